@@ -1,0 +1,38 @@
+"""Shape, forces and derivatives of cables, hoses and wires: quasistatic extensible Kirchhoff rods in JAX."""
+
+from rodjax import problems
+from rodjax.compilation_cache import enable_compilation_cache
+from rodjax.equilibrium import Equilibrium, NotConvergedWarning, describe, solve
+from rodjax.guess import Guess
+from rodjax.loads import PointForce
+from rodjax.path import solve_path
+from rodjax.rod import Rod
+from rodjax.scene import Scene
+from rodjax.solvers.line_search import LineSearch
+from rodjax.solvers.nonlinear_cg import NonlinearCG
+from rodjax.status import Status
+from rodjax.supports import Clamp, Free, Pin, Swivel, frame
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Clamp",
+    "Equilibrium",
+    "Free",
+    "Guess",
+    "LineSearch",
+    "NonlinearCG",
+    "NotConvergedWarning",
+    "Pin",
+    "PointForce",
+    "Rod",
+    "Scene",
+    "Status",
+    "Swivel",
+    "describe",
+    "enable_compilation_cache",
+    "frame",
+    "problems",
+    "solve",
+    "solve_path",
+]

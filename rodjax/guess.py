@@ -1,0 +1,133 @@
+"""Where a solve begins: from points a user gives, or from the library's own first shape."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.checks import number_array
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.scene import Scene
+from rodjax.strain import cross
+from rodjax.supports import Free
+from rodjax.units import Units
+
+
+class Guess(eqx.Module):
+    """A first shape, in no need of fitting supports, length or mesh.
+
+    `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: the total twist of the solution is, of
+    those that the end frames allow, the one nearest to this.
+    """
+
+    points: Float[Array, "m 3"]
+    total_twist: Float[Array, ""]
+
+    def __init__(self, points: Any, total_twist: Any = 0.0):
+        shape = jnp.shape(points)
+        if len(shape) != 2 or shape[0] < 2 or shape[1] != 3:
+            raise ValueError(f"points must have the shape (m, 3) with m >= 2, got {shape}")
+        self.points = number_array(points, "points", shape)
+        self.total_twist = number_array(total_twist, "total_twist")
+
+    def polyline(self, units: Units, segments: int) -> Polyline:
+        """The nodes of a mesh on this shape, nondimensional."""
+        return Polyline.through(resampled((self.points - units.origin[None]) / units.length, segments))
+
+
+def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
+    """Points at equal steps of the curve through equally spaced `points`: cubic, by central differences."""
+    m = len(points) - 1
+    if m == segments:
+        return points
+    ends = (2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1])
+    extended = jnp.concatenate([ends[0], points, ends[1]])
+    slopes = (extended[2:] - extended[:-2]) / 2
+    return cubic(points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
+
+
+def cubic(points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    """Cubic Hermite interpolation: `points` and `slopes` are value and derivative at x = 0, 1, ..., m - 1."""
+    cell = jnp.clip(jnp.floor(x), 0, len(points) - 2).astype(int)
+    t = (x - cell.astype(x.dtype))[:, None]
+    weights = ((1 + 2 * t) * (1 - t) ** 2, t * (1 - t) ** 2, t**2 * (3 - 2 * t), t**2 * (t - 1))
+    values = (points[cell], slopes[cell], points[cell + 1], slopes[cell + 1])
+    return sum(weight * value for weight, value in zip(weights, values, strict=True))
+
+
+def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
+    """Nodes to begin with when there is no guess, in a nondimensional scene.
+
+    Between two held ends: the circular arc of length 1, sagging where gravity and the end tangents point, bent near the
+    ends towards their tangents. With a free end: straight.
+    """
+    u = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)[:, None]
+    start, end = scene.start, scene.end
+    if not end.holds_position:
+        along = start.tangent if start.holds_tangent else _pull(scene)
+        return start.position[None] + u * along[None]
+    if not start.holds_position:
+        along = end.tangent if end.holds_tangent else -_pull(scene)
+        return end.position[None] - (1 - u) * along[None]
+    arc, arc_start, arc_end = _arc(scene, u)
+    if start.holds_tangent:
+        arc += u * (1 - u) ** 4 * (start.tangent - arc_start)[None]
+    if end.holds_tangent:
+        arc += u**4 * (u - 1) * (end.tangent - arc_end)[None]
+    return arc
+
+
+def _pull(scene: Scene) -> Float[Array, "3"]:
+    """The direction of all dead loads together, in which a rod on a pin hangs."""
+    loads = [load.force * load.at for load in scene.point_forces]
+    loads += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+    if scene.gravity is not None:
+        loads.append(scene.gravity / 2)
+    pull = sum(loads[1:], loads[0])
+    size = jnp.sqrt(jnp.sum(pull**2))
+    fallback = jnp.array([0.0, 0.0, -1.0], pull.dtype)
+    return jnp.where(size > 0, pull / jnp.where(size > 0, size, 1.0), fallback)
+
+
+def _arc(scene: Scene, u: Float[Array, "k 1"]) -> tuple[Float[Array, "k 3"], Float[Array, "3"], Float[Array, "3"]]:
+    """The circular arc of length 1 between the ends (a straight line where they are too far), and its end tangents."""
+    start, end = scene.start, scene.end
+    chord = end.position - start.position
+    span = jnp.sqrt(jnp.sum(chord**2))
+    tangents = [end.tangent if end.holds_tangent else jnp.zeros_like(chord) for end in (start, end)]
+    # Coincident ends have no chord: then the arc is a circle that leaves and arrives along the tangents.
+    coincident = span < 1e-6
+    along = _direction(jnp.where(coincident, -(tangents[0] + tangents[1]), chord), jnp.array([1.0, 0.0, 0.0]))
+    sag = (tangents[0] - tangents[1]) / 2
+    if scene.gravity is not None:
+        # A load of gL^3/EI = 100 sags a rod as much as its ends can bend it.
+        sag += scene.gravity / 100
+    sag -= jnp.sum(sag * along) * along
+    across = jnp.eye(3, dtype=along.dtype)[jnp.argmin(jnp.abs(along))]
+    sag = _direction(sag, _direction(cross(along, across), along))
+    half = _half_angle(jnp.minimum(span, 1.0))
+    angle = half * (2 * u - 1)
+    radius = 0.5 / half
+    reach = jnp.maximum(span, 1.0)  # stretched along the chord where the ends are further apart than the rod is long
+    x = reach * (radius * jnp.sin(angle) + jnp.minimum(span, 1.0) / 2)
+    y = radius * (jnp.cos(angle) - jnp.cos(half))
+    arc = start.position[None] + x * along[None] + y * sag[None]
+    cosine, sine = jnp.cos(half) * along, jnp.sin(half) * sag
+    return arc, cosine + sine, cosine - sine
+
+
+def _half_angle(span: Float[Array, ""]) -> Float[Array, ""]:
+    """The half angle a of an arc of length 1 over a chord: sin(a)/a = span, in 1e-3 to pi, by bisection."""
+    low, high = jnp.full_like(span, 1e-3), jnp.full_like(span, jnp.pi)
+    for _ in range(12):
+        middle = (low + high) / 2
+        is_low = jnp.sin(middle) > span * middle
+        low, high = jnp.where(is_low, middle, low), jnp.where(is_low, high, middle)
+    return (low + high) / 2
+
+
+def _direction(vector: Float[Array, "3"], fallback: Float[Array, "3"]) -> Float[Array, "3"]:
+    size = jnp.sqrt(jnp.sum(vector**2))
+    is_zero = size < 1e-6
+    return jnp.where(is_zero, fallback.astype(vector.dtype), vector / jnp.where(is_zero, 1.0, size))

@@ -1,0 +1,131 @@
+"""The scene: a rod, what holds its ends and what loads it, in SI units or in the units of the rod."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known, number_array, vector
+from rodjax.loads import PointForce
+from rodjax.rod import Rod
+from rodjax.supports import Clamp, Free, Pin, Support
+from rodjax.units import Units
+
+# Ends further apart than this many rod lengths are taken for a mistake: no cable is stretched by half of its length.
+MAX_SPAN = 1.5
+
+
+class Scene(eqx.Module):
+    """A rod with its supports and loads.
+
+    What is present is static structure; the numbers are differentiable leaves.
+
+    **Arguments:**
+
+    - `rod`: `Rod`.
+    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
+    - `gravity`: (3,) [m/s^2], or `None` for no weight.
+    - `point_forces`: `PointForce`s along the rod.
+    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
+        total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only.
+
+    Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
+    beyond the rod, or where the ends are further apart than 1.5 rod lengths.
+    """
+
+    rod: Rod
+    start: Support
+    end: Support
+    gravity: Float[Array, "3"] | None
+    point_forces: tuple[PointForce, ...]
+    turns: Float[Array, ""] | None
+
+    def __init__(
+        self,
+        rod: Rod,
+        start: Support,
+        end: Support,
+        gravity: Any = None,
+        point_forces: Sequence[PointForce] = (),
+        turns: Any = None,
+    ):
+        instance(rod, "rod", Rod)
+        instance(start, "start", Support)
+        instance(end, "end", Support)
+        for k, force in enumerate(point_forces):
+            instance(force, f"point_forces[{k}]", PointForce)
+        self.rod = rod
+        self.start = start
+        self.end = end
+        self.gravity = None if gravity is None else vector(gravity, "gravity")
+        self.point_forces = tuple(point_forces)
+        self.turns = None if turns is None else number_array(turns, "turns")
+        self._check_supports()
+        self._check_numbers()
+
+    def _check_supports(self) -> None:
+        pair = f"{type(self.start).__name__} at the start and {type(self.end).__name__} at the end"
+        ends = (self.start, self.end)
+        if not any(end.holds_position for end in ends):
+            raise ValueError(f"{pair} hold no position: the rod would fly off; hold one end with a Clamp, Swivel or Pin")
+        for end, other in (ends, ends[::-1]):
+            if not isinstance(end, Free):
+                continue
+            loaded = self.gravity is not None or self.point_forces or end.force is not None
+            if isinstance(other, Pin) and not loaded:
+                raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
+            if end.moment is not None and not isinstance(other, Clamp):
+                raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
+        if self.turns is not None and not has_torsion_from_frames(self):
+            raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
+
+    def _check_numbers(self) -> None:
+        if not is_known(self):
+            return
+        if self.turns is not None and float(self.turns) != np.round(float(self.turns)):
+            raise ValueError(f"turns must be a whole number, got {float(self.turns):g}")
+        length = float(self.rod.length)
+        for k, force in enumerate(self.point_forces):
+            if float(force.at) > length:
+                raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
+        if self.start.holds_position and self.end.holds_position:
+            span = float(np.linalg.norm(np.subtract(self.end.position, self.start.position)))
+            if span > MAX_SPAN * length:
+                raise ValueError(
+                    f"the ends are {span:g} m apart, a rod of length {length:g} m reaches at most {MAX_SPAN * length:g} m"
+                )
+
+
+def has_torsion_from_frames(scene: Scene) -> bool:
+    """Whether two clamps fix the total twist."""
+    return scene.start.holds_twist and scene.end.holds_twist
+
+
+def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
+    """The dead moment on a free end, if there is one."""
+    for end in (scene.start, scene.end):
+        if isinstance(end, Free) and end.moment is not None:
+            return end.moment
+    return None
+
+
+def nondimensional(scene: Scene) -> tuple[Scene, Units]:
+    """The same scene with L = 1, EI = 1, weight per length = gravity and a held end at the origin, and the way back.
+
+    Tolerances then mean the same for a hair and a hawser, and a scene far from the origin loses no digits.
+    """
+    rod = scene.rod
+    held = scene.start if scene.start.holds_position else scene.end
+    units = Units(origin=held.position, length=rod.length, energy=rod.EI / rod.length)
+    gravity = None if scene.gravity is None else scene.gravity * (rod.mass_per_length * rod.length / units.force)
+    scaled = Scene(
+        rod.in_units(units),
+        scene.start.in_units(units),
+        scene.end.in_units(units),
+        gravity,
+        [force.in_units(units) for force in scene.point_forces],
+        scene.turns,
+    )
+    return scaled, units

@@ -1,0 +1,29 @@
+"""How a solve ended, in numbers that survive `jit` and `vmap`, and in words."""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """The code in `Equilibrium.status`."""
+
+    CONVERGED = 0
+    ROUNDING_FLOOR = 1
+    MAX_ITERATIONS = 2
+    LINE_SEARCH_FAILED = 3
+    NOT_FINITE = 4
+    RUNNING = 5
+
+    @property
+    def is_success(self) -> bool:
+        return self in (Status.CONVERGED, Status.ROUNDING_FLOOR)
+
+    @property
+    def message(self) -> str:
+        return {
+            Status.CONVERGED: "converged: the gradient fell below the tolerance",
+            Status.ROUNDING_FLOOR: "converged to the rounding floor of this mesh, which lies above the tolerance",
+            Status.MAX_ITERATIONS: "not converged: stopped at the largest number of iterations",
+            Status.LINE_SEARCH_FAILED: "not converged: the line search found no better point",
+            Status.NOT_FINITE: "not converged: the energy or its gradient is not a finite number",
+            Status.RUNNING: "not finished",
+        }[self]

@@ -1,0 +1,114 @@
+"""What holds the two ends of a rod."""
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.checks import direction, is_known, rotation, vector
+from rodjax.units import Units
+
+
+class Support(eqx.Module):
+    """What is held at an end. Static, so that whatever is not held never enters a compiled program."""
+
+    holds_position: ClassVar[bool]
+    holds_tangent: ClassVar[bool]
+    holds_twist: ClassVar[bool]
+
+    @abstractmethod
+    def in_units(self, units: Units) -> "Support":
+        """The same support in the units of the rod: see `rodjax.scene.nondimensional`."""
+
+
+class Clamp(Support):
+    """Position and frame are held.
+
+    `position`: (3,) [m]; `frame`: (3, 3), columns d1, d2, t, a rotation: `rodjax.frame` makes one from a tangent.
+    """
+
+    holds_position, holds_tangent, holds_twist = True, True, True
+    position: Float[Array, "3"]
+    frame: Float[Array, "3 3"]
+
+    def __init__(self, position: Any, frame: Any):
+        self.position = vector(position, "position")
+        self.frame = rotation(frame, "frame")
+
+    def in_units(self, units: Units) -> "Clamp":
+        return Clamp((self.position - units.origin) / units.length, self.frame)
+
+    @property
+    def tangent(self) -> Float[Array, "3"]:
+        return self.frame[:, 2]
+
+
+class Swivel(Support):
+    """Position and tangent are held; the rod is free to spin, and so carries no torsion.
+
+    `position`: (3,) [m]; `tangent`: (3,), any nonzero vector along the rod.
+    """
+
+    holds_position, holds_tangent, holds_twist = True, True, False
+    position: Float[Array, "3"]
+    tangent: Float[Array, "3"]
+
+    def __init__(self, position: Any, tangent: Any):
+        self.position = vector(position, "position")
+        self.tangent = direction(tangent, "tangent")
+
+    def in_units(self, units: Units) -> "Swivel":
+        return Swivel((self.position - units.origin) / units.length, self.tangent)
+
+
+class Pin(Support):
+    """Position is held; the rod is free to turn. `position`: (3,) [m]."""
+
+    holds_position, holds_tangent, holds_twist = True, False, False
+    position: Float[Array, "3"]
+
+    def __init__(self, position: Any):
+        self.position = vector(position, "position")
+
+    def in_units(self, units: Units) -> "Pin":
+        return Pin((self.position - units.origin) / units.length)
+
+
+class Free(Support):
+    """Nothing is held; dead loads act on the end, along fixed global axes.
+
+    `force`: (3,) [N]; `moment`: (3,) [N m]; an omitted one is zero and not computed. A dead moment has no potential in
+    three dimensions: its virtual work enters the equilibrium, but no work of it the `energy` of a result.
+    """
+
+    holds_position, holds_tangent, holds_twist = False, False, False
+    force: Float[Array, "3"] | None
+    moment: Float[Array, "3"] | None
+
+    def __init__(self, force: Any = None, moment: Any = None):
+        self.force = None if force is None else vector(force, "force")
+        self.moment = None if moment is None else vector(moment, "moment")
+
+    def in_units(self, units: Units) -> "Free":
+        return Free(
+            None if self.force is None else self.force / units.force,
+            None if self.moment is None else self.moment / units.energy,
+        )
+
+
+def frame(tangent: Any, d2: Any = (0.0, 1.0, 0.0)) -> Float[Array, "3 3"]:
+    """The frame with columns (d1, d2, t): t along `tangent`, d2 the part of `d2` at right angles to it.
+
+    `tangent`, `d2`: (3,), any length. Raises `ValueError` where they are parallel.
+    """
+    t = direction(tangent, "tangent")
+    d2 = direction(d2, "d2")
+    across = d2 - jnp.dot(d2, t) * t
+    length = jnp.linalg.norm(across)
+    # Below this the direction of d2 is mostly rounding of the input.
+    if is_known(length) and not length > 1e-6:
+        raise ValueError(f"d2 must not be parallel to the tangent, got d2 = {d2} and tangent = {t}")
+    d2 = across / length
+    return jnp.stack([jnp.cross(d2, t), d2, t], axis=-1)

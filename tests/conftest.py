@@ -1,0 +1,31 @@
+"""Settings of every test: double precision, strict dtype and rank promotion, a compilation cache kept between runs."""
+
+import os
+
+import jax
+import pytest
+
+import rodjax
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+rodjax.enable_compilation_cache()
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", default=bool(os.environ.get("CI")), help="run the slow tests too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--slow"):
+        skip = pytest.mark.skip(reason="slow: run with --slow")
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def cable() -> rodjax.Rod:
+    """Cable C: 1 m long, 10 mm thick, EI = 4.9087e-3 N m^2, GJ/EI = 2/3, EA L^2/EI = 1.6e5."""
+    return rodjax.problems.cable()

@@ -11,7 +11,7 @@ from rodjax.scene import Scene
 from rodjax.supports import Clamp, Free, frame
 
 # Half angle a of a circular arc of length 1 over a chord of 0.6: sin(a)/a = 0.6.
-ARC_HALF_ANGLE = 1.6605508394245776
+ARC_HALF_ANGLE = 1.6600348132646194
 SPAN = 0.6
 
 

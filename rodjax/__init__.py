@@ -3,11 +3,13 @@
 from rodjax import problems
 from rodjax.compilation_cache import enable_compilation_cache
 from rodjax.equilibrium import Equilibrium, NotConvergedWarning, describe, solve
+from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import PointForce
 from rodjax.path import solve_path
 from rodjax.rod import Rod
 from rodjax.scene import Scene
+from rodjax.scene_file import SceneFileError, read_scene, write_scene
 from rodjax.solvers.line_search import LineSearch
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
@@ -27,12 +29,17 @@ __all__ = [
     "PointForce",
     "Rod",
     "Scene",
+    "SceneFileError",
     "Status",
     "Swivel",
     "describe",
     "enable_compilation_cache",
     "frame",
+    "load",
     "problems",
+    "read_scene",
+    "save",
     "solve",
     "solve_path",
+    "write_scene",
 ]

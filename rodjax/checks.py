@@ -9,12 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 
 def is_known(*values: Any) -> bool:
     """Whether every array in `values` has numbers that Python can read, that is: none is traced."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def number_array(value: Any, name: str, shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
@@ -92,4 +93,5 @@ def instance(value: Any, name: str, kinds: type | Sequence[type]) -> None:
     kinds = (kinds,) if isinstance(kinds, type) else tuple(kinds)
     if not isinstance(value, kinds):
         allowed = " or ".join(kind.__name__ for kind in kinds)
-        raise TypeError(f"{name} must be a {allowed}, got {value!r}")
+        article = "an" if allowed[0] in "AEIOU" else "a"
+        raise TypeError(f"{name} must be {article} {allowed}, got {value!r}")

@@ -1,4 +1,4 @@
-"""JAX's persistent compilation cache: the first solve of a new process then loads its program instead of compiling it."""
+"""JAX's persistent compilation cache: a new process then loads the programs that an earlier one compiled."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The energy of a rod: its density, and the work of dead loads. Every force, Hessian and sensitivity comes from these."""
+"""The energy of a rod: its density and the work of dead loads. Every force and derivative comes from these."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -4,7 +4,6 @@ import warnings
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -13,7 +12,7 @@ from rodjax.checks import instance, is_known, whole_number
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.guess import Guess, cubic, first_shape, resampled
 from rodjax.scene import Scene, nondimensional
-from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
+from rodjax.solvers.nonlinear_cg import Minimum, NonlinearCG, minimize
 from rodjax.status import Status
 from rodjax.units import Units
 
@@ -170,14 +169,11 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, segments: int) 
     return SolverState(Polyline.through(resampled(nodes, segments)), guess.state.units), guess.total_twist
 
 
-def solve_from(
-    scene: Scene, state: SolverState, twist: Float[Array, ""], solver: NonlinearCG
-) -> Equilibrium:
+def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver: NonlinearCG) -> Equilibrium:
     """The one code path of every solve: from a state to an equilibrium."""
     scaled, units = nondimensional(scene)
     polyline = _in_units(state, units)
-    problem, start = FiniteDifference.begin(scaled, polyline, twist)
-    minimum = minimize(problem, start, solver)
+    problem, minimum = _found(scaled, polyline, twist, solver=solver)
     point = minimum.point
     resultants = problem.resultants(point)
     n = len(point.edges)
@@ -203,6 +199,22 @@ def solve_from(
         residual=minimum.residual,
         radius=scene.rod.radius,
         state=SolverState(point, units),
+    )
+
+
+@eqx.filter_custom_jvp
+def _found(
+    scene: Scene, polyline: Polyline, twist: Float[Array, ""], *, solver: NonlinearCG
+) -> tuple[FiniteDifference, Minimum]:
+    problem, start = FiniteDifference.begin(scene, polyline, twist)
+    return problem, minimize(problem, start, solver)
+
+
+@_found.def_jvp
+def _no_derivative(primals, tangents, *, solver: NonlinearCG):
+    # Differentiating the iterations would give numbers that look right and are not.
+    raise NotImplementedError(
+        "the derivative of a solve is not part of this version; take central differences of solves with a tight tolerance"
     )
 
 

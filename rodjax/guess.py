@@ -1,31 +1,32 @@
 """Where a solve begins: from points a user gives, or from the library's own first shape."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import number_array
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.scene import Scene
-from rodjax.strain import cross
-from rodjax.supports import Free
+from rodjax.supports import Directed, Free, Held
 from rodjax.units import Units
 
 
 class Guess(eqx.Module):
     """A first shape, in no need of fitting supports, length or mesh.
 
-    `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: the total twist of the solution is, of
-    those that the end frames allow, the one nearest to this.
+    `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
+    frames allow on this shape, the solution has the one nearest to this.
     """
 
     points: Float[Array, "m 3"]
     total_twist: Float[Array, ""]
 
     def __init__(self, points: Any, total_twist: Any = 0.0):
-        shape = jnp.shape(points)
+        shape = np.shape(points)
         if len(shape) != 2 or shape[0] < 2 or shape[1] != 3:
             raise ValueError(f"points must have the shape (m, 3) with m >= 2, got {shape}")
         self.points = number_array(points, "points", shape)
@@ -53,7 +54,7 @@ def cubic(points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Arr
     t = (x - cell.astype(x.dtype))[:, None]
     weights = ((1 + 2 * t) * (1 - t) ** 2, t * (1 - t) ** 2, t**2 * (3 - 2 * t), t**2 * (t - 1))
     values = (points[cell], slopes[cell], points[cell + 1], slopes[cell + 1])
-    return sum(weight * value for weight, value in zip(weights, values, strict=True))
+    return functools.reduce(jnp.add, (weight * value for weight, value in zip(weights, values, strict=True)))
 
 
 def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
@@ -64,16 +65,17 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     """
     u = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)[:, None]
     start, end = scene.start, scene.end
-    if not end.holds_position:
-        along = start.tangent if start.holds_tangent else _pull(scene)
-        return start.position[None] + u * along[None]
-    if not start.holds_position:
-        along = end.tangent if end.holds_tangent else -_pull(scene)
+    if not isinstance(start, Held):
+        assert isinstance(end, Held), "a scene holds at least one position"
+        along = end.tangent if isinstance(end, Directed) else -_pull(scene)
         return end.position[None] - (1 - u) * along[None]
-    arc, arc_start, arc_end = _arc(scene, u)
-    if start.holds_tangent:
+    if not isinstance(end, Held):
+        along = start.tangent if isinstance(start, Directed) else _pull(scene)
+        return start.position[None] + u * along[None]
+    arc, arc_start, arc_end = _arc(start, end, scene.gravity, u)
+    if isinstance(start, Directed):
         arc += u * (1 - u) ** 4 * (start.tangent - arc_start)[None]
-    if end.holds_tangent:
+    if isinstance(end, Directed):
         arc += u**4 * (u - 1) * (end.tangent - arc_end)[None]
     return arc
 
@@ -90,22 +92,23 @@ def _pull(scene: Scene) -> Float[Array, "3"]:
     return jnp.where(size > 0, pull / jnp.where(size > 0, size, 1.0), fallback)
 
 
-def _arc(scene: Scene, u: Float[Array, "k 1"]) -> tuple[Float[Array, "k 3"], Float[Array, "3"], Float[Array, "3"]]:
+def _arc(
+    start: Held, end: Held, gravity: Float[Array, "3"] | None, u: Float[Array, "k 1"]
+) -> tuple[Float[Array, "k 3"], Float[Array, "3"], Float[Array, "3"]]:
     """The circular arc of length 1 between the ends (a straight line where they are too far), and its end tangents."""
-    start, end = scene.start, scene.end
     chord = end.position - start.position
     span = jnp.sqrt(jnp.sum(chord**2))
-    tangents = [end.tangent if end.holds_tangent else jnp.zeros_like(chord) for end in (start, end)]
+    tangents = [end.tangent if isinstance(end, Directed) else jnp.zeros_like(chord) for end in (start, end)]
     # Coincident ends have no chord: then the arc is a circle that leaves and arrives along the tangents.
     coincident = span < 1e-6
     along = _direction(jnp.where(coincident, -(tangents[0] + tangents[1]), chord), jnp.array([1.0, 0.0, 0.0]))
     sag = (tangents[0] - tangents[1]) / 2
-    if scene.gravity is not None:
-        # A load of gL^3/EI = 100 sags a rod as much as its ends can bend it.
-        sag += scene.gravity / 100
+    if gravity is not None:
+        # A load of w L^3/EI = 100 sags a rod as much as its ends can bend it.
+        sag += gravity / 100
     sag -= jnp.sum(sag * along) * along
     across = jnp.eye(3, dtype=along.dtype)[jnp.argmin(jnp.abs(along))]
-    sag = _direction(sag, _direction(cross(along, across), along))
+    sag = _direction(sag, _direction(jnp.cross(along, across), along))
     half = _half_angle(jnp.minimum(span, 1.0))
     angle = half * (2 * u - 1)
     radius = 0.5 / half

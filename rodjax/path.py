@@ -49,7 +49,9 @@ def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
     """Scenes of one structure as one `Scene` whose leaves have a leading axis."""
     if isinstance(scenes, Scene):
         if scenes.rod.length.ndim != 1:
-            raise ValueError("scenes must be a list of scenes, or one with a leading axis on every leaf; got a single one")
+            raise ValueError(
+                "scenes must be a list, or one Scene with a leading axis on every leaf; got a single scene"
+            )
         return scenes
     scenes = list(scenes)
     if not scenes:
@@ -89,7 +91,7 @@ def _solve_path(
     state, twist = first_state(jax.tree.map(lambda leaf: leaf[0], scenes), guess, segments)
     bar = None if meter is None else meter.init()
     (_, _, bar), path = jax.lax.scan(step, (state, twist, bar), (jnp.arange(count), scenes))
-    if meter is not None:
+    if meter is not None and bar is not None:
         meter.close(bar)
     return path
 

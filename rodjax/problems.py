@@ -23,7 +23,8 @@ def cable(slenderness: float = 200.0) -> Rod:
 def omega(tilt: float, turn: float, rod: Rod | None = None) -> Scene:
     """One scene of Fig. 1 of Linn & Stephan (2008): two clamps 0.6 m apart on the x axis.
 
-    `tilt` [rad]: angle of the end tangents below and above the x axis; `turn` [rad]: of the end frame about its tangent.
+    `tilt` [rad]: angle of the end tangents below and above the x axis; `turn` [rad]: of the end frame about its
+    tangent.
     """
     cosine, sine = math.cos(tilt), math.sin(tilt)
     start = frame((cosine, 0.0, -sine))
@@ -34,7 +35,7 @@ def omega(tilt: float, turn: float, rod: Rod | None = None) -> Scene:
 
 
 def figure_1(rod: Rod | None = None) -> list[Scene]:
-    """The 25 steps of Fig. 1: in 9 the end tangents of a circle segment turn inward, in 16 the end frame turns by 2 pi."""
+    """The 25 steps of Fig. 1: in 9 the end tangents of a circle segment turn inward, in 16 the end frame by 2 pi."""
     tilts = np.linspace(ARC_HALF_ANGLE, math.pi / 6, 10)[1:]
     turns = np.linspace(0.0, 2 * math.pi, 17)[1:]
     bend = [omega(tilt, 0.0, rod) for tilt in tilts]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, number_array, vector
 from rodjax.loads import PointForce
 from rodjax.rod import Rod
-from rodjax.supports import Clamp, Free, Pin, Support
+from rodjax.supports import Clamp, Free, Held, Pin, Support
 from rodjax.units import Units
 
 # Ends further apart than this many rod lengths are taken for a mistake: no cable is stretched by half of its length.
@@ -68,8 +68,8 @@ class Scene(eqx.Module):
     def _check_supports(self) -> None:
         pair = f"{type(self.start).__name__} at the start and {type(self.end).__name__} at the end"
         ends = (self.start, self.end)
-        if not any(end.holds_position for end in ends):
-            raise ValueError(f"{pair} hold no position: the rod would fly off; hold one end with a Clamp, Swivel or Pin")
+        if not any(isinstance(end, Held) for end in ends):
+            raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
         for end, other in (ends, ends[::-1]):
             if not isinstance(end, Free):
                 continue
@@ -78,7 +78,7 @@ class Scene(eqx.Module):
                 raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
             if end.moment is not None and not isinstance(other, Clamp):
                 raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
-        if self.turns is not None and not has_torsion_from_frames(self):
+        if self.turns is not None and not (isinstance(self.start, Clamp) and isinstance(self.end, Clamp)):
             raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
 
     def _check_numbers(self) -> None:
@@ -90,17 +90,13 @@ class Scene(eqx.Module):
         for k, force in enumerate(self.point_forces):
             if float(force.at) > length:
                 raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
-        if self.start.holds_position and self.end.holds_position:
+        if isinstance(self.start, Held) and isinstance(self.end, Held):
             span = float(np.linalg.norm(np.subtract(self.end.position, self.start.position)))
             if span > MAX_SPAN * length:
                 raise ValueError(
-                    f"the ends are {span:g} m apart, a rod of length {length:g} m reaches at most {MAX_SPAN * length:g} m"
+                    f"the ends are {span:g} m apart, but a rod of length {length:g} m "
+                    f"reaches at most {MAX_SPAN * length:g} m"
                 )
-
-
-def has_torsion_from_frames(scene: Scene) -> bool:
-    """Whether two clamps fix the total twist."""
-    return scene.start.holds_twist and scene.end.holds_twist
 
 
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
@@ -117,7 +113,8 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
     Tolerances then mean the same for a hair and a hawser, and a scene far from the origin loses no digits.
     """
     rod = scene.rod
-    held = scene.start if scene.start.holds_position else scene.end
+    held = scene.start if isinstance(scene.start, Held) else scene.end
+    assert isinstance(held, Held), "a scene holds at least one position"
     units = Units(origin=held.position, length=rod.length, energy=rod.EI / rod.length)
     gravity = None if scene.gravity is None else scene.gravity * (rod.mass_per_length * rod.length / units.force)
     scaled = Scene(

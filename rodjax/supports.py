@@ -1,7 +1,7 @@
 """What holds the two ends of a rod."""
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,11 +12,7 @@ from rodjax.units import Units
 
 
 class Support(eqx.Module):
-    """What is held at an end. Static, so that whatever is not held never enters a compiled program."""
-
-    holds_position: ClassVar[bool]
-    holds_tangent: ClassVar[bool]
-    holds_twist: ClassVar[bool]
+    """What is held at an end. Its type is static, so that whatever is not held never enters a compiled program."""
 
     @abstractmethod
     def in_units(self, units: Units) -> "Support":
@@ -29,7 +25,6 @@ class Clamp(Support):
     `position`: (3,) [m]; `frame`: (3, 3), columns d1, d2, t, a rotation: `rodjax.frame` makes one from a tangent.
     """
 
-    holds_position, holds_tangent, holds_twist = True, True, True
     position: Float[Array, "3"]
     frame: Float[Array, "3 3"]
 
@@ -51,7 +46,6 @@ class Swivel(Support):
     `position`: (3,) [m]; `tangent`: (3,), any nonzero vector along the rod.
     """
 
-    holds_position, holds_tangent, holds_twist = True, True, False
     position: Float[Array, "3"]
     tangent: Float[Array, "3"]
 
@@ -66,7 +60,6 @@ class Swivel(Support):
 class Pin(Support):
     """Position is held; the rod is free to turn. `position`: (3,) [m]."""
 
-    holds_position, holds_tangent, holds_twist = True, False, False
     position: Float[Array, "3"]
 
     def __init__(self, position: Any):
@@ -83,7 +76,6 @@ class Free(Support):
     three dimensions: its virtual work enters the equilibrium, but no work of it the `energy` of a result.
     """
 
-    holds_position, holds_tangent, holds_twist = False, False, False
     force: Float[Array, "3"] | None
     moment: Float[Array, "3"] | None
 
@@ -96,6 +88,11 @@ class Free(Support):
             None if self.force is None else self.force / units.force,
             None if self.moment is None else self.moment / units.energy,
         )
+
+
+# The supports that hold the position, and those that also hold the tangent; a `Clamp` alone holds the twist.
+Held = Clamp | Swivel | Pin
+Directed = Clamp | Swivel
 
 
 def frame(tangent: Any, d2: Any = (0.0, 1.0, 0.0)) -> Float[Array, "3 3"]:

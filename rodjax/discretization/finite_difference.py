@@ -10,13 +10,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.twist import TwistReference, angle_about, total_twist, transport, transport_along
+from rodjax.discretization.twist import (
+    FramedTangents,
+    TwistReference,
+    angle_about,
+    total_twist,
+    transport,
+    transport_along,
+)
 from rodjax.energy import dead_load_energy, density
 from rodjax.linalg import BlockCholesky, SymmetricBlockTridiagonal, pair_blocks
 from rodjax.rod import Rod
-from rodjax.scene import Scene, dead_end_moment, has_torsion_from_frames
-from rodjax.strain import axial_strain, cross, curvature
-from rodjax.supports import Clamp, Free, Support, Swivel
+from rodjax.scene import Scene, dead_end_moment
+from rodjax.strain import axial_strain, curvature
+from rodjax.supports import Clamp, Directed, Free, Held, Support, Swivel
 from rodjax.units import Units
 
 
@@ -79,12 +86,12 @@ class FiniteDifference(eqx.Module):
     # --- unknowns: the one place that knows which nodes move -------------------------------------------------------
 
     def _all_nodes(self, displacement: Float[Array, "m 3"]) -> Float[Array, "n+1 3"]:
-        held = (self.scene.start.holds_position, self.scene.end.holds_position)
+        held = (isinstance(self.scene.start, Held), isinstance(self.scene.end, Held))
         return jnp.pad(displacement, ((int(held[0]), int(held[1])), (0, 0)))
 
     def _free_nodes(self, rows: Float[Array, "n+1 ..."]) -> Float[Array, "m ..."]:
-        first = int(self.scene.start.holds_position)
-        return rows[first : len(rows) - int(self.scene.end.holds_position)]
+        first = int(isinstance(self.scene.start, Held))
+        return rows[first : len(rows) - int(isinstance(self.scene.end, Held))]
 
     def moved(self, polyline: Polyline, displacement: Float[Array, "m 3"]) -> Polyline:
         return polyline.moved(self._all_nodes(displacement))
@@ -99,7 +106,7 @@ class FiniteDifference(eqx.Module):
         bending = jax.vmap(_joint_energy, in_axes=(None, 0, 0, 0))(rod, points[:-1], points[1:], spacing)
         stretching = h * jax.vmap(lambda dphi: density(rod, axial_strain=axial_strain(dphi)))(dphi)
         torsion = None
-        if has_torsion_from_frames(self.scene):
+        if self.twist_reference is not None:
             torsion = density(rod, twist=self.total_twist(polyline))
         return Energies(jnp.sum(bending), jnp.sum(stretching), torsion, self._load_energy(polyline))
 
@@ -120,8 +127,8 @@ class FiniteDifference(eqx.Module):
     def total_twist(self, polyline: Polyline) -> Float[Array, ""]:
         """Total twist [rad]: fixed by two clamps, or in equilibrium with a dead moment; zero where an end can spin."""
         moment = dead_end_moment(self.scene)
-        if has_torsion_from_frames(self.scene):
-            return total_twist(self.twist_reference, *_frame_data(self.scene, polyline))
+        if self.twist_reference is not None:
+            return total_twist(self.twist_reference, _framed_tangents(self.scene, polyline))
         if moment is not None:
             return _end_torque(self.scene, moment, polyline) / self.scene.rod.GJ
         return jnp.zeros((), polyline.nodes.dtype)
@@ -145,10 +152,12 @@ class FiniteDifference(eqx.Module):
 
     # --- gradient --------------------------------------------------------------------------------------------------
 
-    @property
-    def has_potential(self) -> bool:
-        """Whether equilibria are stationary points of `energies().total`: not under a dead moment."""
-        return dead_end_moment(self.scene) is None
+    def energy_from(self, polyline: Polyline, moved: Polyline, energy: Float[Array, ""]) -> Float[Array, ""]:
+        """The energy after a motion, `energy`, less the work of loads without a potential on the way, to second order.
+
+        By this a step is judged; without a dead moment it is the energy.
+        """
+        return energy - self._virtual_work(polyline, moved, self.scene)
 
     def energy_and_gradient(self, polyline: Polyline) -> tuple[Float[Array, ""], Float[Array, "m 3"]]:
         """Potential energy, and the gradient of energy less virtual work by the displacements."""
@@ -172,13 +181,13 @@ class FiniteDifference(eqx.Module):
             return 0.0
         edge = 0 if isinstance(self.scene.start, Free) else -1
         tangent, moved_tangent = (_unit(p.edges[edge]) for p in (polyline, moved))
-        reference = TwistReference(*_frame_data(self.scene, polyline), total_twist=jnp.zeros_like(tangent[0]))
-        twist_change = total_twist(reference, *_frame_data(turned, moved))
+        reference = TwistReference(_framed_tangents(self.scene, polyline), jnp.zeros_like(tangent[0]))
+        twist_change = total_twist(reference, _framed_tangents(turned, moved))
         torque = _end_torque(self.scene, moment, polyline)
-        return jnp.sum(moment * cross(tangent, moved_tangent)) - torque * twist_change
+        return jnp.sum(moment * jnp.cross(tangent, moved_tangent)) - torque * twist_change
 
     def rounding_floor(self, polyline: Polyline) -> Float[Array, ""]:
-        """Gradient [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, as measured: `docs/design.md`."""
+        """Gradient [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
         n = len(polyline.edges)
         eps = jnp.finfo(polyline.edges.dtype).eps
         return FLOOR_SAFETY * eps * (self.scene.rod.EA + 4.0 * n**2)
@@ -208,7 +217,7 @@ class FiniteDifference(eqx.Module):
         # By the edges: joint k couples points k and k + 1, of which the prescribed end tangents do not vary.
         zero = jnp.zeros((1, 3, 3), dphi.dtype)
         by_point = jnp.concatenate([bending[:, :3, :3], zero]) + jnp.concatenate([zero, bending[:, 3:, 3:]])
-        first, n = int(scene.start.holds_tangent), len(dphi)
+        first, n = int(isinstance(scene.start, Directed)), len(dphi)
         diagonal = (by_point[first : first + n] + stretching) / h**2
         lower = bending[first : first + n - 1, 3:, :3] / h**2
         # By the nodes: edge i is node i + 1 less node i.
@@ -219,10 +228,10 @@ class FiniteDifference(eqx.Module):
             + jnp.concatenate([diagonal, zero])
             - jnp.concatenate([zero, lower + jnp.swapaxes(lower, 1, 2), zero])
         )
-        if not (scene.start.holds_tangent or scene.end.holds_tangent):
+        if not (isinstance(scene.start, Directed) or isinstance(scene.end, Directed)):
             by_node += PIN_STIFFNESS * h * jnp.eye(3, dtype=dphi.dtype)[None]
         free = self._free_nodes(by_node)
-        offset = int(scene.start.holds_position)
+        offset = int(isinstance(scene.start, Held))
         m = len(free)
         return pair_blocks(free, below[offset : offset + m - 1], -lower[offset : offset + m - 2])
 
@@ -274,12 +283,12 @@ class FiniteDifference(eqx.Module):
         )
 
     def _end_loads(self, polyline: Polyline) -> list[tuple[Float[Array, "3"], Float[Array, "3"]]]:
-        """(f, m) at s = 0 and s = L, by differentiating the energy with respect to the ends' positions and rotations."""
+        """(f, m) at s = 0 and s = L: derivatives of the energy by the positions and rotations of the ends."""
 
         def potential(displacement, rotations):
             moved = polyline.moved(displacement)
-            ends = [_rotated(end, omega) for end, omega in zip((self.scene.start, self.scene.end), rotations)]
-            scene = eqx.tree_at(lambda scene: (scene.start, scene.end), self.scene, tuple(ends))
+            ends = (_rotated(self.scene.start, rotations[0]), _rotated(self.scene.end, rotations[1]))
+            scene = eqx.tree_at(lambda scene: (scene.start, scene.end), self.scene, ends)
             energy = FiniteDifference(scene, self.twist_reference).energies(moved).total
             return energy - self._virtual_work(polyline, moved, scene)
 
@@ -322,19 +331,18 @@ FLOOR_SAFETY = 4.0
 
 def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     """The guess moved to the held ends, by a displacement linear in s; unchanged to the last bit where it fits."""
-    offsets = [
-        end.position - node if end.holds_position else None
-        for end, node in ((scene.start, guess.nodes[0]), (scene.end, guess.nodes[-1]))
-    ]
-    at_start = offsets[1] if offsets[0] is None else offsets[0]
-    at_end = offsets[0] if offsets[1] is None else offsets[1]
+    start, end = scene.start, scene.end
+    at_start = start.position - guess.nodes[0] if isinstance(start, Held) else None
+    at_end = end.position - guess.nodes[-1] if isinstance(end, Held) else at_start
+    at_start = at_end if at_start is None else at_start
+    assert at_start is not None, "a scene holds at least one position"
     s = jnp.linspace(0.0, 1.0, len(guess.nodes), dtype=guess.nodes.dtype)[:, None]
     polyline = guess.moved((1 - s) * at_start[None] + s * at_end[None])
     nodes = polyline.nodes
-    if scene.start.holds_position:
-        nodes = nodes.at[0].set(scene.start.position)
-    if scene.end.holds_position:
-        nodes = nodes.at[-1].set(scene.end.position)
+    if isinstance(start, Held):
+        nodes = nodes.at[0].set(start.position)
+    if isinstance(end, Held):
+        nodes = nodes.at[-1].set(end.position)
     return Polyline(nodes, polyline.edges)
 
 
@@ -343,9 +351,9 @@ def _with_end_tangents(scene: Scene, dphi: Float[Array, "n 3"]) -> tuple[Float[A
     h = 1 / len(dphi)
     points, spacing = [dphi], [jnp.full(len(dphi) - 1, h, dphi.dtype)]
     half = jnp.full(1, h / 2, dphi.dtype)
-    if scene.start.holds_tangent:
+    if isinstance(scene.start, Directed):
         points, spacing = [scene.start.tangent[None], *points], [half, *spacing]
-    if scene.end.holds_tangent:
+    if isinstance(scene.end, Directed):
         points, spacing = [*points, scene.end.tangent[None]], [*spacing, half]
     return jnp.concatenate(points), jnp.concatenate(spacing)
 
@@ -404,49 +412,46 @@ def _across(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, 
 def _rotated(end: Support, omega: Float[Array, "3"]) -> Support:
     """The support turned by a small rotation vector [rad], to first order: exact for derivatives at no rotation."""
     if isinstance(end, Clamp):
-        turned = end.frame + jax.vmap(cross, in_axes=(None, 1), out_axes=1)(omega, end.frame)
+        turned = end.frame + jax.vmap(jnp.cross, in_axes=(None, 1), out_axes=1)(omega, end.frame)
         return eqx.tree_at(lambda end: end.frame, end, turned)
     if isinstance(end, Swivel):
-        return eqx.tree_at(lambda end: end.tangent, end, end.tangent + cross(omega, end.tangent))
+        return eqx.tree_at(lambda end: end.tangent, end, end.tangent + jnp.cross(omega, end.tangent))
     return end
 
 
 def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float) -> Float[Array, "3"]:
     """The tangent at an end: prescribed, or that of the edge, turned by what a dead moment bends half an edge."""
-    if end.holds_tangent:
+    if isinstance(end, Directed):
         return end.tangent
     if isinstance(end, Free) and end.moment is not None:
-        return _unit(edge_tangent + h / 2 * cross(end.moment, edge_tangent))
+        return _unit(edge_tangent + h / 2 * jnp.cross(end.moment, edge_tangent))
     return edge_tangent
 
 
-# --- torsion -----------------------------------------------------------------------------------------------------------
+# --- torsion ---------------------------------------------------------------------------------------------------------
 
 
-def _frame_data(
-    scene: Scene, polyline: Polyline
-) -> tuple[Float[Array, "k 3"], Float[Array, "3"] | None, Float[Array, "3"] | None]:
-    """Tangents along the rod and the directors d1 of the ends that hold the twist: see `TwistReference`."""
+def _framed_tangents(scene: Scene, polyline: Polyline) -> FramedTangents:
     tangents = [jax.vmap(_unit)(polyline.edges)]
-    if scene.start.holds_tangent:
+    if isinstance(scene.start, Directed):
         tangents = [scene.start.tangent[None], *tangents]
-    if scene.end.holds_tangent:
+    if isinstance(scene.end, Directed):
         tangents = [*tangents, scene.end.tangent[None]]
-    directors = [end.frame[:, 0] if end.holds_twist else None for end in (scene.start, scene.end)]
-    return jnp.concatenate(tangents), directors[0], directors[1]
+    start_d1, end_d1 = (end.frame[:, 0] if isinstance(end, Clamp) else None for end in (scene.start, scene.end))
+    return FramedTangents(jnp.concatenate(tangents), start_d1, end_d1)
 
 
 def _twist_reference(scene: Scene, polyline: Polyline, guess_twist: Float[Array, ""]) -> TwistReference | None:
-    if not has_torsion_from_frames(scene):
+    state = _framed_tangents(scene, polyline)
+    if state.start_d1 is None or state.end_d1 is None:
         return None
-    tangents, start_d1, end_d1 = _frame_data(scene, polyline)
-    carried = transport_along(start_d1, tangents)[-1]
-    principal = angle_about(tangents[-1], carried, end_d1)
+    carried = transport_along(state.start_d1, state.tangents)[-1]
+    principal = angle_about(state.tangents[-1], carried, state.end_d1)
     if scene.turns is None:
         turns = jnp.round((guess_twist - principal) / (2 * jnp.pi))
     else:
         turns = scene.turns
-    return TwistReference(tangents, start_d1, end_d1, principal + 2 * jnp.pi * turns)
+    return TwistReference(state, principal + 2 * jnp.pi * turns)
 
 
 def _end_torque(scene: Scene, moment: Float[Array, "3"], polyline: Polyline) -> Float[Array, ""]:
@@ -464,19 +469,19 @@ def _frames(
 ) -> Float[Array, "n+1 3 3"]:
     """Material frames at the nodes, from the end that holds the twist (or a choice where none does)."""
     n = len(edge_tangents)
-    start_d1 = scene.start.frame[:, 0] if scene.start.holds_twist else _any_normal(tangents[0])
+    start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(tangents[0])
     along_edges = transport_along(start_d1, jnp.concatenate([tangents[:1], edge_tangents]))
     # A node's tangent lies on the arc between those of its edges, so that the last node closes the chain.
     d1 = jax.vmap(transport)(along_edges[1:], edge_tangents, tangents[1:])
     d1 = jnp.concatenate([start_d1[None], d1])
     angle = twist * jnp.linspace(0.0, 1.0, n + 1, dtype=twist.dtype)
-    if scene.end.holds_twist and not scene.start.holds_twist:
+    if isinstance(scene.end, Clamp) and not isinstance(scene.start, Clamp):
         angle += angle_about(tangents[-1], d1[-1], scene.end.frame[:, 0]) - angle[-1]
-    d2 = jax.vmap(cross)(tangents, d1)
+    d2 = jax.vmap(jnp.cross)(tangents, d1)
     turned = jnp.cos(angle)[:, None] * d1 + jnp.sin(angle)[:, None] * d2
-    return jnp.stack([turned, jax.vmap(cross)(tangents, turned), tangents], axis=-1)
+    return jnp.stack([turned, jax.vmap(jnp.cross)(tangents, turned), tangents], axis=-1)
 
 
 def _any_normal(tangent: Float[Array, "3"]) -> Float[Array, "3"]:
     axis = jnp.eye(3, dtype=tangent.dtype)[jnp.argmin(jnp.abs(tangent))]
-    return _unit(cross(tangent, axis))
+    return _unit(jnp.cross(tangent, axis))

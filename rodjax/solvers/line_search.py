@@ -1,8 +1,7 @@
 """Line search on slopes, with the approximate Wolfe conditions of Hager & Zhang (2005).
 
 Near a minimum differences of the energy drown in rounding long before its slope does: a step is accepted by its slope,
-and the energy only has to stay within its rounding of where it was. Scenes whose loads have no potential are searched
-by slope alone.
+and the energy only has to stay within its rounding of where it was.
 """
 
 import equinox as eqx
@@ -25,7 +24,9 @@ class Bracket(eqx.Module):
 
     @staticmethod
     def open(slope: Float[Array, ""]) -> "Bracket":
-        return Bracket(jnp.zeros_like(slope), slope, jnp.full_like(slope, jnp.inf), jnp.zeros_like(slope), jnp.array(0))
+        return Bracket(
+            jnp.zeros_like(slope), slope, jnp.full_like(slope, jnp.inf), jnp.zeros_like(slope), jnp.zeros((), int)
+        )
 
 
 class LineSearch(eqx.Module):

@@ -76,7 +76,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
     """Minimise the energy of a discretized scene, from `point`.
 
     One loop, one energy evaluation a turn: the trial step is accepted, and gives the next direction, or it narrows the
-    line search. `problem` offers `moved`, `energy_and_gradient`, `has_potential`, `gauss_newton`, `largest_step` and
+    line search. `problem` offers `moved`, `energy_and_gradient`, `energy_from`, `gauss_newton`, `largest_step` and
     `rounding_floor`: see `FiniteDifference`.
     """
     search = solver.line_search
@@ -85,9 +85,8 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         trial = problem.moved(state.point, state.step * state.direction)
         energy, gradient = problem.energy_and_gradient(trial)
         slope = jnp.sum(gradient * state.direction)
-        energy_is_low = jnp.isfinite(energy) & jnp.isfinite(slope)
-        if problem.has_potential:
-            energy_is_low &= energy <= search.energy_bound(state.energy)
+        reached = problem.energy_from(state.point, trial, energy)
+        energy_is_low = jnp.isfinite(slope) & (reached <= search.energy_bound(state.energy))
         state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
         return jax.lax.cond(
             state.restart | search.accepts(slope, state.slope, energy_is_low),
@@ -163,7 +162,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
 
     zero = problem.no_displacement(point)
     scalar = jnp.zeros((), zero.dtype)
-    count = jnp.array(0)
+    count = jnp.zeros((), int)
     factors = None
     if solver.preconditioner is not None:
         shapes = eqx.filter_eval_shape(lambda: factor(problem.gauss_newton(point)))
@@ -182,7 +181,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         since_restart=count,
         iterations=count,
         evaluations=count,
-        status=jnp.array(Status.RUNNING),
+        status=jnp.full((), Status.RUNNING, int),
     )
     state = jax.lax.while_loop(lambda state: state.status == Status.RUNNING, turn, state)
     return Minimum(

@@ -1,0 +1,170 @@
+"""The command `rodjax`.
+
+Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, which stderr names.
+"""
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NoReturn
+
+import jax
+import numpy as np
+
+import rodjax
+from rodjax.equilibrium import DEFAULT_SEGMENTS, MAX_SEGMENTS, Equilibrium, NotConvergedWarning
+from rodjax.files import SUFFIX, save
+from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
+from rodjax.status import Status
+
+PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+class CommandError(ValueError):
+    """What the user can mend on the command line; the message is one line."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs `rodjax` with these arguments, or those of the process; returns the exit code."""
+    try:
+        arguments = _parser().parse_args(argv)
+        _set_up_jax()
+        return arguments.run(arguments)
+    except (CommandError, SceneFileError) as error:
+        message = str(error)
+    except OSError as error:
+        message = f"{error.strerror or error}: {error.filename}" if error.filename else str(error)
+    print(f"rodjax: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise CommandError(f"{message}; `{self.prog} --help` tells more")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="rodjax", description="Shape and forces of cables, hoses and wires.")
+    parser.add_argument("--version", action="version", version=f"rodjax {rodjax.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    solve = commands.add_parser("solve", help="solve the scene, or the path, in a TOML file")
+    solve.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.scene_file")
+    solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
+    solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
+    solve.set_defaults(run=_solve)
+    demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
+    demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
+    demo.add_argument("--segments", metavar="N", type=_segments, default=DEFAULT_SEGMENTS, help="of the mesh")
+    demo.set_defaults(run=_demo)
+    return parser
+
+
+def _segments(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 2 <= int(text) <= MAX_SEGMENTS):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 2 to {MAX_SEGMENTS}, got {text!r}")
+    return int(text)
+
+
+def _set_up_jax() -> None:
+    jax.config.update("jax_enable_x64", True)
+    # Without a folder to write to every run compiles anew, which is slower but no mistake.
+    with suppress(OSError, RuntimeError):
+        folder = rodjax.enable_compilation_cache()
+        if not os.access(folder, os.W_OK):
+            jax.config.update("jax_compilation_cache_dir", None)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from rodjax.demo import run
+
+    return run(arguments.out, arguments.segments)
+
+
+def _solve(arguments: argparse.Namespace) -> int:
+    _check_output(arguments.output, "-o", (SUFFIX,))
+    _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
+    file = read_scene_file(arguments.scene)
+    with warnings.catch_warnings():
+        # Said below, in the command's own way.
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        if file.is_path:
+            result = rodjax.solve_path(file.scenes, segments=file.segments, progress=sys.stderr.isatty())
+        else:
+            result = rodjax.solve(file.scenes[0], segments=file.segments)
+    print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
+    if arguments.output:
+        save(result, arguments.output)
+    if arguments.plot:
+        _plot(jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result, arguments.plot)
+    if np.all(result.converged):
+        return 0
+    steps = f"steps {', '.join(map(str, np.flatnonzero(~np.asarray(result.converged))))}: " if file.is_path else ""
+    outcome = rodjax.describe(result).replace("\n", ", ")
+    print(f"rodjax: {arguments.scene}: {steps}{outcome}", file=sys.stderr)
+    return 3
+
+
+def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Finds out before a long solve that its result could not be written."""
+    if path is None:
+        return
+    if path.suffix not in suffixes:
+        raise CommandError(f"{option} must end in {' or '.join(suffixes)}, got {str(path)!r}")
+    if not path.parent.is_dir():
+        raise CommandError(f"{option} must be in a folder that exists, got {str(path)!r}")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise CommandError(f"{option} must be a file that can be written, got {str(path)!r}")
+
+
+def _plot(equilibrium: Equilibrium, path: Path) -> None:
+    if not np.all(np.isfinite(equilibrium.nodes)):
+        print(f"rodjax: {path} is not drawn: the shape is not finite", file=sys.stderr)
+        return
+    from rodjax.plot import plot_rod
+
+    plot_rod(equilibrium).savefig(path)
+
+
+def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:
+    scene = file.scenes[0]
+    supports = f"{type(scene.start).__name__} to {type(scene.end).__name__}".lower()
+    scenes = f", {len(file.scenes)} scenes" if file.is_path else ""
+    return f"{path}: {supports}, {float(scene.rod.length):g} m, {result.s.shape[-1] - 1} segments{scenes}"
+
+
+def _table(result: Equilibrium) -> list[str]:
+    def vector(values: jax.Array) -> str:
+        # Adding zero makes zeros of -0.
+        return "".join(f"{float(value) + 0.0:12.4g}" for value in values)
+
+    twist = float(result.total_twist)
+    return [
+        rodjax.describe(result),
+        f"energy       {float(result.energy):.6g} J, of this elastic {float(result.elastic_energy):.6g} J",
+        f"total twist  {twist:.6g} rad ({np.degrees(twist):.4g} deg)",
+        "The part of the rod beyond s exerts on the part before it, at the end the support on the rod:",
+        f"{'':9}{'force [N]':>36}   {'moment [N m]':>36}",
+        f"{'s = 0':9}{vector(result.start_force)}   {vector(result.start_moment)}",
+        f"{'s = L':9}{vector(result.end_force)}   {vector(result.end_moment)}",
+    ]
+
+
+def _rows(path: Equilibrium) -> list[str]:
+    titles = ("twist [deg]", "energy [J]", "|end force| [N]", "|end moment| [N m]", "residual", "iterations")
+    rows = [f"{'step':>4}" + "".join(f"{title:>{len(title) + 3}}" for title in titles) + "   status"]
+    columns = [
+        np.degrees(path.total_twist),
+        path.energy,
+        np.linalg.norm(path.end_force, axis=-1),
+        np.linalg.norm(path.end_moment, axis=-1),
+        path.residual,
+        path.iterations,
+    ]
+    for step, status in enumerate(np.asarray(path.status)):
+        cells = [f"{float(c[step]):{len(t) + 3}.5g}" for t, c in zip(titles, columns, strict=True)]
+        rows.append(f"{step:4}" + "".join(cells) + f"   {Status(status).name.lower().replace('_', ' ')}")
+    return rows

@@ -1,0 +1,236 @@
+"""save() and load(): an `Equilibrium` in one VTKHDF file, which ParaView draws and rodjax reads back to the last bit.
+
+The file is HDF5 with two groups. `/VTKHDF` holds the picture: the centerline as one polyline, with the point data of
+`point_data`, over time steps for a path. `/rodjax` holds every field of `Equilibrium` under its own name, each with
+the attributes `units` and `description`, so that `load` needs no pickle and other programs need no rodjax.
+"""
+
+import dataclasses
+import io
+import os
+import types
+import typing
+import uuid
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known
+from rodjax.equilibrium import Equilibrium
+from rodjax.status import Status
+
+SUFFIX = ".vtkhdf"
+# Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
+FORMAT = 1
+
+# Units and meaning of each field, by its place under /rodjax.
+FIELDS = {
+    "s": ("m", "arclength of the nodes"),
+    "nodes": ("m", "centerline"),
+    "frames": ("1", "material frames at the nodes, columns d1, d2, t"),
+    "curvature": ("1/m", "|t x t'| at the nodes"),
+    "twist": ("rad/m", "twist Omega at the nodes"),
+    "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
+    "tension": ("N", "tension at the nodes"),
+    "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
+    "elastic_energy": ("J", "elastic energy"),
+    "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
+    "start_moment": ("N m", "moment of the rod beyond s = 0 on the support there, about the centerline, global axes"),
+    "end_force": ("N", "force of the support at s = L on the rod, global axes"),
+    "end_moment": ("N m", "moment of the support at s = L on the rod, about the centerline, global axes"),
+    "converged": ("1", "whether the solve converged"),
+    "status": ("1", "how the solve ended: " + ", ".join(f"{status.value} {status.name}" for status in Status)),
+    "iterations": ("1", "iterations of the solver"),
+    "evaluations": ("1", "evaluations of the energy and its gradient"),
+    "residual": ("1", "largest component of the gradient, in EI/L^2"),
+    "radius": ("m", "radius of the rod; absent where it is not known"),
+    "state/polyline/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
+    "state/polyline/edges": ("1", "differences of these nodes, free of the rounding of the positions"),
+    "state/units/origin": ("m", "origin of the solver's coordinates"),
+    "state/units/length": ("m", "the solver's unit of length, L"),
+    "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
+}
+
+
+def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
+    """Writes a result to a `.vtkhdf` file, which ParaView opens and `rodjax.load` reads back to the last bit.
+
+    A path becomes time steps, with the number of the step for the time. The file is replaced as a whole: whatever goes
+    wrong, `path` holds the old file or the new one.
+
+    Raises `ValueError` or `TypeError` for what cannot be saved, `OSError` where the file cannot be written.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    path = _checked(path)
+    if not is_known(equilibrium):
+        raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
+    leading = equilibrium.s.shape[:-1]
+    if len(leading) > 1:
+        raise ValueError(
+            f"equilibrium must be a single one or a path with one leading axis, got leading axes {leading}: "
+            "save one path at a time, such as jax.tree.map(lambda leaf: leaf[0], equilibrium)"
+        )
+    equilibrium = jax.tree.map(np.asarray, equilibrium)
+    # Put together in memory: an error of the disk is then an ordinary one, and HDF5 never holds a half-written file.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        _write_vtk(file.create_group("VTKHDF"), equilibrium)
+        _write(file.create_group("rodjax"), equilibrium)
+        # Imported here because rodjax/__init__.py imports this file before it sets its version.
+        from rodjax import __version__
+
+        file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
+    _replace(path, image.getbuffer())
+
+
+def load(path: str | os.PathLike[str]) -> Equilibrium:
+    """Reads what `rodjax.save` wrote: the same `Equilibrium` to the last bit, which serves as a `guess` too.
+
+    Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
+    rodjax, and where it holds float64 while JAX is set to float32, which would round it.
+    """
+    path = _checked(path)
+    image = path.read_bytes()
+    try:
+        with h5py.File(io.BytesIO(image), "r") as file:
+            _group(file, "VTKHDF", path)
+            group = _group(file, "rodjax", path)
+            _check_format(group, path)
+            equilibrium = _read(group, Equilibrium, path)
+    # What h5py raises for a file that is not HDF5, is cut short or damaged.
+    except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
+        raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
+    return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
+
+
+def point_data(equilibrium: Equilibrium) -> dict[str, Float[Array, "..."]]:
+    """What is drawn along the centerline, by the name that ParaView shows."""
+    return {
+        "Curvature": equilibrium.curvature,
+        "Twist": equilibrium.twist,
+        "Tension": equilibrium.tension,
+        "Frame d1": equilibrium.frames[..., 0],
+        "Frame d2": equilibrium.frames[..., 1],
+        "Tangent": equilibrium.tangents,
+    }
+
+
+def _checked(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise ValueError(f"path must end in {SUFFIX}, got {str(path)!r}")
+    return path
+
+
+def _group(file: h5py.File, name: str, path: Path) -> h5py.Group:
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
+        raise ValueError(f"{path} has no group /{name}: load reads files that rodjax.save wrote")
+    return group
+
+
+def _check_format(group: h5py.Group, path: Path) -> None:
+    written = group.attrs.get("format")
+    if not isinstance(written, np.integer):
+        raise ValueError(f"{path} lacks the attribute format of /rodjax: load reads files that rodjax.save wrote")
+    if written > FORMAT:
+        raise ValueError(
+            f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
+            f"this rodjax reads formats up to {FORMAT}: update it"
+        )
+
+
+def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
+    for field in dataclasses.fields(module):
+        name, value = field.name, getattr(module, field.name)
+        if isinstance(value, eqx.Module):
+            _write(group.create_group(name), value, f"{place}{name}/")
+        elif value is not None:
+            dataset = group.create_dataset(name, data=value)
+            dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place + name]
+
+
+def _read(group: h5py.Group, kind: Any, path: Path) -> Any:
+    """A module of class `kind` with NumPy arrays for leaves."""
+    values = {}
+    for field in dataclasses.fields(kind):
+        entry = group.get(field.name)
+        if isinstance(entry, h5py.Group):
+            values[field.name] = _read(entry, field.type, path)
+        elif isinstance(entry, h5py.Dataset):
+            values[field.name] = entry[()]
+        elif types.NoneType in typing.get_args(field.type):
+            values[field.name] = None
+        else:
+            raise ValueError(f"{path} lacks {group.name}/{field.name}: it is damaged, or rodjax.save did not write it")
+    return kind(**values)
+
+
+def _as_jax(values: Any, path: Path) -> Array:
+    array = jnp.asarray(values)
+    if array.dtype != values.dtype:
+        raise ValueError(
+            f"{path} holds {values.dtype} numbers, which JAX would make {array.dtype}: "
+            'call jax.config.update("jax_enable_x64", True) before anything else'
+        )
+    return array
+
+
+def _write_vtk(root: h5py.Group, equilibrium: Equilibrium) -> None:
+    """VTKHDF 2.0 PolyData, as in https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/."""
+    points = equilibrium.s.shape[-1]
+    root.attrs["Version"] = (2, 0)
+    root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads no string of variable length here
+    root["NumberOfPoints"] = [points]
+    root["Points"] = np.reshape(equilibrium.nodes, (-1, 3))
+    # VTK takes the file for empty where one of the four kinds of cells is missing.
+    for kind in ("Vertices", "Lines", "Polygons", "Strips"):
+        cells = root.create_group(kind)
+        ids = np.arange(points if kind == "Lines" else 0)
+        cells["NumberOfCells"] = [min(len(ids), 1)]
+        cells["NumberOfConnectivityIds"] = [len(ids)]
+        cells["Connectivity"] = ids
+        cells["Offsets"] = [0, len(ids)] if len(ids) else [0]
+    data = point_data(equilibrium)
+    for name, values in data.items():
+        root[f"PointData/{name}"] = np.reshape(values, (-1, *values.shape[equilibrium.s.ndim :]))
+    if equilibrium.s.ndim == 2:
+        _write_steps(root.create_group("Steps"), equilibrium.s.shape[0], points, list(data))
+
+
+def _write_steps(steps: h5py.Group, count: int, points: int, names: list[str]) -> None:
+    """Where each time step begins in the arrays: the points and their data move on, the polyline stays."""
+    offsets = np.arange(count) * points
+    steps.attrs["NSteps"] = count
+    steps["Values"] = np.arange(count, dtype=float)
+    steps["PartOffsets"] = np.zeros(count, int)
+    steps["NumberOfParts"] = np.ones(count, int)
+    steps["PointOffsets"] = offsets
+    steps["CellOffsets"] = np.zeros((count, 4), int)
+    steps["ConnectivityIdOffsets"] = np.zeros((count, 4), int)
+    for name in names:
+        steps[f"PointDataOffsets/{name}"] = offsets
+
+
+def _replace(path: Path, image: memoryview) -> None:
+    """Puts a new file in the place of `path` in one step; a kill before it may leave a hidden `.tmp` file behind."""
+    temporary = path.with_name(f".rodjax-{uuid.uuid4().hex}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(image)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = f"cannot write {path.name}: {error.strerror}; folder"
+        raise OSError(error.errno, reason, str(path.parent)) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()

@@ -1,0 +1,265 @@
+"""Pictures of equilibria, as matplotlib figures without pyplot: save them with `figure.savefig("rod.png")`."""
+
+from collections.abc import Sequence
+from typing import Literal, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LightSource, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
+from mpl_toolkits.mplot3d import Axes3D
+
+from rodjax.checks import instance, positive
+from rodjax.discretization.twist import angle_about, transport
+from rodjax.equilibrium import Equilibrium
+
+Field = Literal["curvature", "twist", "tension"]
+LABELS = {"curvature": "curvature [1/m]", "twist": "twist rate [rad/m]", "tension": "tension [N]"}
+STAGES = ["circle segment", "upside-down Omega, no twist"]
+STAGES += [f"end frame turned by {turn}°" for turn in (90, 180, 270, 360)]
+
+COLOR_MAP = "viridis"
+# Faces around the tube, and how many of them each strip takes: narrower is lost, wider hides the field.
+FACES_AROUND = 24
+STRIP_FACES = 4
+# Black along d1, white along -d1: one of the two is in sight.
+STRIPS = ((0, (0.0, 0.0, 0.0)), (FACES_AROUND // 2, (1.0, 1.0, 1.0)))
+# Parts of the picture's size: the thinnest tube, the longest arrow, the least depth of the box around a flat rod.
+LEAST_RADIUS = 0.018
+ARROW_LENGTH = 0.22
+LEAST_DEPTH = 0.3
+# Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
+LEAST_LOAD = 1e-6
+# The view [degrees], and what is right and up in it.
+ELEVATION, AZIMUTH = 22, -62
+RIGHT, UP = np.array((0.88, 0.47, 0.0)), np.array((-0.18, 0.33, 0.93))
+
+
+def plot_rod(
+    equilibrium: Equilibrium,
+    *,
+    color_by: Field = "curvature",
+    loads: bool = False,
+    radius: float | None = None,
+    axes: Axes3D | None = None,
+) -> Figure:
+    """One equilibrium as a shaded tube of equal scale on all axes.
+
+    **Arguments:**
+
+    - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
+    - `color_by`: `"curvature"`, `"twist"` or `"tension"`.
+    - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their size.
+    - `radius` [m] of the tube; `None`: that of the rod, or thicker than life, 1.8 % of the picture, where the rod
+      would be too thin to see: the figure says so.
+    - `axes`: 3-D axes to draw in; `None`: a new figure.
+
+    The black strip runs along the director d1, the white one along -d1: where the rod twists they wind around it.
+    Raises `ValueError` or `TypeError` for arguments that make no sense.
+    """
+    _check(equilibrium, "equilibrium", color_by)
+    if axes is None:
+        axes = Figure(figsize=(7, 5), layout="constrained").add_subplot(projection="3d")
+    instance(axes, "axes", Axes3D)
+    radius, note = _thickness([equilibrium], None if radius is None else float(positive(radius, "radius")))
+    norm = Normalize(*_limits(getattr(equilibrium, color_by)))
+    points = [_draw_tube(axes, equilibrium, radius, color_by, norm)]
+    if loads:
+        points.append(_draw_loads(axes, equilibrium))
+    _set_view(axes, np.concatenate(points))
+    axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
+    figure = cast(Figure, axes.get_figure(root=True))
+    figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)
+    return figure
+
+
+def plot_along(equilibrium: Equilibrium) -> Figure:
+    """Curvature, twist rate and tension of one equilibrium over the arclength."""
+    _check(equilibrium, "equilibrium")
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    s = np.asarray(equilibrium.s)
+    panels = figure.subplots(len(LABELS), 1, sharex=True)
+    for axes, (name, label) in zip(panels, LABELS.items(), strict=True):
+        values = np.asarray(getattr(equilibrium, name))
+        low, high = _limits(values)
+        margin = 0.05 * (high - low)
+        axes.plot(s, values, marker="." if len(s) < 60 else None)
+        axes.set(ylabel=label, ylim=(low - margin, high + margin), xlim=(s[0], s[-1]))
+        axes.ticklabel_format(axis="y", useOffset=False)
+        axes.grid(color="0.9")
+    panels[-1].set_xlabel("arclength s [m]")
+    figure.align_ylabels()
+    return figure
+
+
+def plot_figure_1(
+    path: Sequence[Equilibrium], *, stages: Sequence[int] = range(len(STAGES)), color_by: Field = "curvature"
+) -> Figure:
+    """The pictures (a) to (f) of Fig. 1 of Linn & Stephan (2008), in one view, with one scale of length and colour.
+
+    `path`: the six equilibria: circle segment, Omega, and with the end frame turned by 90, 180, 270 and 360 degrees.
+    `stages`: which of them to draw, 0 for (a) to 5 for (f). `color_by` and the tube as for `plot_rod`.
+    """
+    instance(path, "path", (list, tuple))
+    for k, equilibrium in enumerate(path):
+        _check(equilibrium, f"path[{k}]", color_by)
+    if len(path) != len(STAGES):
+        raise ValueError(f"path must hold the {len(STAGES)} stages (a) to (f), got {len(path)} equilibria")
+    if len(stages) == 0 or not set(stages) <= set(range(len(STAGES))):
+        raise ValueError(f"stages must be some of 0 to {len(STAGES) - 1}, got {list(stages)}")
+    shown = [path[stage] for stage in stages]
+    columns = min(3, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(4 * columns + 1, 3.7 * rows), layout="constrained")
+    panels = [figure.add_subplot(rows, columns, k + 1, projection="3d") for k in range(len(shown))]
+    radius, note = _thickness(shown)
+    norm = Normalize(*_limits(np.concatenate([getattr(equilibrium, color_by) for equilibrium in shown])))
+    points = [_draw_tube(axes, rod, radius, color_by, norm) for axes, rod in zip(panels, shown, strict=True)]
+    grids = [_set_view(axes, np.concatenate(points), labels=False) for axes in panels]
+    for axes, stage, equilibrium in zip(panels, stages, shown, strict=True):
+        twist = f"{round(np.degrees(float(equilibrium.total_twist)))}°"
+        axes.set_title(f"({'abcdef'[stage]}) {STAGES[stage]}\ntotal twist {twist}", fontsize=10, y=0.95)
+    figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=panels, label=LABELS[color_by], shrink=0.6)
+    figure.supxlabel(f"grid {grids[0]:g} m   {note}", fontsize=9, color="0.4")
+    return figure
+
+
+def tube(
+    equilibrium: Equilibrium, radius: float
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k m 3"]]:
+    """A tube around one equilibrium, smooth between the nodes: arclengths, centerline, points of its surface [m].
+
+    The faces of each ring, from point j to j + 1, go around right-handed about the tangent; the middle of the first
+    `STRIP_FACES` is along d1.
+    """
+    turns = abs(float(equilibrium.total_twist)) / (2 * np.pi)
+    s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], int(max(200, 24 * turns)) + 1)
+    centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
+    tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
+    d1 = np.asarray(_directors(equilibrium, s, tangents))
+    d2 = np.cross(tangents, d1)
+    angle = 2 * np.pi / FACES_AROUND * (np.arange(FACES_AROUND + 1) - STRIP_FACES / 2)
+    around = np.cos(angle)[:, None] * d1[:, None] + np.sin(angle)[:, None] * d2[:, None]
+    centerline = np.asarray(centerline)
+    return np.asarray(s), centerline, centerline[:, None] + radius * around
+
+
+def _directors(
+    equilibrium: Equilibrium, s: Float[jax.Array, "k"], tangents: Float[jax.Array, "k 3"]
+) -> Float[jax.Array, "k 3"]:
+    """d1 between the nodes: carried from both neighbours without twist, the angle between the two shared evenly."""
+    spacing = equilibrium.s[1] - equilibrium.s[0]
+    first = jnp.clip(jnp.floor(s / spacing), 0, len(equilibrium.s) - 2)
+    cell = first.astype(int)
+    d1 = equilibrium.frames[:, :, 0]
+    from_before = jax.vmap(transport)(d1[cell], equilibrium.tangents[cell], tangents)
+    from_after = jax.vmap(transport)(d1[cell + 1], equilibrium.tangents[cell + 1], tangents)
+    # Frames give the angle up to turns: take the one nearest to the twist rate.
+    expected = spacing * (equilibrium.twist[cell] + equilibrium.twist[cell + 1]) / 2
+    angle = jax.vmap(angle_about)(tangents, from_before, from_after)
+    angle += 2 * jnp.pi * jnp.round((expected - angle) / (2 * jnp.pi))
+    angle = ((s / spacing - first) * angle)[:, None]
+    return jnp.cos(angle) * from_before + jnp.sin(angle) * jnp.cross(tangents, from_before)
+
+
+def _draw_tube(
+    axes: Axes3D, equilibrium: Equilibrium, radius: float, color_by: Field, norm: Normalize
+) -> Float[np.ndarray, "p 3"]:
+    """Draw one rod; returns points of its surface."""
+    s, centerline, points = tube(equilibrium, radius)
+    values = np.interp((s[:-1] + s[1:]) / 2, np.asarray(equilibrium.s), getattr(equilibrium, color_by))
+    rings = ScalarMappable(norm, COLOR_MAP).to_rgba(values)[:, :3]
+    colors = np.repeat(rings[:, None], FACES_AROUND, axis=1)
+    # The strip is faces of the tube: a line of its own would be sorted in depth as a whole, in front or behind.
+    for first, color in STRIPS:
+        colors[:, first : first + STRIP_FACES] = color
+    # Caps, with a hole too small to see: faces without an area have no normal for the shading.
+    hole = 1e-3
+    caps = [centerline[k] + hole * (points[k] - centerline[k]) for k in (0, -1)]
+    x, y, z = np.moveaxis(np.concatenate([caps[:1], points, caps[1:]]), -1, 0)
+    colors = np.pad(colors, ((1, 1), (0, 0), (0, 0)), mode="edge")
+    light = LightSource(azdeg=AZIMUTH - 20, altdeg=55)
+    axes.plot_surface(x, y, z, facecolors=colors, lightsource=light, rstride=1, cstride=1, lw=0, antialiased=False)
+    return points.reshape(-1, 3)
+
+
+def _draw_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, "p 3"]:
+    """Arrows for the forces and moments that the supports apply to the rod at its ends; returns their tips."""
+    nodes = np.asarray(equilibrium.nodes)
+    length = ARROW_LENGTH * np.max(np.ptp(nodes, axis=0))
+    units = equilibrium.state.units
+    # At s = 0 what the support applies is the reverse of the section force.
+    forces = np.stack([-equilibrium.start_force, equilibrium.end_force])
+    moments = np.stack([-equilibrium.start_moment, equilibrium.end_moment])
+    kinds = ((forces, "N", units.force, "tab:red", [1.0]), (moments, "N m", units.energy, "tab:purple", [1.0, 0.8]))
+    tips = []
+    for loads, unit, scale, color, heads in kinds:
+        sizes = np.linalg.norm(loads, axis=1)
+        for foot, load, size in zip(nodes[[0, -1]], loads, sizes, strict=True):
+            if size < LEAST_LOAD * float(scale):
+                continue
+            along, reach = load / size, length * size / max(sizes)
+            for head in heads:
+                (fx, fy, fz), (x, y, z) = foot, head * reach * along
+                ratio = 0.2 * length / (head * reach)
+                axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
+            x, y, z = foot + (reach + 0.05 * length) * along
+            ha, va = "left" if along @ RIGHT > 0 else "right", "bottom" if along @ UP > 0 else "top"
+            axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va)
+            tips.append((x, y, z))
+    return np.reshape(tips, (-1, 3))
+
+
+def _set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True) -> float:
+    """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    spans = 1.04 * np.maximum(high - low, LEAST_DEPTH * np.max(high - low))
+    ticks = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(0.0, np.max(spans))
+    grid = float(ticks[1] - ticks[0])
+    for axis, center, span in zip((axes.xaxis, axes.yaxis, axes.zaxis), (low + high) / 2, spans, strict=True):
+        axis.axes.set(**{f"{axis.axis_name}lim": (center - span / 2, center + span / 2)})
+        axis.set_major_locator(MultipleLocator(grid))
+        if labels:
+            axis.set_label_text(f"{axis.axis_name} [m]")
+        else:
+            axis.set_major_formatter(NullFormatter())
+    axes.set_box_aspect(tuple(spans), zoom=0.85 if labels else 1.1)  # pyright: ignore[reportArgumentType]
+    axes.set_proj_type("ortho")
+    axes.view_init(ELEVATION, AZIMUTH)
+    return grid
+
+
+def _limits(values: Float[np.ndarray, "p"]) -> tuple[float, float]:
+    """Range of the values; 10 % around them, or -1 to 1, where they are all the same but for rounding."""
+    low, high = float(values.min()), float(values.max())
+    size = max(abs(low), abs(high))
+    if high - low > 1e-5 * size:
+        return low, high
+    margin = 0.1 * size if size > 1e-9 else 1.0
+    return low - margin, high + margin
+
+
+def _thickness(equilibria: Sequence[Equilibrium], radius: float | None = None) -> tuple[float, str]:
+    """Radius of the tubes [m], the one asked for or one that can be seen, and what to say of it in the picture."""
+    true = 0.0 if equilibria[0].radius is None else float(equilibria[0].radius)
+    if radius is None:
+        nodes = np.concatenate([equilibrium.nodes for equilibrium in equilibria])
+        radius = max(LEAST_RADIUS * float(np.max(np.ptp(nodes, axis=0))), true)
+    if abs(radius - true) < 0.01 * radius:
+        return radius, ""
+    return radius, f"drawn {radius / true:.2g} times as thick as it is" if true else "thickness not to scale"
+
+
+def _check(equilibrium: Equilibrium, name: str, color_by: str = "curvature") -> None:
+    instance(equilibrium, name, Equilibrium)
+    if equilibrium.s.ndim != 1:
+        raise ValueError(
+            f"{name} must be a single equilibrium, got a stack of shape {equilibrium.s.shape[:-1]}; "
+            "jax.tree.map(lambda leaf: leaf[-1], path) takes the last one"
+        )
+    if color_by not in LABELS:
+        raise ValueError(f"color_by must be {' or '.join(map(repr, LABELS))}, got {color_by!r}")

@@ -1,0 +1,506 @@
+"""Scenes as TOML files.
+
+A complete example: a cable whose end is brought closer, then turned by one and a half turns. Quantities are strings
+of a number, or a list of numbers, and any unit of the right dimension; what has no dimension is a plain number or list.
+
+    [rod]
+    section = "circular"           # or "tube": outer_radius and inner_radius in the place of radius
+    length = "1 m"
+    radius = "5 mm"
+    youngs_modulus = "10 MPa"
+    poisson_ratio = 0.5            # or shear_modulus = "3.3 MPa"
+    density = "1200 kg/m^3"        # optional
+    # Without a section: length, EI = "4.9e-3 N m^2", GJ = "3.3e-3 N m^2", EA = "785 N",
+    # and optionally mass_per_length = "0.1 kg/m", radius.
+
+    [start]
+    support = "clamp"              # also "swivel": position, tangent; "pin": position; "free": optional force, moment
+    position = "[0, 0, 0] m"
+    tangent = [1, 0, 0]            # or a 3x3 frame, its columns d1, d2, t; optional d2 = [0, 1, 0] is a second axis
+
+    [end]
+    support = "clamp"
+    position = "[80, 0, 0] cm"
+    tangent = [1, 0, 0]
+    spin = "0 deg"                 # optional: turns the frame of a clamp about its own tangent
+    # turns = 1                    # optional: whole extra turns of the end frame, for two clamps and no path
+
+    [loads]                        # optional
+    gravity = "[0, 0, -9.81] m/s^2"
+
+    [[loads.point_force]]          # any number of these
+    at = "0.5 m"
+    force = "[0, 0, -0.2] N"
+
+    [solve]                        # optional
+    segments = 50
+
+    [[path]]                       # any number of these, one after another
+    steps = 10                     # from what came before to these values in equal steps; 1 where it is not given
+    end.position = "[50, 0, 0] cm"
+
+    [[path]]
+    steps = 18
+    end.spin = "540 deg"
+
+The main tables are the first scene of a path. Along it may change: position, tangent, d2, spin, force, moment of the
+two ends, and loads.gravity. Tangents and d2 go along great circles, all else linearly. A step turns an end by less than
+half a turn.
+"""
+
+import functools
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rodjax.checks import instance, is_known, whole_number
+from rodjax.equilibrium import MAX_SEGMENTS
+from rodjax.files import _replace
+from rodjax.loads import PointForce
+from rodjax.rod import Rod
+from rodjax.scene import Scene
+from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
+
+# More steps than this in one table are taken for a mistake: a full turn would go in steps of 0.04 degrees.
+MAX_STEPS = 10_000
+
+# SI unit (none: a plain number), shape and an example of every key that holds numbers.
+_QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "length": ("m", (), '"1 m"'),
+    "radius": ("m", (), '"5 mm"'),
+    "outer_radius": ("m", (), '"5 mm"'),
+    "inner_radius": ("m", (), '"4 mm"'),
+    "youngs_modulus": ("Pa", (), '"10 MPa"'),
+    "shear_modulus": ("Pa", (), '"3.3 MPa"'),
+    "poisson_ratio": ("", (), "0.5"),
+    "density": ("kg/m^3", (), '"1200 kg/m^3"'),
+    "EI": ("N m^2", (), '"4.9e-3 N m^2"'),
+    "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
+    "EA": ("N", (), '"785 N"'),
+    "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
+    "position": ("m", (3,), '"[0.8, 0, 0] m"'),
+    "tangent": ("", (3,), "[1, 0, 0]"),
+    "d2": ("", (3,), "[0, 1, 0]"),
+    "frame": ("", (3, 3), "[[0, 0, 1], [0, 1, 0], [-1, 0, 0]]"),
+    "spin": ("rad", (), '"90 deg"'),
+    "turns": ("", (), "1"),
+    "force": ("N", (3,), '"[0, 0, -0.2] N"'),
+    "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
+    "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
+    "at": ("m", (), '"0.5 m"'),
+}
+_ELASTIC = ("shear_modulus", "poisson_ratio", "density")
+# What makes the rod, and the keys it must and may have.
+_SECTIONS = {
+    "circular": (Rod.circular, ("length", "radius", "youngs_modulus"), _ELASTIC),
+    "tube": (Rod.tube, ("length", "outer_radius", "inner_radius", "youngs_modulus"), _ELASTIC),
+    None: (Rod, ("length", "EI", "GJ", "EA"), ("mass_per_length", "radius")),
+}
+# The keys that a support must have, may have, and may change along a path.
+_SUPPORTS = {
+    "clamp": (("position",), ("frame", "tangent", "d2", "spin"), ("position", "tangent", "d2", "spin")),
+    "swivel": (("position", "tangent"), (), ("position", "tangent")),
+    "pin": (("position",), (), ("position",)),
+    "free": ((), ("force", "moment"), ("force", "moment")),
+}
+# How the scene's own error messages begin, and the keys that they are about.
+_SCENE_KEYS = {
+    "turns": "end.turns",
+    "point_forces": "loads.point_force",
+    "the ends": "start.position, end.position: the ends",
+    "": "start.support, end.support: ",
+}
+_NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
+
+# SI values of the tables start, end and loads, by table and key.
+Values = dict[str, dict[str, Float[np.ndarray, "..."]]]
+
+
+class SceneFileError(ValueError):
+    """A mistake in a scene file. The message is one line with the file, the key and what is allowed."""
+
+
+class SceneFile(NamedTuple):
+    """What a file holds: `scenes`, one or those of a path; whether it `is_path`; `segments` of the mesh or `None`."""
+
+    scenes: list[Scene]
+    is_path: bool
+    segments: int | None
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
+    """The scene in a TOML file, or the list of scenes where the file has a `[[path]]`.
+
+    Raises `SceneFileError` where the file cannot be read or says what makes no sense. See this module for the format.
+    """
+    file = read_scene_file(path)
+    return file.scenes if file.is_path else file.scenes[0]
+
+
+def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
+    """As `read_scene`, with the settings of the solve."""
+    try:
+        return _scene_file(_toml(Path(path)))
+    except SceneFileError as mistake:
+        # Inside this module the message is without the file.
+        raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
+
+
+def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None = None) -> None:
+    """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
+
+    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, `OSError` where the
+    file cannot be written.
+    """
+    instance(scene, "scene", Scene)
+    if not is_known(scene):
+        raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
+    if scene.rod.length.ndim:
+        raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
+    lines = ["[rod]", *_written(scene.rod, ("length", "EI", "GJ", "EA", "mass_per_length", "radius"))]
+    for name, end in (("start", scene.start), ("end", scene.end)):
+        lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']
+        lines += _written(end, ("position", "force", "moment", "frame" if isinstance(end, Clamp) else "tangent"))
+    lines += _written(scene, ("turns",))
+    if scene.gravity is not None:
+        lines += ["", "[loads]", *_written(scene, ("gravity",))]
+    for force in scene.point_forces:
+        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
+    if segments is not None:
+        lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
+    _replace(Path(path), memoryview("\n".join([*lines, ""]).encode()))
+
+
+def _written(module: eqx.Module, keys: Sequence[str]) -> list[str]:
+    """Lines of TOML for those of the keys that the module has."""
+    lines = []
+    for key in keys:
+        value = getattr(module, key, None)
+        if value is not None:
+            numbers, unit = np.asarray(value, float).tolist(), _QUANTITIES[key][0]
+            lines.append(f'{key} = "{numbers} {unit}"' if unit else f"{key} = {numbers}")
+    return lines
+
+
+# --- tables ----------------------------------------------------------------------------------------------------------
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise SceneFileError(f"cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise SceneFileError(f"is not valid TOML: {error}") from None
+
+
+def _scene_file(content: dict[str, Any]) -> SceneFile:
+    _check_keys(content, "", ("rod", "start", "end"), ("loads", "solve", "path"))
+    rod = _rod(content["rod"])
+    kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
+    values = {name: _end_values(content[name], name, kind) for name, kind in kinds.items()}
+    values["loads"], point_forces = _loads(content.get("loads", {}))
+    solve = _check_keys(content.get("solve", {}), "solve", (), ("segments",))
+    with _named("solve"):
+        segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if solve else None
+    turns = values["end"].pop("turns", None)
+    changes = _changes(content["path"], kinds, values) if "path" in content else []
+    if changes and turns is not None:
+        raise SceneFileError("end.turns is not allowed together with path: turn the end along the path by end.spin")
+
+    def scene(values: Values, where: str = "") -> Scene:
+        start, end = (_support(kind, values[name], f"{where}{name}") for name, kind in kinds.items())
+        try:
+            return Scene(rod, start, end, values["loads"].get("gravity"), point_forces, turns)
+        except (TypeError, ValueError) as error:
+            begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
+            raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
+
+    scenes = [scene(values)]
+    for where, steps, target in changes:
+        _check_spin(values, target, steps, where)
+        for step in range(1, steps + 1):
+            scenes.append(scene(_between(values, target, step / steps, where), where))
+            _check_frames(scenes[-2], scenes[-1], f"{where}steps: step {step} of {steps}")
+        values = _between(values, target, 1.0, where)
+    return SceneFile(scenes, bool(changes), segments)
+
+
+def _rod(table: Any) -> Rod:
+    section = _choice(table, "rod", "section", [name for name in _SECTIONS if name])
+    make, required, optional = _SECTIONS[section]
+    values = _values(table, "rod", required, optional, other=("section",))
+    with _named("rod"):
+        return make(**values)
+
+
+def _support_kind(table: Any, where: str) -> str:
+    kind = _choice(table, where, "support", list(_SUPPORTS))
+    if kind is None:
+        raise SceneFileError(f"{where}.support is missing; allowed are {', '.join(_SUPPORTS)}")
+    return kind
+
+
+def _end_values(table: dict[str, Any], where: str, kind: str) -> dict[str, np.ndarray]:
+    required, optional, _ = _SUPPORTS[kind]
+    if kind == "clamp" and where == "end":
+        optional = (*optional, "turns")
+    values = _values(table, where, required, optional, other=("support",))
+    if kind == "clamp":
+        if ("frame" in values) == ("tangent" in values):
+            raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
+        if "frame" in values and "d2" in values:
+            raise SceneFileError(
+                f"{where}.d2 is not allowed together with {where}.frame, which has d2 as its second column"
+            )
+        values = {"spin": np.zeros(())} | ({} if "frame" in values else {"d2": np.array([0.0, 1.0, 0.0])}) | values
+        if abs(values["spin"]) > math.pi:
+            raise SceneFileError(
+                f"{where}.spin must lie in -180 deg to 180 deg in the first scene, got {table['spin']!r}; "
+                "turn further along a [[path]], or by whole turns with end.turns"
+            )
+    return values
+
+
+def _loads(table: Any) -> tuple[dict[str, np.ndarray], list[PointForce]]:
+    values = _values(table, "loads", (), ("gravity",), other=("point_force",))
+    forces = []
+    for k, force in enumerate(_tables(table.get("point_force", []), "loads.point_force")):
+        where = f"loads.point_force[{k}]"
+        with _named(where):
+            forces.append(PointForce(**_values(force, where, ("at", "force"), ())))
+    return values, forces
+
+
+def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:
+    """Where each table of the path is, its steps and new values; adds to `values` the zero loads that it changes."""
+    changes = []
+    for k, table in enumerate(_tables(tables, "path")):
+        where = f"path[{k}]."
+        _check_keys(table, where[:-1], (), ("steps", "start", "end", "loads"))
+        with _named(where[:-1]):
+            steps = whole_number(table.get("steps", 1), "steps", 1, MAX_STEPS)
+        target: Values = {}
+        for name in values:
+            keys = _SUPPORTS[kinds[name]][2] if name in kinds else ("gravity",)
+            if "frame" in values[name]:
+                keys = ("position", "spin")
+            target[name] = _values(table.get(name, {}), f"{where}{name}", (), keys)
+            values[name] = {key: np.zeros(3) for key in target[name] if key not in values[name]} | values[name]
+        if not any(target.values()):
+            raise SceneFileError(f'{where[:-1]} changes nothing; give new values, such as end.spin = "90 deg"')
+        changes.append((where, steps, target))
+    return changes
+
+
+# --- supports and paths ----------------------------------------------------------------------------------------------
+
+
+def _support(kind: str, values: dict[str, np.ndarray], where: str) -> Support:
+    with _named(where):
+        if kind == "clamp":
+            placed = values["frame"] if "frame" in values else frame(values["tangent"], values["d2"])
+            return Clamp(values["position"], _spun(placed, float(values["spin"])))
+        if kind == "swivel":
+            swivel = Swivel(**values)
+            # Swivel divides by the length once more, which may change the last bit of what write_scene wrote.
+            return eqx.tree_at(lambda swivel: swivel.tangent, swivel, jnp.asarray(values["tangent"]))
+        return Pin(**values) if kind == "pin" else Free(**values)
+
+
+def _spun(placed: Any, spin: float) -> Any:
+    """A frame turned about its own tangent."""
+    if spin == 0:
+        return placed
+    d1, d2, tangent = np.asarray(placed).T
+    turned = math.cos(spin) * d1 + math.sin(spin) * d2, math.cos(spin) * d2 - math.sin(spin) * d1
+    return np.stack([*turned, tangent], axis=-1)
+
+
+def _between(before: Values, after: Values, fraction: float, where: str) -> Values:
+    def value(name: str, key: str, old: np.ndarray) -> np.ndarray:
+        new = after[name].get(key, old)
+        if key in ("tangent", "d2"):
+            return _on_great_circle(old, new, fraction, f"{where}{name}.{key}")
+        return (1 - fraction) * old + fraction * new
+
+    return {name: {key: value(name, key, old) for key, old in table.items()} for name, table in before.items()}
+
+
+def _on_great_circle(old: np.ndarray, new: np.ndarray, fraction: float, where: str) -> np.ndarray:
+    angle = math.atan2(float(np.linalg.norm(np.cross(old, new))), float(np.dot(old, new)))
+    # Nearer to opposite the plane of the turn would be mostly rounding of the input.
+    if angle > math.pi - 1e-6:
+        raise SceneFileError(
+            f"{where} must not be opposite to the one before: the way between is not unique, go by a third"
+        )
+    if angle < 1e-12 or fraction == 1:
+        return new
+    return (math.sin((1 - fraction) * angle) * old + math.sin(fraction * angle) * new) / math.sin(angle)
+
+
+def _check_spin(before: Values, after: Values, steps: int, where: str) -> None:
+    """Each end, and the two against each other, must turn by less than half a turn a step."""
+    spins = {
+        f"{name}.spin": float(after[name].get("spin", table["spin"]) - table["spin"])
+        for name, table in before.items()
+        if "spin" in table
+    }
+    if len(spins) == 2:
+        spins["end.spin - start.spin"] = spins["end.spin"] - spins["start.spin"]
+    for key, spin in spins.items():
+        least = math.floor(abs(spin) / math.pi * (1 + 1e-9)) + 1
+        if steps < least:
+            raise SceneFileError(
+                f"{where}{key} must turn by less than 180 deg a step, got {math.degrees(spin) / steps:g} deg; "
+                f"{where}steps must be at least {least}"
+            )
+
+
+def _check_frames(before: Scene, after: Scene, where: str) -> None:
+    """A frame jumps by half a turn where the tangent passes through d2, which defines it."""
+    for name in ("start", "end"):
+        old, new = getattr(before, name), getattr(after, name)
+        # The trace of a rotation is 1 + 2 cos(angle).
+        if isinstance(new, Clamp) and np.sum(np.asarray(old.frame) * np.asarray(new.frame)) < -1 + 1e-6:
+            raise SceneFileError(f"{where} turns the {name} by 180 deg, less is allowed; is its tangent along d2?")
+
+
+# --- values ----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Puts the table before the key with which a message of a constructor begins."""
+    try:
+        yield
+    except SceneFileError:
+        raise
+    except (TypeError, ValueError) as error:
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*_QUANTITIES, "segments", "steps")
+        raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
+
+
+def _check_keys(table: Any, where: str, required: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:
+    _check_table(table, where)
+    prefix = f"{where}." if where else ""
+    allowed = (*required, *optional)
+    for key in table:
+        if key not in allowed:
+            raise SceneFileError(
+                f"{prefix}{' '.join(key.split())} is not allowed here; allowed are {', '.join(allowed)}"
+            )
+    for key in required:
+        if key not in table:
+            example = f"{key} = {_QUANTITIES[key][2]}" if key in _QUANTITIES else f"a table [{key}]"
+            raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
+    return table
+
+
+def _check_table(table: Any, where: str) -> None:
+    if not isinstance(table, dict):
+        raise SceneFileError(f"{where} must be a table, [{where}], got {table!r}")
+
+
+def _tables(tables: Any, where: str) -> list[Any]:
+    if not isinstance(tables, list):
+        raise SceneFileError(f"{where} must be a list of tables, each [[{where}]], got {tables!r}")
+    return tables
+
+
+def _choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
+    _check_table(table, where)
+    if key in table and table[key] not in allowed:
+        raise SceneFileError(f"{where}.{key} must be one of {', '.join(allowed)}, got {table[key]!r}")
+    return table.get(key)
+
+
+def _values(
+    table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """The numbers of a table in SI units. Keys in `other` may be there too and are left out."""
+    _check_keys(table, where, required, (*optional, *other))
+    return {key: _number(value, key, f"{where}.{key}") for key, value in table.items() if key not in other}
+
+
+def _number(value: Any, key: str, where: str) -> Float[np.ndarray, "..."]:
+    """A quantity or plain number of the shape that its key has, in SI units."""
+    si, shape, example = _QUANTITIES[key]
+    numbers, unit = value, ""
+    if si:
+        if not isinstance(value, str):
+            raise SceneFileError(f"{where} must have a unit, for example {key} = {example}, got {value!r}")
+        match = _NUMBER_AND_UNIT.fullmatch(value)
+        if match is None:
+            raise SceneFileError(f"{where} must be a number and a unit, for example {key} = {example}, got {value!r}")
+        numbers, unit = _parsed(match[1]), match[2]
+    if not _has_shape(numbers, shape):
+        kind = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
+        unit_too = "and a unit" if si else "without quotes or unit"
+        raise SceneFileError(f"{where} must be {kind} {unit_too}, for example {key} = {example}, got {value!r}")
+    if si and not unit:
+        raise SceneFileError(f"{where} must have a unit, for example {key} = {example}, got {value!r}")
+    try:
+        array = np.array(numbers, float)
+    except OverflowError:
+        array = np.array(math.inf)
+    array = array * _factor(unit, si, f"{where} must be in {si} or a like unit, for example {key} = {example}")
+    if not np.all(np.isfinite(array)):
+        raise SceneFileError(f"{where} must be finite, got {value!r}")
+    return _unit_vector(array, where) if key in ("tangent", "d2") else array
+
+
+def _parsed(numbers: str) -> Any:
+    if not numbers.startswith("["):
+        return float(numbers)
+    try:
+        return json.loads(numbers, parse_int=float)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _has_shape(numbers: Any, shape: tuple[int, ...]) -> bool:
+    if shape == ():
+        return isinstance(numbers, (int, float)) and not isinstance(numbers, bool)
+    return isinstance(numbers, list) and len(numbers) == shape[0] and all(_has_shape(x, shape[1:]) for x in numbers)
+
+
+def _unit_vector(vector: np.ndarray, where: str) -> Float[np.ndarray, "3"]:
+    """The direction of a vector; itself to the last bit where it has the length 1."""
+    largest = np.max(np.abs(vector))
+    if largest == 0:
+        raise SceneFileError(f"{where} must be a direction, got the zero vector")
+    unit = vector / largest
+    unit = unit / np.linalg.norm(unit)
+    rounding = 4 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
+    return vector if np.allclose(vector, unit, rtol=0, atol=rounding) else unit
+
+
+def _factor(unit: str, si: str, allowed: str) -> float:
+    """How many SI units a unit is."""
+    if unit == si:
+        return 1.0
+    units = _unit_registry()
+    try:
+        return float(units.Quantity(1.0, units.Unit(unit)).to(units.Unit(si)).magnitude)
+    except Exception:  # pint raises anything, down to AssertionError, for what it cannot parse.
+        raise SceneFileError(f"{allowed}, got the unit {unit!r}") from None
+
+
+@functools.cache
+def _unit_registry() -> Any:
+    # Imported here: it takes half a second that plain SI units need not wait for.
+    import pint
+
+    return pint.UnitRegistry()

@@ -1,0 +1,35 @@
+"""A small setting of each experiment, and its numbers."""
+
+import csv
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+def script(name: str):
+    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_mass_spring(tmp_path, capsys):
+    rows = script("mass_spring").main(["--segments", "10", "--out", str(tmp_path)])
+    before, bent, *_, turned = rows
+    # Bending comes out alike, to the error of 10 segments.
+    assert before["chain_lowest"] == pytest.approx(before["rod_lowest"], rel=0.02)
+    assert bent["chain_lowest"] == pytest.approx(bent["rod_lowest"], rel=0.02)
+    # A turn of the end frame moves the rod by 8 % of its length and the chain not at all.
+    assert turned["chain_from_b"] < 1e-9
+    assert turned["chain_out_of_plane"] < 1e-9
+    assert turned["rod_from_b"] == pytest.approx(0.0765, abs=0.005)
+    assert turned["rod_out_of_plane"] == pytest.approx(0.07, abs=0.005)
+    assert capsys.readouterr().out.count("\n") == 8
+    with open(tmp_path / "mass_spring.csv", newline="") as file:
+        assert [row["stage"] for row in csv.DictReader(file)] == list("abcdef")
+    assert (tmp_path / "mass_spring.png").stat().st_size > 10_000

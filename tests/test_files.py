@@ -1,0 +1,310 @@
+"""save() and load(): bitwise round trips, what VTK reads, files that are always whole, and errors in words."""
+
+import dataclasses
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+from vtkmodules.vtkIOHDF import vtkHDFReader
+
+from rodjax import Equilibrium, problems, solve, solve_path
+from rodjax.files import FIELDS, FORMAT, load, point_data, save
+
+
+@pytest.fixture(scope="session")
+def single() -> Equilibrium:
+    return solve(problems.omega(1.0, 0.3), segments=8)
+
+
+@pytest.fixture(scope="session")
+def path_of_three(single) -> Equilibrium:
+    return solve_path([problems.omega(1.0, turn) for turn in (0.3, 0.6, 0.9)], guess=single)
+
+
+@pytest.fixture(params=["single", "path_of_three"])
+def equilibrium(request) -> Equilibrium:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def saved(single, tmp_path):
+    save(single, tmp_path / "rod.vtkhdf")
+    return tmp_path / "rod.vtkhdf"
+
+
+def assert_same(actual: Equilibrium, expected: Equilibrium) -> None:
+    """The same tree and the same arrays, to the last bit."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for one, other in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        assert (one.dtype, one.shape) == (other.dtype, other.shape)
+        assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+
+
+def read_steps(path) -> list:
+    """What VTK makes of a file, one `vtkPolyData` a time step."""
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    steps = []
+    for k in range(max(reader.GetNumberOfSteps(), 1)):
+        reader.SetStep(k)
+        reader.Update()
+        steps.append(reader.GetOutput().NewInstance())
+        steps[-1].DeepCopy(reader.GetOutput())
+    return steps
+
+
+# --- round trip -----------------------------------------------------------------------------------------------------
+
+
+def test_load_gives_back_every_bit(equilibrium, tmp_path):
+    save(equilibrium, tmp_path / "rod.vtkhdf")
+    assert_same(load(tmp_path / "rod.vtkhdf"), equilibrium)
+
+
+def test_unknown_radius_stays_unknown(single, tmp_path):
+    bare = dataclasses.replace(single, radius=None)
+    save(bare, str(tmp_path / "rod.vtkhdf"))
+    assert_same(load(str(tmp_path / "rod.vtkhdf")), bare)
+
+
+def test_not_a_number_and_float32_survive(single, tmp_path):
+    odd = dataclasses.replace(single, residual=jnp.asarray(np.nan), tension=single.tension.astype(jnp.float32))
+    save(odd, tmp_path / "rod.vtkhdf")
+    assert_same(load(tmp_path / "rod.vtkhdf"), odd)
+
+
+def test_warm_start_from_a_file_takes_no_iteration(single, saved):
+    again = solve(problems.omega(1.0, 0.3), guess=load(saved))
+    assert int(again.iterations) == 0
+    np.testing.assert_array_equal(again.nodes, single.nodes)
+    assert_same(again, solve(problems.omega(1.0, 0.3), guess=single))
+
+
+def test_same_result_gives_the_same_bytes(single, saved):
+    first = saved.read_bytes()
+    save(single, saved)
+    assert saved.read_bytes() == first
+
+
+# --- what is in the file --------------------------------------------------------------------------------------------
+
+
+def places(kind, place="") -> set[str]:
+    """Every field of a module class, nested ones with slashes between."""
+    found = set()
+    for field in dataclasses.fields(kind):
+        nested = isinstance(field.type, type) and issubclass(field.type, eqx.Module)
+        found |= places(field.type, f"{place}{field.name}/") if nested else {place + field.name}
+    return found
+
+
+def test_every_field_has_units_and_a_description(saved):
+    assert places(Equilibrium) == set(FIELDS)
+    with h5py.File(saved, "r") as file:
+        for place, (units, description) in FIELDS.items():
+            attributes = file[f"rodjax/{place}"].attrs
+            assert (attributes["units"], attributes["description"]) == (units, description)
+            assert units
+            assert description
+        assert file["rodjax"].attrs["format"] == FORMAT
+        assert re.fullmatch(r"\d+\.\d+\.\d+.*", str(file["rodjax"].attrs["version"]))
+
+
+def test_vtk_reads_the_polyline_and_its_data_at_every_step(equilibrium, tmp_path):
+    save(equilibrium, tmp_path / "rod.vtkhdf")
+    steps = read_steps(tmp_path / "rod.vtkhdf")
+    alone = equilibrium.s.ndim == 1
+    assert len(steps) == (1 if alone else 3)
+    for k, drawn in enumerate(steps):
+        expected = equilibrium if alone else jax.tree.map(lambda leaf, k=k: leaf[k], equilibrium)
+        assert drawn.GetNumberOfCells() == 1
+        assert drawn.GetCell(0).GetClassName() == "vtkPolyLine"
+        ids = drawn.GetCell(0).GetPointIds()
+        assert [ids.GetId(i) for i in range(ids.GetNumberOfIds())] == list(range(9))
+        np.testing.assert_array_equal(vtk_to_numpy(drawn.GetPoints().GetData()), expected.nodes)
+        data = point_data(expected)
+        assert drawn.GetPointData().GetNumberOfArrays() == len(data)
+        for name, values in data.items():
+            np.testing.assert_array_equal(vtk_to_numpy(drawn.GetPointData().GetArray(name)), values, err_msg=name)
+
+
+def test_vtk_takes_the_number_of_the_step_for_the_time(path_of_three, tmp_path):
+    save(path_of_three, tmp_path / "rod.vtkhdf")
+    reader = vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "rod.vtkhdf"))
+    reader.UpdateInformation()
+    information = reader.GetOutputInformation(0)
+    assert information.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) == (0.0, 1.0, 2.0)
+
+
+# --- a file is the old one or the new one ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_failed_write_leaves_the_old_file_and_nothing_else(step, path_of_three, single, saved, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(OSError, match=r"rod\.vtkhdf: No space left on device") as raised:
+        save(path_of_three, saved)
+    monkeypatch.undo()
+    assert raised.value.errno == errno.ENOSPC
+    assert os.listdir(saved.parent) == ["rod.vtkhdf"]
+    assert_same(load(saved), single)
+
+
+def test_interrupted_write_leaves_the_old_file_and_nothing_else(path_of_three, single, saved, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        save(path_of_three, saved)
+    assert os.listdir(saved.parent) == ["rod.vtkhdf"]
+    assert_same(load(saved), single)
+
+
+WRITE_FOREVER = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+from rodjax.files import load, save
+versions = [load(path) for path in sys.argv[2:]]
+save(versions[0], sys.argv[1])
+print("writing", flush=True)
+while True:
+    for version in versions:
+        save(version, sys.argv[1])
+"""
+
+
+def test_killed_writer_leaves_a_whole_file(path_of_three, tmp_path):
+    long = jax.tree.map(lambda leaf: jnp.repeat(leaf, 500, axis=0), path_of_three)
+    versions = [long, dataclasses.replace(long, energy=-long.energy)]
+    sources = [tmp_path / "first.vtkhdf", tmp_path / "second.vtkhdf"]
+    for version, source in zip(versions, sources, strict=True):
+        save(version, source)
+    whole = sources[0].stat().st_size
+    (tmp_path / "target").mkdir()
+    target = tmp_path / "target" / "rod.vtkhdf"
+    for _ in range(2):
+        command = [sys.executable, "-c", WRITE_FOREVER, *map(str, [target, *sources])]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            assert writer.stdout.readline() == b"writing\n"
+            while not any(0 < size < whole for size in sizes(target.parent)):
+                assert writer.poll() is None
+            writer.send_signal(signal.SIGKILL)
+        found = load(target)
+        assert_same(found, versions[int(found.energy[0] != long.energy[0])])
+
+
+def sizes(folder: Path) -> list[int]:
+    """Sizes of the files in a folder in which files come and go."""
+    found = []
+    for file in folder.iterdir():
+        with suppress(FileNotFoundError):
+            found.append(file.stat().st_size)
+    return found
+
+
+# --- errors ---------------------------------------------------------------------------------------------------------
+
+
+def test_other_suffixes_are_refused(single, tmp_path):
+    with pytest.raises(ValueError, match=r"must end in \.vtkhdf, got .*rod\.h5"):
+        save(single, tmp_path / "rod.h5")
+    with pytest.raises(ValueError, match=r"must end in \.vtkhdf, got 'rod'"):
+        load("rod")
+
+
+def test_only_an_equilibrium_can_be_saved(single, tmp_path):
+    with pytest.raises(TypeError, match=r"equilibrium must be an? Equilibrium"):
+        save(single.nodes, tmp_path / "rod.vtkhdf")
+
+
+def test_two_leading_axes_are_refused(path_of_three, tmp_path):
+    grid = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), path_of_three)
+    with pytest.raises(ValueError, match=r"one leading axis, got leading axes \(2, 3\)"):
+        save(grid, tmp_path / "rod.vtkhdf")
+    assert not os.listdir(tmp_path)
+
+
+def test_traced_results_are_refused(single, tmp_path):
+    with pytest.raises(ValueError, match=r"call save outside jax\.jit"):
+        eqx.filter_jit(lambda equilibrium: save(equilibrium, tmp_path / "rod.vtkhdf"))(single)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.vtkhdf"):
+        load(tmp_path / "nowhere.vtkhdf")
+
+
+def test_folders_that_cannot_be_written_are_named(single, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"cannot write rod\.vtkhdf: No such file or directory.*/nowhere'"):
+        save(single, tmp_path / "nowhere" / "rod.vtkhdf")
+    (tmp_path / "note").touch()
+    with pytest.raises(NotADirectoryError, match=r"cannot write rod\.vtkhdf: Not a directory.*/note'"):
+        save(single, tmp_path / "note" / "rod.vtkhdf")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folders_without_permission_are_named(single, tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError, match=r"cannot write rod\.vtkhdf: Permission denied"):
+        save(single, tmp_path / "rod.vtkhdf")
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
+def test_a_file_cut_short_is_refused(part, saved):
+    saved.write_bytes(saved.read_bytes()[: int(part * saved.stat().st_size)])
+    with pytest.raises(ValueError, match=r"rod\.vtkhdf is not a readable HDF5 file"):
+        load(saved)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [
+        ("VTKHDF", "has no group /VTKHDF: load reads files that rodjax.save wrote"),
+        ("rodjax", "has no group /rodjax: load reads files that rodjax.save wrote"),
+        ("rodjax/end_force", "lacks /rodjax/end_force"),
+        ("rodjax/state", "lacks /rodjax/state"),
+        ("rodjax/state/units/length", "lacks /rodjax/state/units/length"),
+    ],
+)
+def test_what_a_file_lacks_is_named(missing, message, saved):
+    with h5py.File(saved, "r+") as file:
+        del file[missing]
+    with pytest.raises(ValueError, match=rf"rod\.vtkhdf {message}"):
+        load(saved)
+
+
+def test_newer_and_absent_formats_are_refused(saved):
+    with h5py.File(saved, "r+") as file:
+        file["rodjax"].attrs.update({"format": FORMAT + 1, "version": "9.0"})
+    with pytest.raises(ValueError, match=rf"format {FORMAT + 1}, written by rodjax 9\.0; .* up to {FORMAT}: update it"):
+        load(saved)
+    with h5py.File(saved, "r+") as file:
+        del file["rodjax"].attrs["format"]
+    with pytest.raises(ValueError, match="lacks the attribute format of /rodjax"):
+        load(saved)
+
+
+def test_numbers_are_never_rounded_silently(saved):
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"holds float64 numbers.*jax_enable_x64"):
+        load(saved)

@@ -1,0 +1,216 @@
+import io
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from rodjax import Clamp, Free, PointForce, Rod, Scene, frame, plot, problems, solve
+from rodjax.discretization.twist import angle_about, transport_along
+
+SEGMENTS = 10
+TURNS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2, 2 * np.pi)
+
+
+@pytest.fixture(scope="module")
+def stages():
+    found = [solve(problems.omega(problems.ARC_HALF_ANGLE, 0.0), segments=SEGMENTS, guess=problems.figure_1_start())]
+    for turn in TURNS:
+        found.append(solve(problems.omega(np.pi / 6, turn), guess=found[-1]))
+    return found
+
+
+@pytest.fixture(scope="module")
+def twisted(stages):
+    return stages[-1]
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=60)
+    file.seek(0)
+    return imread(file)[..., :3]
+
+
+def strip_middle(points):
+    """Direction from the centerline to the middle of the black strip."""
+    first, last = points[:, 0], points[:, plot.STRIP_FACES]
+    return (first + last) / 2
+
+
+def test_the_surface_lies_at_the_radius_from_the_centerline(twisted):
+    _, centerline, points = plot.tube(twisted, 0.02)
+    distance = np.linalg.norm(points - centerline[:, None], axis=-1)
+    np.testing.assert_allclose(distance, 0.02, rtol=1e-12)
+    along = np.gradient(centerline, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    slope = np.einsum("kmi,ki->km", points - centerline[:, None], along) / 0.02
+    assert np.abs(slope[2:-2]).max() < 0.01
+
+
+def test_the_tube_is_smooth_between_ten_segments(twisted):
+    _, centerline, _ = plot.tube(twisted, 0.02)
+    edges = np.diff(centerline, axis=0)
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    corners = np.degrees(np.arccos(np.sum(edges[1:] * edges[:-1], axis=1)))
+    assert len(corners) > 10 * SEGMENTS
+    assert corners.max() < 4
+
+
+def test_the_strip_runs_along_d1_at_the_nodes(twisted):
+    s, centerline, points = plot.tube(twisted, 0.02)
+    strip = strip_middle(points) - centerline
+    strip /= np.linalg.norm(strip, axis=1, keepdims=True)
+    at_nodes = [int(np.argmin(np.abs(s - node))) for node in twisted.s]
+    np.testing.assert_allclose(s[at_nodes], twisted.s, atol=1e-12)
+    np.testing.assert_allclose(strip[at_nodes], twisted.frames[:, :, 0], atol=1e-10)
+
+
+def test_the_strip_winds_by_the_total_twist(twisted):
+    _, centerline, points = plot.tube(twisted, 0.02)
+    strip = strip_middle(points) - centerline
+    strip /= np.linalg.norm(strip, axis=1, keepdims=True)
+    edges = np.diff(centerline, axis=0)
+    tangents = jnp.asarray(edges / np.linalg.norm(edges, axis=1, keepdims=True))
+    tangents = jnp.concatenate([twisted.tangents[:1], tangents, twisted.tangents[-1:]])
+    carried = transport_along(jnp.asarray(strip[0]), tangents)
+    angle = angle_about(tangents[-1], carried[-1], jnp.asarray(strip[-1]))
+    # The twist of the smooth curve through the nodes differs from that of the polyline by its discretization error.
+    assert abs(angle % (2 * np.pi) - twisted.total_twist) < 0.15
+
+
+def test_the_strip_keeps_turns_within_a_segment():
+    """Straight rod, two segments, three turns: more than a turn from node to node."""
+    rod = Rod.circular(1.0, 0.01, 1e7, 4e6)
+    level = frame((1.0, 0.0, 0.0))
+    straight = Scene(rod, Clamp((0.0, 0.0, 0.0), level), Clamp((1.0, 0.0, 0.0), level), turns=3)
+    equilibrium = solve(straight, segments=2)
+    _, centerline, points = plot.tube(equilibrium, 0.02)
+    strip = strip_middle(points) - centerline
+    angle = np.unwrap(np.arctan2(strip[:, 2], strip[:, 1]))
+    assert abs(angle[-1] - angle[0]) == pytest.approx(6 * np.pi, abs=1e-6)
+
+
+def test_the_strips_are_painted_on_the_tube(twisted):
+    figure = plot.plot_rod(twisted)
+    pixels(figure)
+    (surface,) = [a for a in figure.axes[0].collections if isinstance(a, Poly3DCollection)]
+    colors = np.asarray(surface.get_facecolor())
+    s, _, _ = plot.tube(twisted, 0.02)
+    rings = len(s) - 1
+    assert len(colors) == (rings + 2) * plot.FACES_AROUND  # with two caps
+    is_black = np.all(colors[:, :3] == 0, axis=1)
+    assert is_black.sum() == (rings + 2) * plot.STRIP_FACES
+    is_grey = np.ptp(colors[:, :3], axis=1) < 1e-12
+    assert is_grey.sum() == 2 * (rings + 2) * plot.STRIP_FACES
+
+
+@pytest.mark.parametrize(
+    ("color_by", "label"),
+    [("curvature", "curvature [1/m]"), ("twist", "twist rate [rad/m]"), ("tension", "tension [N]")],
+)
+def test_the_color_bar_has_units_and_the_range_of_the_field(twisted, color_by, label):
+    figure = plot.plot_rod(twisted, color_by=color_by)
+    _, bar = figure.axes
+    assert bar.get_ylabel() == label
+    low, high = bar.get_ylim()
+    values = np.asarray(getattr(twisted, color_by))
+    if color_by == "twist":  # constant along the rod
+        values = np.array([0.9, 1.1]) * values[0]
+    np.testing.assert_allclose((low, high), (values.min(), values.max()))
+
+
+def test_all_axes_have_one_scale(twisted):
+    axes = cast(Axes3D, plot.plot_rod(twisted).axes[0])
+    spans = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    ratio = np.asarray(axes._box_aspect) / spans  # pyright: ignore[reportAttributeAccessIssue]
+    np.testing.assert_allclose(ratio, ratio[0])
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis), ("z", axes.zaxis)):
+        assert axis.get_label_text() == f"{name} [m]"
+
+
+def test_a_thin_rod_is_drawn_thicker_and_the_picture_says_so(twisted):
+    def notes(figure):
+        return [text.get_text() for text in figure.axes[0].texts]
+
+    assert notes(plot.plot_rod(twisted, radius=0.005)) == [""]
+    assert notes(plot.plot_rod(twisted, radius=0.015)) == ["drawn 3 times as thick as it is"]
+    size = float(np.max(np.ptp(np.asarray(twisted.nodes), axis=0)))
+    times = plot.LEAST_RADIUS * size / 0.005
+    assert notes(plot.plot_rod(twisted)) == [f"drawn {times:.2g} times as thick as it is"]
+
+
+def test_loads_are_drawn_with_their_size(twisted):
+    texts = [text.get_text() for text in plot.plot_rod(twisted, loads=True).axes[0].texts]
+    expected = []
+    for loads, unit in (
+        ((twisted.start_force, twisted.end_force), "N"),
+        ((twisted.start_moment, twisted.end_moment), "N m"),
+    ):
+        expected += [f"{np.linalg.norm(load):.3g} {unit}" for load in loads]
+    assert texts[:-1] == expected
+
+
+def test_a_free_end_without_load_has_no_arrow(cable):
+    force = PointForce(0.5, (0.0, 0.0, -0.01))
+    scene = Scene(cable, Clamp((0.0, 0.0, 0.0), frame((1.0, 0.0, 0.0))), Free(), point_forces=[force])
+    equilibrium = solve(scene, segments=SEGMENTS)
+    texts = [text.get_text() for text in plot.plot_rod(equilibrium, loads=True).axes[0].texts]
+    assert texts[0] == "0.01 N"
+    assert [text.split()[-1] for text in texts[:-1]] == ["N", "m"]
+
+
+def test_pictures_are_not_blank(twisted):
+    for figure in (plot.plot_rod(twisted, loads=True), plot.plot_along(twisted)):
+        image = pixels(figure)
+        assert np.mean(np.any(image < 0.9, axis=-1)) > 0.01
+        assert np.all(image[0] == 1)  # nothing cut off at the top
+
+
+def test_a_rod_can_be_drawn_in_axes_of_another_figure(twisted):
+    figure = Figure()
+    axes = figure.add_subplot(1, 2, 1, projection="3d")
+    assert plot.plot_rod(twisted, axes=axes) is figure
+    with pytest.raises(TypeError, match=r"axes must be an? Axes3D"):
+        plot.plot_rod(twisted, axes=figure.add_subplot(1, 2, 2))  # pyright: ignore[reportArgumentType]
+
+
+def test_plot_along_shows_the_fields(twisted):
+    figure = plot.plot_along(twisted)
+    assert [axes.get_ylabel() for axes in figure.axes] == list(plot.LABELS.values())
+    assert figure.axes[-1].get_xlabel() == "arclength s [m]"
+    for axes, name in zip(figure.axes, plot.LABELS, strict=True):
+        np.testing.assert_array_equal(axes.lines[0].get_xdata(), twisted.s)
+        np.testing.assert_array_equal(axes.lines[0].get_ydata(), getattr(twisted, name))
+
+
+def test_figure_1_shows_six_stages_alike(stages):
+    figure = plot.plot_figure_1(stages)
+    panels = [cast(Axes3D, axes) for axes in figure.axes[:6]]
+    titles = [axes.get_title() for axes in panels]
+    assert titles[0] == "(a) circle segment\ntotal twist 0°"
+    assert titles[1].startswith("(b) upside-down Omega, no twist\n")
+    assert titles[5].startswith("(f) end frame turned by 360°\n")
+    assert len({(axes.get_xlim(), axes.get_ylim(), axes.get_zlim(), axes.elev, axes.azim) for axes in panels}) == 1
+    assert figure.axes[6].get_ylabel() == "curvature [1/m]"
+    assert pixels(figure).std() > 0.05
+    chosen = plot.plot_figure_1(stages, stages=(1, 5))
+    assert [axes.get_title()[:3] for axes in chosen.axes[:2]] == ["(b)", "(f)"]
+
+
+def test_errors_say_what_is_allowed(stages, twisted):
+    with pytest.raises(ValueError, match="color_by must be 'curvature' or 'twist' or 'tension', got 'strain'"):
+        plot.plot_rod(twisted, color_by="strain")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="radius must be positive"):
+        plot.plot_rod(twisted, radius=0.0)
+    with pytest.raises(ValueError, match=r"equilibrium must be a single equilibrium, got a stack of shape \(2,\)"):
+        plot.plot_along(jax.tree.map(lambda *leaves: jnp.stack(leaves), twisted, twisted))
+    with pytest.raises(ValueError, match=r"path must hold the 6 stages \(a\) to \(f\), got 5 equilibria"):
+        plot.plot_figure_1(stages[:5])
+    with pytest.raises(ValueError, match="stages must be some of 0 to 5"):
+        plot.plot_figure_1(stages, stages=(6,))

@@ -1,0 +1,374 @@
+"""Scenes as TOML: the same numbers come back, paths are what they say, and each mistake is named in one line."""
+
+import inspect
+import math
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import rodjax
+from rodjax import Clamp, Free, Pin, PointForce, Rod, Scene, Swivel, problems, scene_file
+from rodjax.scene_file import SceneFileError, read_scene, read_scene_file, write_scene
+
+SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
+
+ROD = """
+[rod]
+length = "1 m"
+EI = "4.9e-3 N m^2"
+GJ = "3.3e-3 N m^2"
+EA = "785 N"
+"""
+START = """
+[start]
+support = "clamp"
+position = "[0, 0, 0] m"
+tangent = [1, 0, 0]
+"""
+END = """
+[end]
+support = "clamp"
+position = "[0.8, 0, 0] m"
+tangent = [1, 0, 0]
+"""
+FREE = """
+[end]
+support = "free"
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Reads a scene from the text of a file."""
+
+    def read(text):
+        path = tmp_path / "scene.toml"
+        path.write_text(text, encoding="utf-8")
+        return read_scene_file(path)
+
+    return read
+
+
+def assert_same(scene, expected, atol=0.0):
+    assert jax.tree.structure(scene) == jax.tree.structure(expected)
+    for value, other in zip(jax.tree.leaves(scene), jax.tree.leaves(expected), strict=True):
+        assert value.dtype == other.dtype
+        np.testing.assert_allclose(value, other, rtol=0, atol=atol)
+
+
+def awkward(size, seed=0):
+    """Numbers that use all their digits."""
+    return np.random.default_rng(seed).normal(size=size)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("ends", ["clamps", "swivels", "pins", "free end", "free start"])
+def test_write_and_read_give_the_same_numbers_to_the_last_bit(ends, seed, tmp_path):
+    rod = Rod(1 / 3, *np.abs(awkward(3, seed)) * [1e-3, 1e-5, 1e6], mass_per_length=0.1, radius=1 / 300)
+    x, y, t, v = awkward((4, 3), seed) / 10
+    clamp = Clamp(x / 10, rodjax.frame(t, v))
+    start, end = {
+        "clamps": (clamp, Clamp(y / 10, rodjax.frame(v, t))),
+        "swivels": (Swivel(x / 10, t), Swivel(y / 10, v)),
+        "pins": (Pin(x / 10), Pin(y / 10)),
+        "free end": (clamp, Free(v, t)),
+        "free start": (Free(), clamp),
+    }[ends]
+    turns = -2 if ends == "clamps" else None
+    forces = [PointForce(0.1, v), PointForce(0.2, t)]
+    path = tmp_path / "scene.toml"
+    for scene in (Scene(rod, start, end, 9.81 * t, forces, turns), Scene(rod, start, end)):
+        write_scene(scene, path, segments=30)
+        assert_same(read_scene(path), scene)
+        assert read_scene_file(path).segments == 30
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.toml"]
+
+
+def test_write_refuses_what_is_not_one_scene(tmp_path):
+    scene = problems.hanging_cable()
+    stack = jax.tree.map(lambda leaf: leaf[None], scene)
+    path = tmp_path / "scene.toml"
+    with pytest.raises(ValueError, match="single scene"):
+        write_scene(stack, path)
+    with pytest.raises(TypeError, match="must be a Scene"):
+        write_scene([scene], path)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="segments must be a whole number from 2"):
+        write_scene(scene, path, segments=1)
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda scene: write_scene(scene, path))(scene)
+    with pytest.raises(OSError, match="missing"):
+        write_scene(scene, tmp_path / "missing" / "scene.toml")
+    assert not path.exists()
+
+
+def test_the_example_in_the_documentation_is_a_path_with_all_it_names(read):
+    text = inspect.getdoc(scene_file)
+    assert text
+    example = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
+    assert {"rod", "start", "end", "loads", "solve", "path"} == set(tomllib.loads(example))
+    file = read(example)
+    assert len(file.scenes) == 29
+    assert file.segments == 50
+    np.testing.assert_allclose(file.scenes[10].end.position, [0.5, 0, 0], atol=1e-15)
+
+
+def test_hanging_cable_is_the_benchmark_problem():
+    scene = read_scene(SCENES / "hanging_cable.toml")
+    assert isinstance(scene, Scene)
+    assert_same(scene, problems.hanging_cable(), atol=1e-9)
+    np.testing.assert_allclose(scene.rod.GJ, problems.cable().GJ, rtol=1e-14)
+
+
+def test_figure_1_is_the_benchmark_problem_after_the_circle_segment():
+    scenes = read_scene(SCENES / "figure_1.toml")
+    assert isinstance(scenes, list)
+    expected = [problems.omega(problems.ARC_HALF_ANGLE, 0.0), *problems.figure_1()]
+    assert len(scenes) == len(expected) == 26
+    for scene, other in zip(scenes, expected, strict=True):
+        assert_same(scene, other, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('length = "100 cm"', 1.0),
+        ('length = "1e3mm"', 1.0),
+        ('length = " .5  m "', 0.5),
+        ('length = "+2 inch"', 0.0508),
+        ("length = '1000000 µm'", 1.0),
+    ],
+)
+def test_units(line, expected, read):
+    file = read(ROD.replace('length = "1 m"', line) + START + FREE)
+    np.testing.assert_allclose(file.scenes[0].rod.length, expected, rtol=1e-15)
+
+
+def test_sections_are_those_of_rod(read):
+    ends = START + FREE
+    tube = read(
+        '[rod]\nsection = "tube"\nlength = "1 m"\nouter_radius = "6 mm"\ninner_radius = "4 mm"\n'
+        'youngs_modulus = "10 N/mm^2"\npoisson_ratio = 0.5\n' + ends
+    ).scenes[0]
+    expected = Rod.tube(1.0, 0.006, 0.004, 1e7, poisson_ratio=0.5)
+    assert_same(tube.rod, expected)
+
+
+def test_spin_turns_the_frame_about_its_tangent(read):
+    scene = read(ROD + START + END.replace("[1, 0, 0]", '[0, 0, 2]\nspin = "90 deg"')).scenes[0]
+    np.testing.assert_allclose(scene.end.frame, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+
+def test_a_path_goes_linearly_and_tangents_along_great_circles(read):
+    path = """
+[[path]]
+steps = 3
+start.tangent = [0, 0, 5]
+end.moment = "[0, 3, 0] N mm"
+loads.gravity = "[0, 0, -9] m/s^2"
+[[path]]
+end.force = "[0, 0, -2] N"
+start.spin = "10 deg"
+start.position = "[0, 0, 1] m"
+"""
+    scenes = read(ROD + START + FREE + path).scenes
+    assert len(scenes) == 5
+    # What is absent at first and then grows is zero at first, so that the scenes have one structure.
+    assert len({str(jax.tree.structure(scene)) for scene in scenes}) == 1
+    np.testing.assert_array_equal([scene.gravity[2] for scene in scenes], [0, -3, -6, -9, -9])
+    np.testing.assert_allclose([scene.end.moment[1] for scene in scenes], np.array([0, 1, 2, 3, 3]) / 1e3, atol=1e-18)
+    np.testing.assert_array_equal([scene.end.force[2] for scene in scenes], [0, 0, 0, 0, -2])
+    np.testing.assert_array_equal([scene.start.position[2] for scene in scenes], [0, 0, 0, 0, 1])
+    angle = np.radians([0, 30, 60, 90, 90])
+    tangents = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    np.testing.assert_allclose([scene.start.tangent for scene in scenes], tangents, atol=1e-15)
+    d2 = [[0, 1, 0]] * 4 + [[-math.sin(math.radians(10)), math.cos(math.radians(10)), 0]]
+    # At tangent e_z: d1 = d2 x t = e_x, and d2 turns from e_y towards -d1.
+    np.testing.assert_allclose([scene.start.frame[:, 1] for scene in scenes], d2, atol=1e-15)
+
+
+def test_d2_is_made_orthogonal_again_along_a_path(read):
+    tilted = START.replace("[1, 0, 0]", "[1, 0, 0]\nd2 = [1, 1, 0]")
+    path = "\n[[path]]\nsteps = 4\nstart.tangent = [0, 0, 1]\nstart.d2 = [0, 1, 1]\n"
+    for scene in read(ROD + tilted + FREE + path).scenes:
+        np.testing.assert_allclose(scene.start.frame.T @ scene.start.frame, np.eye(3), atol=1e-14)
+
+
+def test_a_clamp_with_a_frame_may_move_and_spin(read):
+    framed = START.replace("tangent = [1, 0, 0]", "frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]")
+    path = '\n[[path]]\nsteps = 2\nstart.spin = "180 deg"\n'
+    scenes = read(ROD + framed + FREE + path).scenes
+    np.testing.assert_allclose(scenes[2].start.frame, [[0, 0, 1], [0, -1, 0], [1, 0, 0]], atol=1e-15)
+
+
+MISTAKES = [
+    # syntax and tables
+    ("[rod\n", "is not valid TOML", "line 1"),
+    (START + END, "rod is missing", "[rod]"),
+    ("rod = 5\n" + START + END, "rod must be a table", "[rod]"),
+    (
+        ROD + "color = 1\n" + START + END,
+        "rod.color is not allowed",
+        "length, EI, GJ, EA, mass_per_length, radius, section",
+    ),
+    (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, solve, path"),
+    (ROD + START + END + "path = 1\n", "end.path is not allowed", "position, frame, tangent, d2, spin"),
+    ("path = 1\n" + ROD + START + END, "path must be a list of tables", "[[path]]"),
+    ("path = [1]\n" + ROD + START + END, "path[0] must be a table", "got 1"),
+    # the rod
+    (ROD.replace('"1 m"', "5") + START + END, "rod.length must have a unit", 'length = "1 m"'),
+    (ROD.replace('"1 m"', '"5"') + START + END, "rod.length must have a unit", 'length = "1 m"'),
+    (ROD.replace('"1 m"', '"5 kg"') + START + END, "rod.length must be in m", "'kg'"),
+    (ROD.replace('"1 m"', '"5 (m"') + START + END, "rod.length must be in m", "'(m'"),
+    (ROD.replace('"1 m"', '"5 yards of it"') + START + END, "rod.length must be in m", 'length = "1 m"'),
+    (ROD.replace('"1 m"', '"long"') + START + END, "rod.length must be a number and a unit", 'length = "1 m"'),
+    (ROD.replace('"1 m"', '"[1, 2] m"') + START + END, "rod.length must be a number and a unit", 'length = "1 m"'),
+    (ROD.replace('"1 m"', "true") + START + END, "rod.length must have a unit", 'length = "1 m"'),
+    (ROD.replace('"1 m"', '"-5 mm"') + START + END, "rod.length must be positive", "-0.005"),
+    (ROD.replace('"1 m"', '"nan m"') + START + END, "rod.length must be finite", "nan m"),
+    (ROD.replace('"785 N"', '"inf N"') + START + END, "rod.EA must be finite", "inf N"),
+    (ROD.replace('"785 N"', '"1e999 N"') + START + END, "rod.EA must be finite", "1e999"),
+    (ROD.replace('EA = "785 N"', "") + START + END, "rod.EA is missing", 'EA = "785 N"'),
+    ('[rod]\nsection = "square"\n' + START + END, "rod.section must be one of", "circular, tube"),
+    ('[rod]\nsection = ["tube"]\n' + START + END, "rod.section must be one of", "circular, tube"),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = "5 mm"\nyoungs_modulus = "1 MPa"\n' + START + END,
+        "rod: exactly one of",
+        "shear_modulus and poisson_ratio",
+    ),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = "5 mm"\nyoungs_modulus = "1 MPa"\n'
+        'poisson_ratio = "0.5"\n' + START + END,
+        "rod.poisson_ratio must be a number without quotes",
+        "poisson_ratio = 0.5",
+    ),
+    # the ends
+    (ROD + START.replace('support = "clamp"', "") + END, "start.support is missing", "clamp, swivel, pin, free"),
+    (ROD + START.replace("clamp", "glue") + END, "start.support must be one of", "clamp, swivel, pin, free"),
+    (ROD + START.replace("clamp", "pin") + END, "start.tangent is not allowed", "position"),
+    (ROD + START.replace("[1, 0, 0]", "[0, 0, 0]") + END, "start.tangent must be a direction", "zero vector"),
+    (ROD + START.replace("[1, 0, 0]", "[1, 0]") + END, "start.tangent must be 3 numbers", "[1, 0, 0]"),
+    (ROD + START.replace("[1, 0, 0]", '"[1, 0, 0]"') + END, "start.tangent must be 3 numbers", "without quotes"),
+    (ROD + START.replace("[1, 0, 0]", "[1, 0, nan]") + END, "start.tangent must be finite", "nan"),
+    (ROD + START.replace("[1, 0, 0]", f"[1{400 * '0'}, 0, 0]") + END, "start.tangent must be finite", "1000"),
+    (ROD + START.replace("[1, 0, 0]", "[0, 1, 0]") + END, "start.d2 must not be parallel", "tangent"),
+    (ROD + START.replace("tangent = [1, 0, 0]", "") + END, "start.tangent or start.frame", "exactly one"),
+    (ROD + START + "frame = [[1,0,0],[0,1,0],[0,0,1]]\n" + END, "start.tangent or start.frame", "exactly one"),
+    (
+        ROD + START.replace("tangent = [1, 0, 0]", "d2 = [0, 1, 0]\nframe = [[1,0,0],[0,1,0],[0,0,1]]") + END,
+        "start.d2 is not allowed",
+        "second column",
+    ),
+    (
+        ROD + START.replace("tangent = [1, 0, 0]", "frame = [[1, 0, 0], [0, 1, 0], [0, 0, 2]]") + END,
+        "start.frame must be a rotation",
+        "unit length",
+    ),
+    (
+        ROD + START.replace("tangent = [1, 0, 0]", "frame = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]") + END,
+        "start.frame must be right-handed",
+        "d1 x d2 = t",
+    ),
+    (ROD + START + END.replace('"[0.8, 0, 0] m"', "[0.8, 0, 0]"), "end.position must have a unit", "[0.8, 0, 0] m"),
+    (ROD + START + END.replace('"[0.8, 0, 0] m"', '"0.8 m"'), "end.position must be 3 numbers", "[0.8, 0, 0] m"),
+    (ROD + START + END.replace("[0.8, 0, 0]", "[0.8, 0, x]"), "end.position must be 3 numbers", "[0.8, 0, 0] m"),
+    (ROD + START + END.replace("[0.8, 0, 0]", "[0.8, 0, true]"), "end.position must be 3 numbers", "[0.8, 0, 0] m"),
+    (ROD + START + END.replace("0.8", "3.8"), "end.position: the ends are 3.8 m apart", "at most 1.5 m"),
+    (ROD + START + END + "turns = 0.5\n", "end.turns must be a whole number", "0.5"),
+    (ROD + START + "turns = 1\n" + END, "start.turns is not allowed", "position, frame, tangent, d2, spin"),
+    (ROD + START + END + 'spin = "270 deg"\n', "end.spin must lie in -180 deg to 180 deg", "end.turns"),
+    (ROD + START + END + "spin = 1.5\n", "end.spin must have a unit", 'spin = "90 deg"'),
+    (
+        ROD + '[start]\nsupport = "pin"\nposition = "[0, 0, 0] m"\n' + FREE,
+        "start.support, end.support: Pin at the start and Free",
+        "without gravity or a force",
+    ),
+    (ROD + '[start]\nsupport = "free"\n' + FREE, "start.support, end.support: Free", "Clamp, Swivel or Pin"),
+    (
+        ROD + '[start]\nsupport = "pin"\nposition = "[0, 0, 0] m"\n' + END + "turns = 1\n",
+        "end.turns need a Clamp at both ends",
+        "Pin",
+    ),
+    # loads, solve
+    (ROD + START + END + "[loads]\ngravity = 9.81\n", "loads.gravity must have a unit", "[0, 0, -9.81] m/s^2"),
+    (ROD + START + END + '[loads]\ngravity = "[0, 0, -1] m"\n', "loads.gravity must be in m/s^2", "'m'"),
+    (ROD + START + END + "[loads]\npoint_force = 1\n", "loads.point_force must be a list", "[[loads.point_force]]"),
+    (
+        ROD + START + END + '[[loads.point_force]]\nat = "2 m"\nforce = "[0, 0, 1] N"\n',
+        "loads.point_force[0].at must lie in 0 to 1 m",
+        "2 m",
+    ),
+    (
+        ROD + START + END + '[[loads.point_force]]\nat = "-2 m"\nforce = "[0, 0, 1] N"\n',
+        "loads.point_force[0].at must not be negative",
+        "-2",
+    ),
+    (ROD + START + END + '[[loads.point_force]]\nat = "2 m"\n', "loads.point_force[0].force is missing", "N"),
+    (ROD + START + END + "[solve]\nsegments = 1\n", "solve.segments must be a whole number", "2 to 100000"),
+    (ROD + START + END + "[solve]\nsegments = 2.5\n", "solve.segments must be a whole number", "2 to 100000"),
+    (ROD + START + END + "[solve]\nsteps = 2\n", "solve.steps is not allowed", "segments"),
+    # paths
+    (ROD + START + END + "[[path]]\nsteps = 3\n", "path[0] changes nothing", "end.spin"),
+    (ROD + START + END + "[[path]]\nsteps = 0\n", "path[0].steps must be a whole number", "1 to 10000"),
+    (ROD + START + END + "[[path]]\nend.turns = 1\n", "path[0].end.turns is not allowed", "spin"),
+    (ROD + START + END + '[[path]]\nrod.length = "2 m"\n', "path[0].rod is not allowed", "start, end, loads"),
+    (ROD + START + END + "[[path]]\nend.tangent = [-1, 0, 0]\n", "path[0].end.tangent must not be opposite", "third"),
+    (ROD + START + END + "[[path]]\nend.tangent = [0, 0, 0]\n", "path[0].end.tangent must be a direction", "zero"),
+    (
+        ROD + START + END + '[[path]]\nsteps = 2\nend.spin = "360 deg"\n',
+        "path[0].end.spin must turn by less than 180 deg a step",
+        "path[0].steps must be at least 3",
+    ),
+    (
+        ROD + START + END + '[[path]]\nend.spin = "100 deg"\nstart.spin = "-100 deg"\n',
+        "path[0].end.spin - start.spin must turn by less than 180 deg a step",
+        "path[0].steps must be at least 2",
+    ),
+    (
+        ROD + START + END + '[[path]]\nsteps = 2\nend.position = "[0.9, 0, 0] m"\n'
+        '[[path]]\nsteps = 9\nend.position = "[9, 0, 0] m"\n',
+        "path[1].start.position, end.position: the ends are",
+        "at most 1.5 m",
+    ),
+    (
+        ROD + START + END + "[[path]]\nsteps = 7\nend.tangent = [0, 1, 0.00]\n",
+        "path[0].end.d2 must not be parallel",
+        "tangent",
+    ),
+    (
+        ROD + START + END + "[[path]]\nsteps = 3\nend.tangent = [-0.5, 0.8660254037844386, 0]\n",
+        "path[0].steps: step 3 of 3 turns the end by 180 deg",
+        "d2",
+    ),
+    (
+        ROD + START + END + "turns = 1\n" + '[[path]]\nend.spin = "90 deg"\n',
+        "end.turns is not allowed together with path",
+        "end.spin",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "key", "allowed"), MISTAKES, ids=[key for _, key, _ in MISTAKES])
+def test_a_mistake_is_named_in_one_line(text, key, allowed, read, tmp_path):
+    with pytest.raises(SceneFileError) as caught:
+        read(text)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"{tmp_path / 'scene.toml'}: ")
+    assert key in message
+    assert allowed in message
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(SceneFileError, match=r"missing\.toml: cannot be read: No such file"):
+        read_scene(tmp_path / "missing.toml")
+    with pytest.raises(SceneFileError, match="cannot be read: Is a directory"):
+        read_scene(tmp_path)
+    (tmp_path / "picture.toml").write_bytes(b"\x89PNG\r\n")
+    with pytest.raises(SceneFileError, match=r"picture\.toml: is not valid TOML"):
+        read_scene(tmp_path / "picture.toml")
+    (tmp_path / "deep.toml").write_text("a = " + 100_000 * "[")
+    with pytest.raises(SceneFileError, match=r"deep\.toml: is not valid TOML"):
+        read_scene(tmp_path / "deep.toml")

@@ -74,7 +74,7 @@ def rotation(value: Any, name: str) -> Float[Array, "3 3"]:
         if error > tolerance:
             raise ValueError(
                 f"{name} must be a rotation (columns d1, d2, t of unit length at right angles), "
-                f"got one that is off by {error:.1e}; rodjax.frame(tangent, d2) makes one"
+                f"got one that is off by {error:.1e}; tangent and d2 make one, in Python by rodjax.frame(tangent, d2)"
             )
         if np.linalg.det(matrix) < 0:
             raise ValueError(f"{name} must be right-handed (d1 x d2 = t), got a left-handed frame")

@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     solve.set_defaults(run=_solve)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
-    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; default: the report's 10")
+    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
     demo.set_defaults(run=_demo)
     return parser
 

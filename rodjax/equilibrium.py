@@ -173,8 +173,8 @@ def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver
     """The one code path of every solve: from a state to an equilibrium."""
     scaled, units = nondimensional(scene)
     polyline = _in_units(state, units)
-    problem, minimum = _found(scaled, polyline, twist, solver=solver)
-    point = minimum.point
+    minimum = _found(scaled, polyline, twist, solver=solver)
+    problem, point = minimum.problem, minimum.point
     resultants = problem.resultants(point)
     n = len(point.edges)
     fraction = jnp.linspace(0.0, 1.0, n + 1, dtype=point.nodes.dtype)
@@ -203,18 +203,17 @@ def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver
 
 
 @eqx.filter_custom_jvp
-def _found(
-    scene: Scene, polyline: Polyline, twist: Float[Array, ""], *, solver: NonlinearCG
-) -> tuple[FiniteDifference, Minimum]:
+def _found(scene: Scene, polyline: Polyline, twist: Float[Array, ""], *, solver: NonlinearCG) -> Minimum:
     problem, start = FiniteDifference.begin(scene, polyline, twist)
-    return problem, minimize(problem, start, solver)
+    return minimize(problem, start, solver)
 
 
 @_found.def_jvp
 def _no_derivative(primals, tangents, *, solver: NonlinearCG):
     # Differentiating the iterations would give numbers that look right and are not.
     raise NotImplementedError(
-        "the derivative of a solve is not part of this version; take central differences of solves with a tight tolerance"
+        "the derivative of a solve is not part of this version; "
+        "take central differences of solves with a tight tolerance"
     )
 
 

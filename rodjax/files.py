@@ -10,8 +10,6 @@ import io
 import os
 import types
 import typing
-import uuid
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.atomic_write import replace_file
 from rodjax.checks import instance, is_known
 from rodjax.equilibrium import Equilibrium
 from rodjax.status import Status
@@ -87,7 +86,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
         from rodjax import __version__
 
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
-    _replace(path, image.getbuffer())
+    replace_file(path, image.getbuffer())
 
 
 def load(path: str | os.PathLike[str]) -> Equilibrium:
@@ -217,20 +216,3 @@ def _write_steps(steps: h5py.Group, count: int, points: int, names: list[str]) -
     steps["ConnectivityIdOffsets"] = np.zeros((count, 4), int)
     for name in names:
         steps[f"PointDataOffsets/{name}"] = offsets
-
-
-def _replace(path: Path, image: memoryview) -> None:
-    """Puts a new file in the place of `path` in one step; a kill before it may leave a hidden `.tmp` file behind."""
-    temporary = path.with_name(f".rodjax-{uuid.uuid4().hex}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            file.write(image)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        reason = f"cannot write {path.name}: {error.strerror}; folder"
-        raise OSError(error.errno, reason, str(path.parent)) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()

@@ -92,7 +92,7 @@ def _round_section(
     E = positive(youngs_modulus, "youngs_modulus")
     G = _shear_modulus(E, shear_modulus, poisson_ratio)
     # The differences of powers are factored so that a thin wall keeps its digits.
-    area = positive(math.pi * (outer - inner) * (outer + inner), "outer_radius - inner_radius")
+    area = math.pi * positive(outer - inner, "outer_radius - inner_radius") * (outer + inner)
     second_moment = area * (outer**2 + inner**2) / 4
     return Rod(
         length,

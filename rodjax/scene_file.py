@@ -48,14 +48,10 @@ two ends, and loads.gravity. Tangents and d2 go along great circles, all else li
 half a turn.
 """
 
-import functools
-import json
 import math
 import os
-import re
 import tomllib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,10 +60,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from rodjax.atomic_write import replace_file
 from rodjax.checks import instance, is_known, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS
-from rodjax.files import _replace
 from rodjax.loads import PointForce
+from rodjax.quantities import SceneFileError, assignment, check_keys, choice, named, si_values, table_list
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
@@ -75,31 +72,6 @@ from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
 # More steps than this in one table are taken for a mistake: a full turn would go in steps of 0.04 degrees.
 MAX_STEPS = 10_000
 
-# SI unit (none: a plain number), shape and an example of every key that holds numbers.
-_QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
-    "length": ("m", (), '"1 m"'),
-    "radius": ("m", (), '"5 mm"'),
-    "outer_radius": ("m", (), '"5 mm"'),
-    "inner_radius": ("m", (), '"4 mm"'),
-    "youngs_modulus": ("Pa", (), '"10 MPa"'),
-    "shear_modulus": ("Pa", (), '"3.3 MPa"'),
-    "poisson_ratio": ("", (), "0.5"),
-    "density": ("kg/m^3", (), '"1200 kg/m^3"'),
-    "EI": ("N m^2", (), '"4.9e-3 N m^2"'),
-    "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
-    "EA": ("N", (), '"785 N"'),
-    "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
-    "position": ("m", (3,), '"[0.8, 0, 0] m"'),
-    "tangent": ("", (3,), "[1, 0, 0]"),
-    "d2": ("", (3,), "[0, 1, 0]"),
-    "frame": ("", (3, 3), "[[0, 0, 1], [0, 1, 0], [-1, 0, 0]]"),
-    "spin": ("rad", (), '"90 deg"'),
-    "turns": ("", (), "1"),
-    "force": ("N", (3,), '"[0, 0, -0.2] N"'),
-    "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
-    "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
-    "at": ("m", (), '"0.5 m"'),
-}
 _ELASTIC = ("shear_modulus", "poisson_ratio", "density")
 # What makes the rod, and the keys it must and may have.
 _SECTIONS = {
@@ -121,14 +93,9 @@ _SCENE_KEYS = {
     "the ends": "start.position, end.position: the ends",
     "": "start.support, end.support: ",
 }
-_NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
 
 # SI values of the tables start, end and loads, by table and key.
 Values = dict[str, dict[str, Float[np.ndarray, "..."]]]
-
-
-class SceneFileError(ValueError):
-    """A mistake in a scene file. The message is one line with the file, the key and what is allowed."""
 
 
 class SceneFile(NamedTuple):
@@ -153,7 +120,7 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     try:
         return _scene_file(_toml(Path(path)))
     except SceneFileError as mistake:
-        # Inside this module the message is without the file.
+        # Up to here the message is without the file.
         raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
 
 
@@ -179,18 +146,13 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
-    _replace(Path(path), memoryview("\n".join([*lines, ""]).encode()))
+    replace_file(Path(path), "\n".join([*lines, ""]).encode())
 
 
 def _written(module: eqx.Module, keys: Sequence[str]) -> list[str]:
     """Lines of TOML for those of the keys that the module has."""
-    lines = []
-    for key in keys:
-        value = getattr(module, key, None)
-        if value is not None:
-            numbers, unit = np.asarray(value, float).tolist(), _QUANTITIES[key][0]
-            lines.append(f'{key} = "{numbers} {unit}"' if unit else f"{key} = {numbers}")
-    return lines
+    values = {key: getattr(module, key, None) for key in keys}
+    return [assignment(key, value) for key, value in values.items() if value is not None]
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -206,13 +168,13 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _scene_file(content: dict[str, Any]) -> SceneFile:
-    _check_keys(content, "", ("rod", "start", "end"), ("loads", "solve", "path"))
+    check_keys(content, "", ("rod", "start", "end"), ("loads", "solve", "path"))
     rod = _rod(content["rod"])
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: _end_values(content[name], name, kind) for name, kind in kinds.items()}
     values["loads"], point_forces = _loads(content.get("loads", {}))
-    solve = _check_keys(content.get("solve", {}), "solve", (), ("segments",))
-    with _named("solve"):
+    solve = check_keys(content.get("solve", {}), "solve", (), ("segments",))
+    with named("solve"):
         segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if solve else None
     turns = values["end"].pop("turns", None)
     changes = _changes(content["path"], kinds, values) if "path" in content else []
@@ -238,15 +200,15 @@ def _scene_file(content: dict[str, Any]) -> SceneFile:
 
 
 def _rod(table: Any) -> Rod:
-    section = _choice(table, "rod", "section", [name for name in _SECTIONS if name])
+    section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
-    values = _values(table, "rod", required, optional, other=("section",))
-    with _named("rod"):
+    values = si_values(table, "rod", required, optional, other=("section",))
+    with named("rod"):
         return make(**values)
 
 
 def _support_kind(table: Any, where: str) -> str:
-    kind = _choice(table, where, "support", list(_SUPPORTS))
+    kind = choice(table, where, "support", list(_SUPPORTS))
     if kind is None:
         raise SceneFileError(f"{where}.support is missing; allowed are {', '.join(_SUPPORTS)}")
     return kind
@@ -256,7 +218,7 @@ def _end_values(table: dict[str, Any], where: str, kind: str) -> dict[str, np.nd
     required, optional, _ = _SUPPORTS[kind]
     if kind == "clamp" and where == "end":
         optional = (*optional, "turns")
-    values = _values(table, where, required, optional, other=("support",))
+    values = si_values(table, where, required, optional, other=("support",))
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
@@ -274,29 +236,29 @@ def _end_values(table: dict[str, Any], where: str, kind: str) -> dict[str, np.nd
 
 
 def _loads(table: Any) -> tuple[dict[str, np.ndarray], list[PointForce]]:
-    values = _values(table, "loads", (), ("gravity",), other=("point_force",))
+    values = si_values(table, "loads", (), ("gravity",), other=("point_force",))
     forces = []
-    for k, force in enumerate(_tables(table.get("point_force", []), "loads.point_force")):
+    for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
         where = f"loads.point_force[{k}]"
-        with _named(where):
-            forces.append(PointForce(**_values(force, where, ("at", "force"), ())))
+        with named(where):
+            forces.append(PointForce(**si_values(force, where, ("at", "force"), ())))
     return values, forces
 
 
 def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:
     """Where each table of the path is, its steps and new values; adds to `values` the zero loads that it changes."""
     changes = []
-    for k, table in enumerate(_tables(tables, "path")):
+    for k, table in enumerate(table_list(tables, "path")):
         where = f"path[{k}]."
-        _check_keys(table, where[:-1], (), ("steps", "start", "end", "loads"))
-        with _named(where[:-1]):
+        check_keys(table, where[:-1], (), ("steps", "start", "end", "loads"))
+        with named(where[:-1]):
             steps = whole_number(table.get("steps", 1), "steps", 1, MAX_STEPS)
         target: Values = {}
         for name in values:
             keys = _SUPPORTS[kinds[name]][2] if name in kinds else ("gravity",)
             if "frame" in values[name]:
                 keys = ("position", "spin")
-            target[name] = _values(table.get(name, {}), f"{where}{name}", (), keys)
+            target[name] = si_values(table.get(name, {}), f"{where}{name}", (), keys)
             values[name] = {key: np.zeros(3) for key in target[name] if key not in values[name]} | values[name]
         if not any(target.values()):
             raise SceneFileError(f'{where[:-1]} changes nothing; give new values, such as end.spin = "90 deg"')
@@ -308,7 +270,7 @@ def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[s
 
 
 def _support(kind: str, values: dict[str, np.ndarray], where: str) -> Support:
-    with _named(where):
+    with named(where):
         if kind == "clamp":
             placed = values["frame"] if "frame" in values else frame(values["tangent"], values["d2"])
             return Clamp(values["position"], _spun(placed, float(values["spin"])))
@@ -375,132 +337,3 @@ def _check_frames(before: Scene, after: Scene, where: str) -> None:
         # The trace of a rotation is 1 + 2 cos(angle).
         if isinstance(new, Clamp) and np.sum(np.asarray(old.frame) * np.asarray(new.frame)) < -1 + 1e-6:
             raise SceneFileError(f"{where} turns the {name} by 180 deg, less is allowed; is its tangent along d2?")
-
-
-# --- values ----------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _named(where: str) -> Iterator[None]:
-    """Puts the table before the key with which a message of a constructor begins."""
-    try:
-        yield
-    except SceneFileError:
-        raise
-    except (TypeError, ValueError) as error:
-        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*_QUANTITIES, "segments", "steps")
-        raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
-
-
-def _check_keys(table: Any, where: str, required: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:
-    _check_table(table, where)
-    prefix = f"{where}." if where else ""
-    allowed = (*required, *optional)
-    for key in table:
-        if key not in allowed:
-            raise SceneFileError(
-                f"{prefix}{' '.join(key.split())} is not allowed here; allowed are {', '.join(allowed)}"
-            )
-    for key in required:
-        if key not in table:
-            example = f"{key} = {_QUANTITIES[key][2]}" if key in _QUANTITIES else f"a table [{key}]"
-            raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
-    return table
-
-
-def _check_table(table: Any, where: str) -> None:
-    if not isinstance(table, dict):
-        raise SceneFileError(f"{where} must be a table, [{where}], got {table!r}")
-
-
-def _tables(tables: Any, where: str) -> list[Any]:
-    if not isinstance(tables, list):
-        raise SceneFileError(f"{where} must be a list of tables, each [[{where}]], got {tables!r}")
-    return tables
-
-
-def _choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
-    _check_table(table, where)
-    if key in table and table[key] not in allowed:
-        raise SceneFileError(f"{where}.{key} must be one of {', '.join(allowed)}, got {table[key]!r}")
-    return table.get(key)
-
-
-def _values(
-    table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
-) -> dict[str, np.ndarray]:
-    """The numbers of a table in SI units. Keys in `other` may be there too and are left out."""
-    _check_keys(table, where, required, (*optional, *other))
-    return {key: _number(value, key, f"{where}.{key}") for key, value in table.items() if key not in other}
-
-
-def _number(value: Any, key: str, where: str) -> Float[np.ndarray, "..."]:
-    """A quantity or plain number of the shape that its key has, in SI units."""
-    si, shape, example = _QUANTITIES[key]
-    numbers, unit = value, ""
-    if si:
-        if not isinstance(value, str):
-            raise SceneFileError(f"{where} must have a unit, for example {key} = {example}, got {value!r}")
-        match = _NUMBER_AND_UNIT.fullmatch(value)
-        if match is None:
-            raise SceneFileError(f"{where} must be a number and a unit, for example {key} = {example}, got {value!r}")
-        numbers, unit = _parsed(match[1]), match[2]
-    if not _has_shape(numbers, shape):
-        kind = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
-        unit_too = "and a unit" if si else "without quotes or unit"
-        raise SceneFileError(f"{where} must be {kind} {unit_too}, for example {key} = {example}, got {value!r}")
-    if si and not unit:
-        raise SceneFileError(f"{where} must have a unit, for example {key} = {example}, got {value!r}")
-    try:
-        array = np.array(numbers, float)
-    except OverflowError:
-        array = np.array(math.inf)
-    array = array * _factor(unit, si, f"{where} must be in {si} or a like unit, for example {key} = {example}")
-    if not np.all(np.isfinite(array)):
-        raise SceneFileError(f"{where} must be finite, got {value!r}")
-    return _unit_vector(array, where) if key in ("tangent", "d2") else array
-
-
-def _parsed(numbers: str) -> Any:
-    if not numbers.startswith("["):
-        return float(numbers)
-    try:
-        return json.loads(numbers, parse_int=float)
-    except (ValueError, RecursionError):
-        return None
-
-
-def _has_shape(numbers: Any, shape: tuple[int, ...]) -> bool:
-    if shape == ():
-        return isinstance(numbers, (int, float)) and not isinstance(numbers, bool)
-    return isinstance(numbers, list) and len(numbers) == shape[0] and all(_has_shape(x, shape[1:]) for x in numbers)
-
-
-def _unit_vector(vector: np.ndarray, where: str) -> Float[np.ndarray, "3"]:
-    """The direction of a vector; itself to the last bit where it has the length 1."""
-    largest = np.max(np.abs(vector))
-    if largest == 0:
-        raise SceneFileError(f"{where} must be a direction, got the zero vector")
-    unit = vector / largest
-    unit = unit / np.linalg.norm(unit)
-    rounding = 4 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
-    return vector if np.allclose(vector, unit, rtol=0, atol=rounding) else unit
-
-
-def _factor(unit: str, si: str, allowed: str) -> float:
-    """How many SI units a unit is."""
-    if unit == si:
-        return 1.0
-    units = _unit_registry()
-    try:
-        return float(units.Quantity(1.0, units.Unit(unit)).to(units.Unit(si)).magnitude)
-    except Exception:  # pint raises anything, down to AssertionError, for what it cannot parse.
-        raise SceneFileError(f"{allowed}, got the unit {unit!r}") from None
-
-
-@functools.cache
-def _unit_registry() -> Any:
-    # Imported here: it takes half a second that plain SI units need not wait for.
-    import pint
-
-    return pint.UnitRegistry()

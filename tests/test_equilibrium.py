@@ -198,7 +198,7 @@ def test_position_at_interpolates_the_centerline(twisted):
     between = (fine.s[:-1] + fine.s[1:]) / 2
     at_nodes = np.max(np.abs(fine.position_at(twisted.s) - twisted.nodes))
     assert np.max(np.abs(fine.position_at(between) - twisted.position_at(between))) < 1.2 * at_nodes
-    with pytest.raises(ValueError, match="s must lie in 0 to 1 m, got 0.5 to 1.5 m"):
+    with pytest.raises(ValueError, match=r"s must lie in 0 to 1 m, got 0\.5 to 1\.5 m"):
         twisted.position_at([0.5, 1.5])
 
 

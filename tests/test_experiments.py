@@ -33,3 +33,16 @@ def test_mass_spring(tmp_path, capsys):
     with open(tmp_path / "mass_spring.csv", newline="") as file:
         assert [row["stage"] for row in csv.DictReader(file)] == list("abcdef")
     assert (tmp_path / "mass_spring.png").stat().st_size > 10_000
+
+
+def test_kernels(tmp_path):
+    rows = script("kernels").main(["--segments", "4", "--repeats", "1", "--out", str(tmp_path)])
+    assert len(rows) == 6 + 7
+    assert all(row["us"] > 0 for row in rows)
+    assert (tmp_path / "kernels.csv").read_text().count("\n") == len(rows) + 1
+
+
+def test_rounding_floor():
+    ratios = script("rounding_floor").main(["--segments", "10", "100", "--slenderness", "200"])
+    # The estimate the solver uses allows 4.
+    assert max(ratios.values()) < 4

@@ -1,5 +1,7 @@
 """The solver on the report's Fig. 1: iterations with and without preconditioner; the line search in rounding."""
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,6 +59,48 @@ def test_a_step_into_an_infinite_energy_is_taken_back():
     assert step == 0.5
 
 
-def test_bad_options_are_refused():
-    with pytest.raises(ValueError, match="preconditioner must be 'gauss_newton' or None, got 'ilu'"):
-        rj.NonlinearCG(preconditioner="ilu")  # pyright: ignore[reportArgumentType]
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(preconditioner="ilu"), "preconditioner must be 'gauss_newton' or None, got 'ilu'"),
+        (dict(tolerance=-1.0), "tolerance must not be negative"),
+        (dict(max_iterations=0), "max_iterations must be a whole number from 1"),
+        (dict(refresh=0.5), "refresh must be a whole number"),
+        (dict(line_search=0.1), "line_search must be a LineSearch, got 0.1"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rj.NonlinearCG(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(curvature=1.0), "curvature must lie between 0 and 1, got 1.0"),
+        (dict(expansion=1.0), "expansion must lie between 1.1 and inf"),
+        (dict(max_trials=1), "max_trials must be a whole number from 2 to 1000"),
+    ],
+)
+def test_bad_line_searches_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        LineSearch(**options)
+
+
+def test_an_extreme_rod_is_solved_or_flagged_but_never_nan():
+    """EA L^2/EI = 1e17: the Gauss-Newton Hessian is indefinite by rounding."""
+    rod = rj.Rod(1.0, EI=1.0, GJ=1.0, EA=1e17)
+    clamps = [rj.Clamp((x, 0, 0), rj.frame((1, 0, z))) for x, z in ((0, 1), (0.8, -1))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rj.NotConvergedWarning)
+        result = rj.solve(rj.Scene(rod, *clamps), segments=10, solver=rj.NonlinearCG(max_iterations=50))
+    assert np.all(np.isfinite(result.nodes))
+    assert np.all(np.isfinite(result.end_force))
+    assert result.converged == (result.residual <= 1e-8) or result.status == rj.Status.ROUNDING_FLOOR
+
+
+def test_a_guess_without_length_is_reported_as_not_finite():
+    guess = rj.Guess([[0, 0, 0], [0, 0, 0]])
+    with pytest.warns(rj.NotConvergedWarning, match="not a finite number"):
+        result = rj.solve(problems.cantilever(), segments=4, guess=guess)
+    assert result.status == rj.Status.NOT_FINITE

@@ -244,6 +244,12 @@ MISTAKES = [
         "rod.poisson_ratio must be a number without quotes",
         "poisson_ratio = 0.5",
     ),
+    (
+        '[rod]\nsection = "tube"\nlength = "1 m"\nouter_radius = "4 mm"\ninner_radius = "5 mm"\n'
+        'youngs_modulus = "1 MPa"\npoisson_ratio = 0.5\n' + START + END,
+        "rod.outer_radius - inner_radius must be positive",
+        "got -0.001",
+    ),
     # the ends
     (ROD + START.replace('support = "clamp"', "") + END, "start.support is missing", "clamp, swivel, pin, free"),
     (ROD + START.replace("clamp", "glue") + END, "start.support must be one of", "clamp, swivel, pin, free"),
@@ -263,8 +269,8 @@ MISTAKES = [
     ),
     (
         ROD + START.replace("tangent = [1, 0, 0]", "frame = [[1, 0, 0], [0, 1, 0], [0, 0, 2]]") + END,
-        "start.frame must be a rotation",
-        "unit length",
+        "start.frame must be a rotation (columns d1, d2, t of unit length",
+        "tangent and d2 make one",
     ),
     (
         ROD + START.replace("tangent = [1, 0, 0]", "frame = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]") + END,

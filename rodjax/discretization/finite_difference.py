@@ -66,12 +66,12 @@ class FiniteDifference(eqx.Module):
     """A nondimensional scene on a polyline: energy, gradient, preconditioner and results as functions of a `Polyline`.
 
     Displacements in the arguments and results of the public methods are those of the nodes that are free to move,
-    (m, 3): the rows for held ends are left out. `twist_reference` is the state from which the total twist is carried;
+    (m, 3): the rows for held ends are left out. `reference` is the state from which the total twist is carried;
     `None` in scenes without torsion.
     """
 
     scene: Scene
-    twist_reference: TwistReference | None
+    reference: TwistReference | None
 
     @staticmethod
     def begin(scene: Scene, guess: Polyline, guess_twist: Float[Array, ""]) -> tuple["FiniteDifference", Polyline]:
@@ -96,17 +96,26 @@ class FiniteDifference(eqx.Module):
     def moved(self, polyline: Polyline, displacement: Float[Array, "m 3"]) -> Polyline:
         return polyline.moved(self._all_nodes(displacement))
 
+    def reference_at(self, polyline: Polyline) -> TwistReference | None:
+        """This polyline as the reference of the total twist: no tangent may turn by pi from it."""
+        if self.reference is None:
+            return None
+        return TwistReference(_framed_tangents(self.scene, polyline), self.total_twist(polyline))
+
+    def with_reference(self, reference: TwistReference | None) -> "FiniteDifference":
+        return FiniteDifference(self.scene, reference)
+
     # --- energy ----------------------------------------------------------------------------------------------------
 
     def energies(self, polyline: Polyline) -> Energies:
         h = 1 / len(polyline.edges)
         rod = self.scene.rod
         dphi = polyline.edges / h
-        points, spacing = _with_end_tangents(self.scene, dphi)
-        bending = jax.vmap(_joint_energy, in_axes=(None, 0, 0, 0))(rod, points[:-1], points[1:], spacing)
+        tangents, spacing = _with_end_tangents(self.scene, jax.vmap(_unit)(dphi))
+        bending = jax.vmap(_joint_energy, in_axes=(None, 0, 0, 0))(rod, tangents[:-1], tangents[1:], spacing)
         stretching = h * jax.vmap(lambda dphi: density(rod, axial_strain=axial_strain(dphi)))(dphi)
         torsion = None
-        if self.twist_reference is not None:
+        if self.reference is not None:
             torsion = density(rod, twist=self.total_twist(polyline))
         return Energies(jnp.sum(bending), jnp.sum(stretching), torsion, self._load_energy(polyline))
 
@@ -127,8 +136,8 @@ class FiniteDifference(eqx.Module):
     def total_twist(self, polyline: Polyline) -> Float[Array, ""]:
         """Total twist [rad]: fixed by two clamps, or in equilibrium with a dead moment; zero where an end can spin."""
         moment = dead_end_moment(self.scene)
-        if self.twist_reference is not None:
-            return total_twist(self.twist_reference, _framed_tangents(self.scene, polyline))
+        if self.reference is not None:
+            return total_twist(self.reference, _framed_tangents(self.scene, polyline))
         if moment is not None:
             return _end_torque(self.scene, moment, polyline) / self.scene.rod.GJ
         return jnp.zeros((), polyline.nodes.dtype)
@@ -254,12 +263,12 @@ class FiniteDifference(eqx.Module):
 
         start_tangent = _end_tangent(scene.start, edge_tangents[0], h)
         end_tangent = _end_tangent(scene.end, edge_tangents[-1], h)
-        inner_tangents = jax.vmap(_unit)(dphi[:-1] + dphi[1:])
+        inner_tangents = jax.vmap(_unit)(edge_tangents[:-1] + edge_tangents[1:])
         tangents = jnp.concatenate([start_tangent[None], inner_tangents, end_tangent[None]])
         twist = self.total_twist(polyline)
         frames = _frames(scene, edge_tangents, tangents, twist)
 
-        inner_curvature = jax.vmap(curvature)((dphi[:-1] + dphi[1:]) / 2, (dphi[1:] - dphi[:-1]) / h)
+        inner_curvature = jax.vmap(_joint_curvature, in_axes=(0, 0, None))(edge_tangents[:-1], edge_tangents[1:], h)
         end_curvatures = [
             _across(moment, tangent) / rod.EI
             for moment, tangent in ((start_moment, start_tangent), (end_moment, end_tangent))
@@ -289,7 +298,7 @@ class FiniteDifference(eqx.Module):
             moved = polyline.moved(displacement)
             ends = (_rotated(self.scene.start, rotations[0]), _rotated(self.scene.end, rotations[1]))
             scene = eqx.tree_at(lambda scene: (scene.start, scene.end), self.scene, ends)
-            energy = FiniteDifference(scene, self.twist_reference).energies(moved).total
+            energy = FiniteDifference(scene, self.reference).energies(moved).total
             return energy - self._virtual_work(polyline, moved, scene)
 
         no_rotations = jnp.zeros((2, 3), polyline.nodes.dtype)
@@ -332,10 +341,10 @@ FLOOR_SAFETY = 4.0
 def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     """The guess moved to the held ends, by a displacement linear in s; unchanged to the last bit where it fits."""
     start, end = scene.start, scene.end
-    at_start = start.position - guess.nodes[0] if isinstance(start, Held) else None
-    at_end = end.position - guess.nodes[-1] if isinstance(end, Held) else at_start
-    at_start = at_end if at_start is None else at_start
-    assert at_start is not None, "a scene holds at least one position"
+    offsets = [
+        end.position - node for end, node in ((start, guess.nodes[0]), (end, guess.nodes[-1])) if isinstance(end, Held)
+    ]
+    at_start, at_end = offsets[0], offsets[-1]  # the same where only one end is held
     s = jnp.linspace(0.0, 1.0, len(guess.nodes), dtype=guess.nodes.dtype)[:, None]
     polyline = guess.moved((1 - s) * at_start[None] + s * at_end[None])
     nodes = polyline.nodes
@@ -359,9 +368,13 @@ def _with_end_tangents(scene: Scene, dphi: Float[Array, "n 3"]) -> tuple[Float[A
 
 
 def _joint_curvature(
-    before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""]
+    before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""] | float
 ) -> Float[Array, "3"]:
-    """Curvature from phi' at two points, by central differences halfway between them."""
+    """Curvature from the unit tangents at two points, by central differences halfway between them.
+
+    It grows beyond bounds as the tangents turn against each other. From phi' instead of t it would vanish for edges of
+    different length folded upon each other, and the rod would have a way through the fold.
+    """
     return curvature((before + after) / 2, (after - before) / spacing)
 
 
@@ -375,9 +388,13 @@ def _joint_stiffness(
     rod: Rod, before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""]
 ) -> Float[Array, "6 6"]:
     """Gauss-Newton Hessian of a joint's energy by phi' at the two points: J^T (d2w) J, J = d(curvature)."""
-    strain = _joint_curvature(before, after, spacing)
-    jacobian = jnp.concatenate(jax.jacfwd(_joint_curvature, argnums=(0, 1))(before, after, spacing), axis=1)
-    return spacing * jacobian.T @ jax.hessian(lambda strain: density(rod, curvature=strain))(strain) @ jacobian
+
+    def strain(before, after):
+        return _joint_curvature(_unit(before), _unit(after), spacing)
+
+    jacobian = jnp.concatenate(jax.jacfwd(strain, argnums=(0, 1))(before, after), axis=1)
+    stiffness = jax.hessian(lambda strain: density(rod, curvature=strain))(strain(before, after))
+    return spacing * jacobian.T @ stiffness @ jacobian
 
 
 def _stretch_stiffness(rod: Rod, dphi: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -4,9 +4,13 @@ Near a minimum differences of the energy drown in rounding long before its slope
 and the energy only has to stay within its rounding of where it was.
 """
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import whole_number
 
 
 class Bracket(eqx.Module):
@@ -42,6 +46,12 @@ class LineSearch(eqx.Module):
     energy_tolerance: float = 1e-9
     expansion: float = 8.0
     max_trials: int = 25
+
+    def __check_init__(self):
+        for name, low, high in (("curvature", 0.0, 1.0), ("energy_tolerance", 0.0, 1.0), ("expansion", 1.1, math.inf)):
+            if not low < getattr(self, name) < high:
+                raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {getattr(self, name)!r}")
+        whole_number(self.max_trials, "max_trials", 2, 1000)
 
     def energy_bound(self, energy: Float[Array, ""]) -> Float[Array, ""]:
         return energy + self.energy_tolerance * (1 + jnp.abs(energy))

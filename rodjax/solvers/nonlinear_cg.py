@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from rodjax.checks import instance, not_negative, whole_number
 from rodjax.linalg import BlockCholesky, factor
 from rodjax.solvers.line_search import Bracket, LineSearch
 from rodjax.status import Status
@@ -35,6 +36,10 @@ class NonlinearCG(eqx.Module):
     def __check_init__(self):
         if self.preconditioner not in ("gauss_newton", None):
             raise ValueError(f"preconditioner must be 'gauss_newton' or None, got {self.preconditioner!r}")
+        not_negative(self.tolerance, "tolerance")
+        whole_number(self.max_iterations, "max_iterations", 1, 10**9)
+        whole_number(self.refresh, "refresh", 1, 10**9)
+        instance(self.line_search, "line_search", LineSearch)
 
 
 # A plain search starts with a step this small against the largest that keeps the edges from turning over.
@@ -44,8 +49,9 @@ STAGNATION = 10.0
 
 
 class Minimum(eqx.Module):
-    """Where a minimiser stopped."""
+    """Where a minimiser stopped: the point, and the problem seen from there."""
 
+    problem: Any
     point: PyTree
     energy: Float[Array, ""]
     residual: Float[Array, ""]
@@ -55,7 +61,8 @@ class Minimum(eqx.Module):
 
 
 class _State(eqx.Module):
-    # The last accepted point and what is known there; the search from it; the count of iterations since a restart.
+    # The last accepted point and what is known there; the search from it.
+    reference: PyTree  # what the problem measures from, renewed with the preconditioner
     point: PyTree
     energy: Float[Array, ""]
     gradient: Float[Array, "m 3"]
@@ -66,7 +73,7 @@ class _State(eqx.Module):
     step: Float[Array, ""]
     bracket: Bracket
     restart: Bool[Array, ""]  # the next trial is the point itself: accept it and start afresh
-    since_restart: Int[Array, ""]
+    is_fresh: Bool[Array, ""]  # this search is the first after a restart
     iterations: Int[Array, ""]
     evaluations: Int[Array, ""]
     status: Int[Array, ""]
@@ -76,36 +83,43 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
     """Minimise the energy of a discretized scene, from `point`.
 
     One loop, one energy evaluation a turn: the trial step is accepted, and gives the next direction, or it narrows the
-    line search. `problem` offers `moved`, `energy_and_gradient`, `energy_from`, `gauss_newton`, `largest_step` and
-    `rounding_floor`: see `FiniteDifference`.
+    line search. `FiniteDifference` is such a problem.
     """
     search = solver.line_search
 
     def turn(state: _State) -> _State:
-        trial = problem.moved(state.point, state.step * state.direction)
-        energy, gradient = problem.energy_and_gradient(trial)
+        here = problem.with_reference(state.reference)
+        trial = here.moved(state.point, state.step * state.direction)
+        energy, gradient = here.energy_and_gradient(trial)
         slope = jnp.sum(gradient * state.direction)
-        reached = problem.energy_from(state.point, trial, energy)
+        reached = here.energy_from(state.point, trial, energy)
         energy_is_low = jnp.isfinite(slope) & (reached <= search.energy_bound(state.energy))
         state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
         return jax.lax.cond(
             state.restart | search.accepts(slope, state.slope, energy_is_low),
-            lambda: advanced(state, trial, energy, gradient),
+            lambda: advanced(here, state, trial, energy, gradient),
             lambda: narrowed(state, slope, energy_is_low),
         )
 
-    def advanced(state: _State, point: PyTree, energy: Float[Array, ""], gradient: Float[Array, "m 3"]) -> _State:
+    def prepared(here: Any, point: PyTree) -> tuple[PyTree, BlockCholesky | None]:
+        preconditioned = solver.preconditioner is not None
+        return here.reference_at(point), factor(here.gauss_newton(point)) if preconditioned else None
+
+    def advanced(
+        here: Any, state: _State, point: PyTree, energy: Float[Array, ""], gradient: Float[Array, "m 3"]
+    ) -> _State:
         iterations = state.iterations + jnp.where(state.restart, 0, 1)
         status = progress(point, energy, gradient, iterations)
-        since_restart = jnp.where(state.restart, 0, state.since_restart + 1)
-        renew = since_restart == 0
-        factors = state.factors
-        if factors is None:
-            preconditioned = gradient
-        else:
-            refresh = (since_restart % solver.refresh == 0) & (status == Status.RUNNING)
-            factors = jax.lax.cond(refresh, lambda: factor(problem.gauss_newton(point)), lambda: factors)
-            preconditioned = problem.precondition(factors, gradient)
+        renew = state.restart
+        reference, factors = jax.lax.cond(
+            (renew | (iterations % solver.refresh == 0)) & (status == Status.RUNNING),
+            lambda: prepared(here, point),
+            lambda: (state.reference, state.factors),
+        )
+        preconditioned = gradient
+        if factors is not None:  # in an extreme scene rounding can make even J^T J indefinite
+            solved = problem.precondition(factors, gradient)
+            preconditioned = jnp.where(factors.is_positive_definite, solved, gradient)
         change = jnp.sum(preconditioned * (gradient - state.gradient))
         beta = jnp.maximum(0.0, change / jnp.sum(state.gradient * state.preconditioned))
         direction = jnp.where(renew, 0.0, beta) * state.direction - preconditioned
@@ -119,6 +133,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         else:  # Newton-like: the right step stays near one while the slopes fall by orders of magnitude
             step = jnp.where(renew, 1.0, state.step)
         return _State(
+            reference=reference,
             point=point,
             energy=energy,
             gradient=gradient,
@@ -129,7 +144,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
             step=jnp.minimum(step, reach),
             bracket=Bracket.open(slope),
             restart=jnp.array(False),
-            since_restart=jnp.where(renew, 0, since_restart),
+            is_fresh=state.restart,
             iterations=iterations,
             evaluations=state.evaluations,
             status=status,
@@ -139,7 +154,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         bracket, step = search.narrowed(state.bracket, state.step, slope, energy_is_low)
         exhausted = bracket.trials >= search.max_trials
         # A direction that failed is given up for the preconditioned gradient; if that failed too, so has the search.
-        failed = exhausted & (state.since_restart == 0)
+        failed = exhausted & state.is_fresh
         stagnated = jnp.max(jnp.abs(state.gradient)) <= STAGNATION * problem.rounding_floor(state.point)
         reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
         return eqx.tree_at(
@@ -163,11 +178,10 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
     zero = problem.no_displacement(point)
     scalar = jnp.zeros((), zero.dtype)
     count = jnp.zeros((), int)
-    factors = None
-    if solver.preconditioner is not None:
-        shapes = eqx.filter_eval_shape(lambda: factor(problem.gauss_newton(point)))
-        factors = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    shapes = eqx.filter_eval_shape(prepared, problem, point)
+    _, factors = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     state = _State(
+        reference=problem.reference,
         point=point,
         energy=scalar,
         gradient=zero,
@@ -178,13 +192,14 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         step=scalar,
         bracket=Bracket.open(scalar),
         restart=jnp.array(True),
-        since_restart=count,
+        is_fresh=jnp.array(False),
         iterations=count,
         evaluations=count,
         status=jnp.full((), Status.RUNNING, int),
     )
     state = jax.lax.while_loop(lambda state: state.status == Status.RUNNING, turn, state)
     return Minimum(
+        problem=problem.with_reference(state.reference),
         point=state.point,
         energy=state.energy,
         residual=jnp.max(jnp.abs(state.gradient)),

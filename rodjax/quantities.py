@@ -1,0 +1,190 @@
+"""Tables and numbers with units from a scene file: keys, shapes, SI values, and errors that say what is allowed.
+
+Quantities are strings such as "[50, 0, 0] cm"; what has no dimension is a plain number or list.
+"""
+
+import functools
+import json
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+# SI unit (none: a plain number), shape and an example of every key that holds numbers.
+_QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "length": ("m", (), '"1 m"'),
+    "radius": ("m", (), '"5 mm"'),
+    "outer_radius": ("m", (), '"5 mm"'),
+    "inner_radius": ("m", (), '"4 mm"'),
+    "youngs_modulus": ("Pa", (), '"10 MPa"'),
+    "shear_modulus": ("Pa", (), '"3.3 MPa"'),
+    "poisson_ratio": ("", (), "0.5"),
+    "density": ("kg/m^3", (), '"1200 kg/m^3"'),
+    "EI": ("N m^2", (), '"4.9e-3 N m^2"'),
+    "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
+    "EA": ("N", (), '"785 N"'),
+    "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
+    "position": ("m", (3,), '"[0.8, 0, 0] m"'),
+    "tangent": ("", (3,), "[1, 0, 0]"),
+    "d2": ("", (3,), "[0, 1, 0]"),
+    "frame": ("", (3, 3), "[[0, 0, 1], [0, 1, 0], [-1, 0, 0]]"),
+    "spin": ("rad", (), '"90 deg"'),
+    "turns": ("", (), "1"),
+    "force": ("N", (3,), '"[0, 0, -0.2] N"'),
+    "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
+    "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
+    "at": ("m", (), '"0.5 m"'),
+    "segments": ("", (), "50"),
+    "steps": ("", (), "10"),
+}
+_NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
+
+
+class SceneFileError(ValueError):
+    """A mistake in a scene file. The message is one line with the file, the key and what is allowed."""
+
+
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Makes errors of the file of those of a constructor: puts the table before the key with which they begin."""
+    try:
+        yield
+    except SceneFileError:
+        raise
+    except (TypeError, ValueError) as error:
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in _QUANTITIES
+        raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
+
+
+def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:
+    """The table, where it is one with all the required keys and no others than these and the optional ones."""
+    _check_table(table, where)
+    prefix = f"{where}." if where else ""
+    allowed = (*required, *optional)
+    for key in table:
+        if key not in allowed:
+            raise SceneFileError(
+                f"{prefix}{' '.join(key.split())} is not allowed here; allowed are {', '.join(allowed)}"
+            )
+    for key in required:
+        if key not in table:
+            example = f"{key} = {_QUANTITIES[key][2]}" if key in _QUANTITIES else f"a table [{key}]"
+            raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
+    return table
+
+
+def table_list(value: Any, where: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise SceneFileError(f"{where} must be a list of tables, each [[{where}]], got {value!r}")
+    return value
+
+
+def choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
+    """The one of the allowed names that the table has under the key; `None` where it has no such key."""
+    _check_table(table, where)
+    if key in table and table[key] not in allowed:
+        raise SceneFileError(f"{where}.{key} must be one of {', '.join(allowed)}, got {table[key]!r}")
+    return table.get(key)
+
+
+def si_values(
+    table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
+) -> dict[str, Float[np.ndarray, "..."]]:
+    """The numbers of a table in SI units. Keys in `other` may be there too and are left out."""
+    check_keys(table, where, required, (*optional, *other))
+    with named(where):
+        return {key: _si_value(value, key) for key, value in table.items() if key not in other}
+
+
+def assignment(key: str, value: Any) -> str:
+    """The line of TOML from which `si_values` makes the same number to the last bit."""
+    numbers, unit = np.asarray(value, float).tolist(), _QUANTITIES[key][0]
+    return f'{key} = "{numbers} {unit}"' if unit else f"{key} = {numbers}"
+
+
+def _check_table(table: Any, where: str) -> None:
+    if not isinstance(table, dict):
+        raise SceneFileError(f"{where} must be a table, [{where}], got {table!r}")
+
+
+def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
+    """A quantity or plain number of the shape that its key has, in SI units; of a direction, the unit vector."""
+    si, shape, example = _QUANTITIES[key]
+
+    def mistake(allowed: str, got: str = repr(value)) -> ValueError:
+        return ValueError(f"{key} must {allowed}, for example {key} = {example}, got {got}")
+
+    numbers, unit = value, ""
+    if si:
+        if not isinstance(value, str):
+            raise mistake("have a unit")
+        match = _NUMBER_AND_UNIT.fullmatch(value)
+        if match is None:
+            raise mistake("be a number and a unit")
+        numbers, unit = _parsed(match[1]), match[2]
+    if not _has_shape(numbers, shape):
+        kind = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
+        raise mistake(f"be {kind} {'and a unit' if si else 'without quotes or unit'}")
+    if si and not unit:
+        raise mistake("have a unit")
+    factor = _factor(unit, si)
+    if factor is None:
+        raise mistake(f"be in {si} or a like unit", f"the unit {unit!r}")
+    try:
+        array = np.array(numbers, float) * factor
+    except OverflowError:
+        array = np.array(math.inf)
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{key} must be finite, got {value!r}")
+    if key not in ("tangent", "d2"):
+        return array
+    if not np.any(array):
+        raise ValueError(f"{key} must be a direction, got the zero vector")
+    return _unit_vector(array)
+
+
+def _parsed(numbers: str) -> Any:
+    if not numbers.startswith("["):
+        return float(numbers)
+    try:
+        return json.loads(numbers, parse_int=float)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _has_shape(numbers: Any, shape: tuple[int, ...]) -> bool:
+    if shape == ():
+        return isinstance(numbers, (int, float)) and not isinstance(numbers, bool)
+    return isinstance(numbers, list) and len(numbers) == shape[0] and all(_has_shape(x, shape[1:]) for x in numbers)
+
+
+def _unit_vector(vector: np.ndarray) -> Float[np.ndarray, "3"]:
+    """The direction of a nonzero vector; itself to the last bit where it has the length 1."""
+    unit = vector / np.max(np.abs(vector))
+    unit = unit / np.linalg.norm(unit)
+    rounding = 4 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
+    return vector if np.allclose(vector, unit, rtol=0, atol=rounding) else unit
+
+
+def _factor(unit: str, si: str) -> float | None:
+    """How many SI units a unit is; `None` where it is no unit of this dimension."""
+    if unit == si:
+        return 1.0
+    units = _unit_registry()
+    try:
+        return float(units.Quantity(1.0, units.Unit(unit)).to(units.Unit(si)).magnitude)
+    except Exception:  # pint raises anything, down to AssertionError, for what it cannot parse.
+        return None
+
+
+@functools.cache
+def _unit_registry() -> Any:
+    # Imported here: it takes half a second that plain SI units need not wait for.
+    import pint
+
+    return pint.UnitRegistry()

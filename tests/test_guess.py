@@ -1,0 +1,60 @@
+"""The library's own first shape, and interpolation."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rodjax as rj
+from rodjax import Clamp, Pin, Scene, frame, problems
+from rodjax.guess import cubic, first_shape, resampled
+from rodjax.scene import nondimensional
+
+
+def shape(scene: Scene, segments: int = 200) -> np.ndarray:
+    scaled, _ = nondimensional(scene)
+    return np.asarray(first_shape(scaled, segments))
+
+
+@pytest.mark.parametrize("span", [0.0, 0.2, 0.8, 0.999])
+def test_pins_get_an_arc_of_the_right_length(span):
+    nodes = shape(Scene(problems.cable(), Pin((0, 0, 0)), Pin((span, 0, 0)), gravity=(0, 0, -9.81)))
+    np.testing.assert_allclose(nodes[[0, -1]], [[0, 0, 0], [span, 0, 0]], atol=2e-3)  # 12 bisections of the angle
+    np.testing.assert_allclose(np.sum(np.linalg.norm(np.diff(nodes, axis=0), axis=1)), 1.0, atol=2e-3)
+    assert np.min(nodes[:, 2]) < -0.01  # it sags
+
+
+def test_the_first_shape_leaves_along_the_end_tangents():
+    nodes = shape(Scene(problems.cable(), Clamp((0, 0, 0), frame((0, 0, 1))), Clamp((0.5, 0, 0), frame((1, 1, 0)))))
+    np.testing.assert_allclose(200 * (nodes[1] - nodes[0]), [0, 0, 1], atol=0.05)  # to the curvature of one segment
+    np.testing.assert_allclose(200 * (nodes[-1] - nodes[-2]), np.array([1, 1, 0]) / np.sqrt(2), atol=0.05)
+
+
+def test_a_cold_start_finds_an_equilibrium_between_random_frames():
+    rng = np.random.default_rng(0)
+    rod = problems.cable(50.0)
+    unit = float(rod.EI / rod.mass_per_length)
+    for _ in range(40):
+        direction = rng.normal(size=3)
+        position = rng.uniform(0.05, 0.95) * direction / np.linalg.norm(direction)
+        start, end = (Rotation.random(random_state=rng).as_matrix() for _ in range(2))
+        gravity = (0, 0, -unit * 10 ** rng.uniform(-1, 2.5))
+        result = rj.solve(Scene(rod, Clamp((0, 0, 0), start), Clamp(position, end), gravity), segments=20)
+        assert result.converged, rj.describe(result)
+        # The tangents have followed their reference: the frame carried with the total twist meets the clamp.
+        np.testing.assert_allclose(result.frames[-1], end, atol=1e-12)
+
+
+def test_resampling_keeps_a_parabola():
+    s = np.linspace(0, 1, 11)
+    curve = lambda s: np.stack([s, s**2, 0 * s], axis=1)  # noqa: E731
+    fine = np.asarray(resampled(jnp.asarray(curve(s)), 40))
+    inner = slice(4, -4)  # one-sided slopes at the ends
+    np.testing.assert_allclose(fine[inner], curve(np.linspace(0, 1, 41))[inner], atol=1e-14)
+
+
+def test_cubic_interpolation_is_exact_for_cubics():
+    x = jnp.arange(4.0)
+    points, slopes = jnp.stack([x**3, x, x**2], axis=1), jnp.stack([3 * x**2, 1 + 0 * x, 2 * x], axis=1)
+    at = jnp.array([0.0, 0.3, 1.7, 3.0])
+    np.testing.assert_allclose(cubic(points, slopes, at), jnp.stack([at**3, at, at**2], axis=1), atol=1e-14)

@@ -1,7 +1,7 @@
 """solve(): the equilibrium of a scene."""
 
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from rodjax.checks import instance, is_known, whole_number
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.guess import Guess, cubic, first_shape, resampled
 from rodjax.scene import Scene, nondimensional
+from rodjax.solvers.newton_krylov import find_equilibrium
 from rodjax.solvers.nonlinear_cg import Minimum, NonlinearCG, minimize
 from rodjax.status import Status
 from rodjax.units import Units
@@ -99,6 +100,7 @@ def solve(
     scene: Scene,
     *,
     segments: int | None = None,
+    discretization: Literal["finite_difference"] = "finite_difference",
     solver: NonlinearCG | None = None,
     guess: Guess | Equilibrium | None = None,
 ) -> Equilibrium:
@@ -110,6 +112,7 @@ def solve(
 
     - `scene`: `Scene`.
     - `segments`: of the mesh; `None`: those of a guess that is an `Equilibrium`, else 50.
+    - `discretization`: `"finite_difference"`, the only one in this version: second order in 1/segments.
     - `solver`: `NonlinearCG`; `None` for its defaults.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
       supports and gravity.
@@ -123,7 +126,7 @@ def solve(
             f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
-    segments, solver = checked_options(segments, solver, guess)
+    segments, solver = checked_options(segments, discretization, solver, guess)
     equilibrium = _solve(scene, guess, segments, solver)
     warn_if_not_converged(equilibrium)
     return equilibrium
@@ -141,9 +144,11 @@ def describe(equilibrium: Equilibrium) -> str:
 
 
 def checked_options(
-    segments: int | None, solver: NonlinearCG | None, guess: Guess | Equilibrium | None
+    segments: int | None, discretization: str, solver: NonlinearCG | None, guess: Guess | Equilibrium | None
 ) -> tuple[int, NonlinearCG]:
     """Segments and solver with the library's choice for `None`."""
+    if discretization != "finite_difference":
+        raise ValueError(f"discretization must be 'finite_difference' in this version, got {discretization!r}")
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     if segments is None:
@@ -205,7 +210,7 @@ def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver
 @eqx.filter_custom_jvp
 def _found(scene: Scene, polyline: Polyline, twist: Float[Array, ""], *, solver: NonlinearCG) -> Minimum:
     problem, start = FiniteDifference.begin(scene, polyline, twist)
-    return minimize(problem, start, solver)
+    return (minimize if problem.has_potential else find_equilibrium)(problem, start, solver)
 
 
 @_found.def_jvp

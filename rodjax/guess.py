@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import number_array
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.scene import Scene
-from rodjax.supports import Directed, Free, Held
+from rodjax.supports import Directed, Free, Held, Support
 from rodjax.units import Units
 
 
@@ -61,23 +61,39 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     """Nodes to begin with when there is no guess, in a nondimensional scene.
 
     Between two held ends: the circular arc of length 1, sagging where gravity and the end tangents point, bent near the
-    ends towards their tangents. With a free end: straight.
+    ends towards their tangents. With a free end: straight, or the helix into which a moment on that end alone bends it.
     """
     u = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)[:, None]
     start, end = scene.start, scene.end
     if not isinstance(start, Held):
         assert isinstance(end, Held), "a scene holds at least one position"
         along = end.tangent if isinstance(end, Directed) else -_pull(scene)
-        return end.position[None] - (1 - u) * along[None]
+        return end.position[None] - _helix(along, start, u)[::-1]
     if not isinstance(end, Held):
         along = start.tangent if isinstance(start, Directed) else _pull(scene)
-        return start.position[None] + u * along[None]
+        return start.position[None] + _helix(along, end, u)
     arc, arc_start, arc_end = _arc(start, end, scene.gravity, u)
     if isinstance(start, Directed):
         arc += u * (1 - u) ** 4 * (start.tangent - arc_start)[None]
     if isinstance(end, Directed):
         arc += u**4 * (u - 1) * (end.tangent - arc_end)[None]
     return arc
+
+
+def _helix(tangent: Float[Array, "3"], free: Support, u: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
+    """The way from a held end to a free one. A moment M there turns the tangent about itself at the rate M L/EI.
+
+    (From either end: the section moment at s = 0 is the reverse of a moment on a free start, and so is the way.)
+    """
+    moment = free.moment if isinstance(free, Free) else None
+    if moment is None:
+        return u * tangent[None]
+    size = jnp.sqrt(jnp.sum(moment**2))
+    axis = _direction(moment, tangent)
+    angle = (u[:-1] + u[1:]) / 2 * size
+    along = jnp.sum(axis * tangent) * axis
+    turned = along[None] + jnp.cos(angle) * (tangent - along)[None] + jnp.sin(angle) * jnp.cross(axis, tangent)[None]
+    return jnp.concatenate([jnp.zeros((1, 3), u.dtype), jnp.cumsum(turned, axis=0) / (len(u) - 1)])
 
 
 def _pull(scene: Scene) -> Float[Array, "3"]:

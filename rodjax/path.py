@@ -1,6 +1,7 @@
 """Quasistatic paths: a sequence of scenes, each solved from the last, in one compiled scan."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ def solve_path(
     scenes: Sequence[Scene] | Scene,
     *,
     segments: int | None = None,
+    discretization: Literal["finite_difference"] = "finite_difference",
     solver: NonlinearCG | None = None,
     guess: Guess | Equilibrium | None = None,
     progress: bool = False,
@@ -34,12 +36,12 @@ def solve_path(
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames may turn by
       less than pi from one to the next.
     - `progress`: show a progress bar.
-    - `segments`, `solver`, `guess`: as for `rodjax.solve`; the guess is for the first scene.
+    - `segments`, `discretization`, `solver`, `guess`: as for `rodjax.solve`; the guess is for the first scene.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
-    segments, solver = checked_options(segments, solver, guess)
+    segments, solver = checked_options(segments, discretization, solver, guess)
     path = _solve_path(stacked, guess, segments, solver, progress)
     warn_if_not_converged(path)
     return path

@@ -46,3 +46,22 @@ def test_rounding_floor():
     ratios = script("rounding_floor").main(["--segments", "10", "100", "--slenderness", "200"])
     # The estimate the solver uses allows 4.
     assert max(ratios.values()) < 4
+
+
+@pytest.mark.slow
+def test_nonlinear_cg(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
+    options = ["--segments", "4", "6", "--repeats", "1", "--out", str(tmp_path)]
+    rows = script("nonlinear_cg").main(options)
+    assert all(row.converged for row in rows)
+    for segments, energy in ((4, 20.584261), (6, 20.568931)):
+        loose, tight, preconditioned = (row for row in rows if row.segments == segments)
+        assert preconditioned.iterations_max <= 40
+        assert preconditioned.iterations_mean < 25
+        assert tight.iterations_mean > 4 * preconditioned.iterations_mean
+        for row in (loose, tight, preconditioned):
+            assert row.energy == pytest.approx(energy, rel=1e-6)
+    assert "N = 6: the preconditioner takes" in capsys.readouterr().out
+    with open(tmp_path / "nonlinear_cg.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 6
+    assert (tmp_path / "nonlinear_cg.png").stat().st_size > 10_000

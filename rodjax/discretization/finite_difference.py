@@ -161,6 +161,11 @@ class FiniteDifference(eqx.Module):
 
     # --- gradient --------------------------------------------------------------------------------------------------
 
+    @property
+    def has_potential(self) -> bool:
+        """Whether the loads have a potential, so that equilibria are stationary points of an energy."""
+        return dead_end_moment(self.scene) is None
+
     def energy_from(self, polyline: Polyline, moved: Polyline, energy: Float[Array, ""]) -> Float[Array, ""]:
         """The energy after a motion, `energy`, less the work of loads without a potential on the way, to second order.
 

@@ -42,7 +42,7 @@ class LineSearch(eqx.Module):
     - `max_trials`: energy evaluations before a direction is given up.
     """
 
-    curvature: float = 0.2
+    curvature: float = 0.1
     energy_tolerance: float = 1e-9
     expansion: float = 8.0
     max_trials: int = 25

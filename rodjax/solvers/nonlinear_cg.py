@@ -19,7 +19,7 @@ class NonlinearCG(eqx.Module):
     **Arguments:**
 
     - `preconditioner`: `"gauss_newton"`, factorised at the start and every `refresh` iterations, or `None`, the
-        report's method: hundreds of iterations a step at 10 segments, thousands at 50.
+        report's method: hundreds of iterations a step at 10 segments, tens of thousands at 50.
     - `tolerance`: largest component of the gradient, in units of EI/L^2, at which a solve has converged. Where the
         rounding of the mesh does not let it fall so far, that floor is the tolerance, and the status says so.
     - `max_iterations`: iterations after which a solve is given up.
@@ -79,6 +79,22 @@ class _State(eqx.Module):
     status: Int[Array, ""]
 
 
+def progress(
+    problem: Any,
+    solver: NonlinearCG,
+    point: PyTree,
+    energy: Float[Array, ""],
+    gradient: Float[Array, "m 3"],
+    iterations: Int[Array, ""],
+) -> Int[Array, ""]:
+    """The `Status` at a point: done, to go on, or given up."""
+    residual = jnp.max(jnp.abs(gradient))
+    status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
+    status = jnp.where(residual <= problem.rounding_floor(point), Status.ROUNDING_FLOOR, status)
+    status = jnp.where(residual <= solver.tolerance, Status.CONVERGED, status)
+    return jnp.where(jnp.isfinite(energy + residual), status, Status.NOT_FINITE)
+
+
 def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
     """Minimise the energy of a discretized scene, from `point`.
 
@@ -109,7 +125,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         here: Any, state: _State, point: PyTree, energy: Float[Array, ""], gradient: Float[Array, "m 3"]
     ) -> _State:
         iterations = state.iterations + jnp.where(state.restart, 0, 1)
-        status = progress(point, energy, gradient, iterations)
+        status = progress(problem, solver, point, energy, gradient, iterations)
         renew = state.restart
         reference, factors = jax.lax.cond(
             (renew | (iterations % solver.refresh == 0)) & (status == Status.RUNNING),
@@ -167,13 +183,6 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
                 jnp.where(failed, reason, state.status).astype(state.status.dtype),
             ),
         )
-
-    def progress(point, energy, gradient, iterations) -> Int[Array, ""]:
-        residual = jnp.max(jnp.abs(gradient))
-        status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
-        status = jnp.where(residual <= problem.rounding_floor(point), Status.ROUNDING_FLOOR, status)
-        status = jnp.where(residual <= solver.tolerance, Status.CONVERGED, status)
-        return jnp.where(jnp.isfinite(energy + residual), status, Status.NOT_FINITE)
 
     zero = problem.no_displacement(point)
     scalar = jnp.zeros((), zero.dtype)

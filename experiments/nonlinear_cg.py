@@ -1,0 +1,301 @@
+"""What does the preconditioner buy on Fig. 1 of Linn & Stephan (2008), and how far is it from the machine's limit?
+
+The 25 steps of Fig. 1 by plain nonlinear conjugate gradients, the report's method, and by the preconditioned default.
+With `--limit`, hand-written C++ (analytic derivatives; banded Newton and plain NCG) runs in turn with them, since a
+shared machine is quicker in one minute than in the next: `ratio` compares runs that lay side by side.
+"""
+
+import argparse
+import csv
+import math
+import os
+import platform
+import re
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+import rodjax
+from rodjax import problems
+from rodjax.path import stack_scenes
+
+STEPS = 25
+ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+# A slow path is repeated for about so long [s] in a round, once at least.
+ROUND_SECONDS = 6.0
+# What the C++ program prints of a run.
+REPORT = re.compile(
+    r"min (?P<min>\S+) med (?P<median>\S+) +iters tot (?P<iterations>\d+) max/step (?P<most>\d+) +evals (?P<evals>\d+)"
+    r".*notconv (?P<failures>\d+).*E/\(EI/L\) (?P<energy>\S+)"
+)
+
+
+class Limit(NamedTuple):
+    """A method of the C++ program."""
+
+    name: str
+    argument: Literal["newton", "ncg"]
+    tolerance: str
+    color: str
+
+
+class Method(NamedTuple):
+    """A solver of rodjax, and the C++ method it is compared with, at the same tolerance."""
+
+    name: str
+    solver: rodjax.NonlinearCG
+    limit: Limit | None
+    color: str
+
+
+class Row(NamedTuple):
+    """A line of the table; counts and times are per step."""
+
+    segments: int
+    method: str
+    tolerance: float
+    iterations_median: float  # NaN where only the mean is known
+    iterations_mean: float
+    iterations_max: int
+    evaluations: float
+    ms_median: float
+    ms_min: float
+    paths: int
+    compile_s: float  # NaN for C++
+    converged: bool
+    energy: float  # of stage (f) [EI/L]
+    ratio: float = math.nan  # median over the rounds, to the C++ method
+
+
+def plain(tolerance: float) -> rodjax.NonlinearCG:
+    return rodjax.NonlinearCG(preconditioner=None, tolerance=tolerance, max_iterations=1_000_000)
+
+
+NEWTON = Limit("C++ Newton", "newton", "1e-8", "C0")
+NCG = Limit("C++ plain NCG", "ncg", "1e-4", "C1")
+PLAIN = (Method("plain NCG", plain(1e-4), NCG, "C1"), Method("plain NCG", plain(1e-8), None, "C3"))
+PRECONDITIONED = Method("preconditioned", rodjax.NonlinearCG(), NEWTON, "C0")
+
+
+class OurRuns:
+    """The compiled path of one method, and the times of its runs."""
+
+    def __init__(self, method: Method, segments: int):
+        self.method, self.segments = method, segments
+        scenes, guess = stack_scenes(problems.figure_1()), problems.figure_1_start()
+
+        @jax.jit
+        def path(scenes, guess):
+            return rodjax.solve_path(scenes, segments=segments, guess=guess, solver=method.solver)
+
+        begin = time.perf_counter()
+        compiled = path.lower(scenes, guess).compile()
+        self.compile_s = time.perf_counter() - begin
+        self.run: Callable[[], rodjax.Equilibrium] = lambda: jax.block_until_ready(compiled(scenes, guess))
+        begin = time.perf_counter()
+        self.result = self.run()  # warms up
+        self.guessed_s = time.perf_counter() - begin
+        self.times: list[float] = []
+
+    def round(self, repeats: int) -> float:
+        """Median time of some runs [ms a step]."""
+        times = []
+        for _ in range(max(1, min(repeats, int(ROUND_SECONDS / self.guessed_s)))):
+            begin = time.perf_counter()
+            self.run()
+            times.append((time.perf_counter() - begin) / STEPS * 1e3)
+        self.times += times
+        return statistics.median(times)
+
+    def row(self, ratios: Sequence[float]) -> Row:
+        path, scale = self.result, float(problems.cable().EI / problems.cable().length)
+        iterations = np.asarray(path.iterations)
+        return Row(
+            segments=self.segments,
+            method=self.method.name,
+            tolerance=self.method.solver.tolerance,
+            iterations_median=float(np.median(iterations)),
+            iterations_mean=float(np.mean(iterations)),
+            iterations_max=int(np.max(iterations)),
+            evaluations=float(np.mean(path.evaluations)),
+            ms_median=statistics.median(self.times),
+            ms_min=min(self.times),
+            paths=len(self.times),
+            compile_s=self.compile_s,
+            converged=bool(np.all(path.converged)),
+            energy=float(path.energy[-1]) / scale,
+            ratio=statistics.median(ratios) if ratios else math.nan,
+        )
+
+
+class CppRuns:
+    """Runs of one C++ method, each of which repeats the path for two seconds and prints the median."""
+
+    def __init__(self, program: Path, limit: Limit, segments: int):
+        self.limit, self.segments = limit, segments
+        self.command = [str(program.resolve()), "p2", limit.argument, limit.tolerance, str(segments)]
+        self.reports: list[dict[str, str]] = []
+
+    def round(self) -> float:
+        """Median time [ms a step]."""
+        output = subprocess.run(self.command, capture_output=True, text=True, check=True).stdout
+        report = REPORT.search(output)
+        if report is None:
+            raise ValueError(f"{' '.join(self.command)} printed no line of numbers that this script knows: {output!r}")
+        self.reports.append(report.groupdict())
+        return float(report["median"])
+
+    def row(self) -> Row:
+        last = self.reports[-1]
+        return Row(
+            segments=self.segments,
+            method=self.limit.name,
+            tolerance=float(self.limit.tolerance),
+            iterations_median=math.nan,
+            iterations_mean=int(last["iterations"]) / STEPS,
+            iterations_max=int(last["most"]),
+            evaluations=int(last["evals"]) / STEPS,
+            ms_median=statistics.median(float(report["median"]) for report in self.reports),
+            ms_min=min(float(report["min"]) for report in self.reports),
+            paths=len(self.reports),
+            compile_s=math.nan,
+            converged=last["failures"] == "0",
+            energy=float(last["energy"]),
+        )
+
+
+def measured(segments: int, methods: Sequence[Method], program: Path | None, rounds: int, repeats: int) -> list[Row]:
+    """All methods at one mesh; those with a C++ partner in rounds of ours, C++, ours, C++, ..."""
+    rows = []
+    for method in methods:
+        ours = OurRuns(method, segments)
+        cpp = CppRuns(program, method.limit, segments) if program and method.limit else None
+        ratios = []
+        for _ in range(1 if cpp is None else rounds):
+            ms = ours.round(repeats)
+            if cpp is not None:
+                ratios.append(ms / cpp.round())
+        rows.append(ours.row(ratios))
+        if cpp is not None:
+            rows.append(cpp.row())
+    return rows
+
+
+def machine() -> str:
+    """CPU model and cores."""
+    model = platform.processor() or platform.machine()
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        found = re.search(r"model name\s*: (.*)", information.read_text())
+        model = found[1] if found else model
+    return f"{model}, {os.cpu_count()} cores"
+
+
+HEADER = (
+    f"{'':27} |{'iterations a step':^23}|{'evals':>8}{'ms a step':>11}{'':9}{'us an':>9}{'':6} |{'compile':>8}"
+    f"{'con-':>7}  {'energy f':13}{'ratio':>6}\n"
+    f"{'N':>4}  {'method':15}{'tol':>6} |{'median':>8}{'mean':>8}{'max':>7}|{'a step':>8}{'median':>11}{'min':>9}"
+    f"{'eval':>9}{'runs':>6} |{'s':>8}{'verged':>7}  {'EI/L':13}{'to C++':>6}"
+)
+
+
+def line(row: Row) -> str:
+    def number(value: float, format_spec: str, width: int) -> str:
+        return f"{'-' if math.isnan(value) else format(value, format_spec):>{width}}"
+
+    return (
+        f"{row.segments:4}  {row.method:15}{row.tolerance:6.0e} |{number(row.iterations_median, '.0f', 8)}"
+        f"{row.iterations_mean:8.1f}{row.iterations_max:7}|{row.evaluations:8.1f}{row.ms_median:11.4f}{row.ms_min:9.4f}"
+        f"{1e3 * row.ms_median / row.evaluations:9.2f}{row.paths:6} |{number(row.compile_s, '.1f', 8)}"
+        f"{'yes' if row.converged else 'NO':>7}  {row.energy:<13.9f}{number(row.ratio, '.1f', 6)}"
+    )
+
+
+def gains(rows: Sequence[Row]) -> list[str]:
+    """What the preconditioner buys where both ran at the same tolerance."""
+    tolerance = PRECONDITIONED.solver.tolerance
+    found = {(row.segments, row.method): row for row in rows if row.tolerance == tolerance}
+    words = []
+    for (segments, name), slow in found.items():
+        quick = found[segments, PRECONDITIONED.name]
+        if name == PLAIN[0].name:
+            iterations, seconds = slow.iterations_mean / quick.iterations_mean, slow.ms_median / quick.ms_median
+            words.append(
+                f"N = {segments}: the preconditioner takes {iterations:.0f} times fewer iterations "
+                f"and {seconds:.0f} times less time (both to {tolerance:.0e})"
+            )
+    return words
+
+
+def picture(rows: Sequence[Row]) -> Figure:
+    """Time of a step against the number of segments."""
+    figure = Figure(figsize=(8, 5.6), layout="constrained")
+    axes = figure.subplots()
+    colors = {(method.name, method.solver.tolerance): method.color for method in (*PLAIN, PRECONDITIONED)}
+    colors |= {(limit.name, float(limit.tolerance)): limit.color for limit in (NCG, NEWTON)}
+    for (name, tolerance), color in colors.items():
+        curve = [row for row in rows if row.method == name and row.tolerance == tolerance]
+        if not curve:
+            continue
+        segments, ms = [row.segments for row in curve], [row.ms_median for row in curve]
+        label = f"{name}, to $10^{{{round(math.log10(tolerance))}}}$"
+        style = "s--" if name.startswith("C++") else "o-"
+        axes.loglog(segments, ms, style, color=color, label=label)
+        below = (name, tolerance) == (PLAIN[0].name, 1e-4) or name in (PRECONDITIONED.name, NEWTON.name)
+        for x, y in zip(segments, ms, strict=True):
+            offset = (0, -15 if below else 8)
+            axes.annotate(f"{y:.3g}", (x, y), offset, textcoords="offset points", ha="center", fontsize=8, color=color)
+    ticks = sorted({row.segments for row in rows})
+    axes.set_xticks(ticks, [str(n) for n in ticks], minor=False)
+    axes.set_xticks([], minor=True)
+    axes.margins(y=0.1)
+    axes.set(xlabel="segments N", ylabel="time of one step of Fig. 1 [ms]")
+    axes.set_title(f"Nonlinear conjugate gradients on Fig. 1 (25 steps)\n{machine()}, one thread, double precision")
+    axes.grid(color="0.9")
+    axes.legend()
+    return figure
+
+
+def main(argv: Sequence[str] | None = None) -> list[Row]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--segments", type=int, nargs="+", default=[10, 20, 50, 100, 200])
+    parser.add_argument("--plain-up-to", type=int, default=50, help="largest mesh for plain NCG, ours and C++")
+    parser.add_argument("--rounds", type=int, default=3, help="turns of ours and C++ at each mesh")
+    parser.add_argument("--repeats", type=int, default=7, help="runs of ours in a round")
+    parser.add_argument("--limit", type=Path, help="the C++ program that stands in for the machine's limit")
+    parser.add_argument("--out", type=Path, help="folder for nonlinear_cg.csv and nonlinear_cg.png")
+    arguments = parser.parse_args(argv)
+    os.environ.setdefault("XLA_FLAGS", ONE_THREAD)  # read when JAX makes its first array
+    jax.config.update("jax_enable_x64", True)
+    print(f"Fig. 1, {STEPS} steps; {machine()}, load {os.getloadavg()[0]:.1f}; XLA_FLAGS={os.environ['XLA_FLAGS']}")
+    repeats = f"{arguments.repeats} runs in a round, or as many as fit in {ROUND_SECONDS:.0f} s, at least one"
+    print(f"times: median over all runs, {repeats}; a C++ run repeats the path for 2 s")
+    print("tolerance: largest component of the gradient [EI/L^2], ours and C++ alike")
+    print("ratio: ours to C++, side by side: preconditioned NCG to Newton (1e-8), plain NCG to plain NCG (1e-4)")
+    print(HEADER)
+    rows = []
+    for segments in arguments.segments:
+        methods = (*PLAIN, PRECONDITIONED) if segments <= arguments.plain_up_to else (PRECONDITIONED,)
+        found = measured(segments, methods, arguments.limit, arguments.rounds, arguments.repeats)
+        print("\n".join(map(line, found)), flush=True)
+        rows += found
+    print("\n".join(gains(rows)))
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        with open(arguments.out / "nonlinear_cg.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(Row._fields)
+            writer.writerows(rows)
+        picture(rows).savefig(arguments.out / "nonlinear_cg.png", dpi=110)
+    return rows
+
+
+if __name__ == "__main__":
+    main()

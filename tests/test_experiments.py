@@ -65,3 +65,9 @@ def test_nonlinear_cg(tmp_path, capsys, monkeypatch):
     with open(tmp_path / "nonlinear_cg.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == 6
     assert (tmp_path / "nonlinear_cg.png").stat().st_size > 10_000
+
+
+def test_cold_start():
+    shares = script("cold_start").main(["--count", "5", "--moments", "1", "--segments", "10"])
+    assert len(shares) == 3 + 2 * 4
+    assert all(share == 1.0 for name, share in shares.items() if name.startswith("clamps"))

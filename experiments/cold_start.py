@@ -56,7 +56,7 @@ def clamps(rod: Rod, rng: np.random.Generator, count: int) -> Iterator[Scene]:
     for _ in range(count):
         away = rng.normal(size=3)
         position = rng.uniform(0.05, 0.95) * away / np.linalg.norm(away)
-        start, end = (Rotation.random(random_state=rng).as_matrix() for _ in range(2))
+        start, end = (Rotation.random(None, rng).as_matrix() for _ in range(2))
         gravity = (0.0, 0.0, -unit * 10 ** rng.uniform(-1, 2.5))
         yield Scene(rod, Clamp((0, 0, 0), start), Clamp(position, end), gravity)
 

@@ -225,6 +225,7 @@ def _set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = Tru
         axis.set_major_locator(MultipleLocator(grid))
         if labels:
             axis.set_label_text(f"{axis.axis_name} [m]")
+            axis.labelpad = 12  # clear of the tick labels
         else:
             axis.set_major_formatter(NullFormatter())
     axes.set_box_aspect(tuple(spans), zoom=0.85 if labels else 1.1)  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def replace_file(path: Path, content: bytes | memoryview) -> None:
+def replace_file(path: Path, content: bytes) -> None:
     """Puts a new file in the place of `path` in one step; a kill before it may leave a hidden `.tmp` file behind.
 
     Raises `OSError` with the names of the file and its folder where it cannot be written.

@@ -86,7 +86,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
         from rodjax import __version__
 
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
-    replace_file(path, image.getbuffer())
+    replace_file(path, image.getvalue())
 
 
 def load(path: str | os.PathLike[str]) -> Equilibrium:

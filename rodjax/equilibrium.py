@@ -14,7 +14,7 @@ from rodjax.guess import Guess, cubic, first_shape, resampled
 from rodjax.scene import Scene, nondimensional
 from rodjax.solvers.newton_krylov import find_equilibrium
 from rodjax.solvers.nonlinear_cg import Minimum, NonlinearCG, minimize
-from rodjax.status import Status
+from rodjax.status import Status, is_converged
 from rodjax.units import Units
 
 DEFAULT_SEGMENTS = 50
@@ -197,7 +197,7 @@ def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver
         start_moment=resultants.start_moment * units.energy,
         end_force=resultants.end_force * units.force,
         end_moment=resultants.end_moment * units.energy,
-        converged=(minimum.status == Status.CONVERGED) | (minimum.status == Status.ROUNDING_FLOOR),
+        converged=is_converged(minimum.status),
         status=minimum.status,
         iterations=minimum.iterations,
         evaluations=minimum.evaluations,

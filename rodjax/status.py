@@ -2,6 +2,8 @@
 
 import enum
 
+from jaxtyping import Array, Bool, Int
+
 
 class Status(enum.IntEnum):
     """The code in `Equilibrium.status`."""
@@ -14,10 +16,6 @@ class Status(enum.IntEnum):
     RUNNING = 5
 
     @property
-    def is_success(self) -> bool:
-        return self in (Status.CONVERGED, Status.ROUNDING_FLOOR)
-
-    @property
     def message(self) -> str:
         return {
             Status.CONVERGED: "converged: the gradient fell below the tolerance",
@@ -27,3 +25,8 @@ class Status(enum.IntEnum):
             Status.NOT_FINITE: "not converged: the energy or its gradient is not a finite number",
             Status.RUNNING: "not finished",
         }[self]
+
+
+def is_converged(status: Int[Array, "..."]) -> Bool[Array, "..."]:
+    """Whether a code, or each of an array of them, stands for an equilibrium."""
+    return (status == Status.CONVERGED) | (status == Status.ROUNDING_FLOOR)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from rodjax.linalg import factor
 from rodjax.solvers.nonlinear_cg import Minimum, NonlinearCG, minimize, progress
-from rodjax.status import Status
+from rodjax.status import Status, is_converged
 
 MAX_STEPS = 100
 MAX_HALVINGS = 12
@@ -60,8 +60,7 @@ def find_equilibrium(problem, point: PyTree, solver: NonlinearCG) -> Minimum:
 
     def unfinished(state: tuple[_State, Int[Array, ""]]):
         found, attempts = state
-        done = (found.status == Status.CONVERGED) | (found.status == Status.ROUNDING_FLOOR)
-        return (attempts < 2) & ~done
+        return (attempts < 2) & ~is_converged(found.status)
 
     nothing = problem.no_displacement(point)
     begin = _State(point, jnp.zeros((), nothing.dtype), nothing, zero, zero, jnp.full((), Status.RUNNING, int))

@@ -6,35 +6,21 @@ shared machine is quicker in one minute than in the next: `ratio` compares runs 
 """
 
 import argparse
-import csv
 import math
-import os
-import platform
-import re
 import statistics
-import subprocess
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
+from measuring import ROUND_SECONDS, Timed, compiled, conditions, cpp_report, machine, number, save_rows, set_up
 
 import rodjax
 from rodjax import problems
 from rodjax.path import stack_scenes
 
 STEPS = 25
-ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-# A slow path is repeated for about so long [s] in a round, once at least.
-ROUND_SECONDS = 6.0
-# What the C++ program prints of a run.
-REPORT = re.compile(
-    r"min (?P<min>\S+) med (?P<median>\S+) +iters tot (?P<iterations>\d+) max/step (?P<most>\d+) +evals (?P<evals>\d+)"
-    r".*notconv (?P<failures>\d+).*E/\(EI/L\) (?P<energy>\S+)"
-)
 
 
 class Limit(NamedTuple):
@@ -91,31 +77,18 @@ class OurRuns:
         self.method, self.segments = method, segments
         scenes, guess = stack_scenes(problems.figure_1()), problems.figure_1_start()
 
-        @jax.jit
         def path(scenes, guess):
             return rodjax.solve_path(scenes, segments=segments, guess=guess, solver=method.solver)
 
-        begin = time.perf_counter()
-        compiled = path.lower(scenes, guess).compile()
-        self.compile_s = time.perf_counter() - begin
-        self.run: Callable[[], rodjax.Equilibrium] = lambda: jax.block_until_ready(compiled(scenes, guess))
-        begin = time.perf_counter()
-        self.result = self.run()  # warms up
-        self.guessed_s = time.perf_counter() - begin
-        self.times: list[float] = []
+        program, self.compile_s = compiled(path, scenes, guess)
+        self.path: Timed[rodjax.Equilibrium] = Timed(lambda: program(scenes, guess))
 
     def round(self, repeats: int) -> float:
         """Median time of some runs [ms a step]."""
-        times = []
-        for _ in range(max(1, min(repeats, int(ROUND_SECONDS / self.guessed_s)))):
-            begin = time.perf_counter()
-            self.run()
-            times.append((time.perf_counter() - begin) / STEPS * 1e3)
-        self.times += times
-        return statistics.median(times)
+        return self.path.round(repeats) / STEPS
 
     def row(self, ratios: Sequence[float]) -> Row:
-        path, scale = self.result, float(problems.cable().EI / problems.cable().length)
+        path, scale = self.path.result, float(problems.cable().EI / problems.cable().length)
         iterations = np.asarray(path.iterations)
         return Row(
             segments=self.segments,
@@ -125,9 +98,9 @@ class OurRuns:
             iterations_mean=float(np.mean(iterations)),
             iterations_max=int(np.max(iterations)),
             evaluations=float(np.mean(path.evaluations)),
-            ms_median=statistics.median(self.times),
-            ms_min=min(self.times),
-            paths=len(self.times),
+            ms_median=statistics.median(self.path.times) / STEPS,
+            ms_min=min(self.path.times) / STEPS,
+            paths=len(self.path.times),
             compile_s=self.compile_s,
             converged=bool(np.all(path.converged)),
             energy=float(path.energy[-1]) / scale,
@@ -139,17 +112,14 @@ class CppRuns:
     """Runs of one C++ method, each of which repeats the path for two seconds and prints the median."""
 
     def __init__(self, program: Path, limit: Limit, segments: int):
-        self.limit, self.segments = limit, segments
-        self.command = [str(program.resolve()), "p2", limit.argument, limit.tolerance, str(segments)]
+        self.program, self.limit, self.segments = program, limit, segments
         self.reports: list[dict[str, str]] = []
 
     def round(self) -> float:
         """Median time [ms a step]."""
-        output = subprocess.run(self.command, capture_output=True, text=True, check=True).stdout
-        report = REPORT.search(output)
-        if report is None:
-            raise ValueError(f"{' '.join(self.command)} printed no line of numbers that this script knows: {output!r}")
-        self.reports.append(report.groupdict())
+        limit = self.limit
+        report = cpp_report(self.program, "p2", limit.argument, limit.tolerance, self.segments, Path.cwd())
+        self.reports.append(report)
         return float(report["median"])
 
     def row(self) -> Row:
@@ -188,16 +158,6 @@ def measured(segments: int, methods: Sequence[Method], program: Path | None, rou
     return rows
 
 
-def machine() -> str:
-    """CPU model and cores."""
-    model = platform.processor() or platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        found = re.search(r"model name\s*: (.*)", information.read_text())
-        model = found[1] if found else model
-    return f"{model}, {os.cpu_count()} cores"
-
-
 HEADER = (
     f"{'':27} |{'iterations a step':^23}|{'evals':>8}{'ms a step':>11}{'':9}{'us an':>9}{'':6} |{'compile':>8}"
     f"{'con-':>7}  {'energy f':13}{'ratio':>6}\n"
@@ -207,9 +167,6 @@ HEADER = (
 
 
 def line(row: Row) -> str:
-    def number(value: float, format_spec: str, width: int) -> str:
-        return f"{'-' if math.isnan(value) else format(value, format_spec):>{width}}"
-
     return (
         f"{row.segments:4}  {row.method:15}{row.tolerance:6.0e} |{number(row.iterations_median, '.0f', 8)}"
         f"{row.iterations_mean:8.1f}{row.iterations_max:7}|{row.evaluations:8.1f}{row.ms_median:11.4f}{row.ms_min:9.4f}"
@@ -272,9 +229,8 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
     parser.add_argument("--limit", type=Path, help="the C++ program that stands in for the machine's limit")
     parser.add_argument("--out", type=Path, help="folder for nonlinear_cg.csv and nonlinear_cg.png")
     arguments = parser.parse_args(argv)
-    os.environ.setdefault("XLA_FLAGS", ONE_THREAD)  # read when JAX makes its first array
-    jax.config.update("jax_enable_x64", True)
-    print(f"Fig. 1, {STEPS} steps; {machine()}, load {os.getloadavg()[0]:.1f}; XLA_FLAGS={os.environ['XLA_FLAGS']}")
+    set_up()
+    print(f"Fig. 1, {STEPS} steps; {conditions()}")
     repeats = f"{arguments.repeats} runs in a round, or as many as fit in {ROUND_SECONDS:.0f} s, at least one"
     print(f"times: median over all runs, {repeats}; a C++ run repeats the path for 2 s")
     print("tolerance: largest component of the gradient [EI/L^2], ours and C++ alike")
@@ -288,11 +244,7 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
         rows += found
     print("\n".join(gains(rows)))
     if arguments.out is not None:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        with open(arguments.out / "nonlinear_cg.csv", "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(Row._fields)
-            writer.writerows(rows)
+        save_rows(rows, arguments.out / "nonlinear_cg.csv")
         picture(rows).savefig(arguments.out / "nonlinear_cg.png", dpi=110)
     return rows
 

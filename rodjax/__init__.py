@@ -11,6 +11,7 @@ from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene, write_scene
 from rodjax.solvers.line_search import LineSearch
+from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel, frame
@@ -23,6 +24,7 @@ __all__ = [
     "Free",
     "Guess",
     "LineSearch",
+    "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
     "Pin",

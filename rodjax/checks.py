@@ -1,9 +1,12 @@
 """Argument checks: each error names the argument, what was given and what is allowed.
 
 Values are checked where they are known. Inside `jax.jit`, `vmap` or `grad` they are not, so that only shapes are.
+
+Plain numbers are NumPy's until a module stores them: JAX would compile a program for each operation on them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -12,58 +15,77 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+Numbers = Array | np.ndarray
+
 
 def is_known(*values: Any) -> bool:
     """Whether every array in `values` has numbers that Python can read, that is: none is traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
-def number_array(value: Any, name: str, shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-    """`value` as a floating-point array of the given shape, finite where its numbers are known."""
+def namespace(*values: Any) -> ModuleType:
+    """The module whose functions compute with `values`: NumPy where they are known, else JAX's."""
+    return np if is_known(*values) else jnp
+
+
+def leaf(numbers: Float[Numbers, "*shape"]) -> Float[Array, "*shape"]:
+    """Checked numbers as a module stores them."""
+    # Not jnp.asarray: that compiles a program for each shape.
+    return numbers if isinstance(numbers, Array) else jax.device_put(numbers)
+
+
+def number_array(value: Any, name: str, shape: tuple[int, ...] = ()) -> Float[Numbers, "..."]:
+    """`value` as floating-point numbers of the given shape, of JAX's precision, finite where they are known."""
     kind = "a number" if shape == () else f"numbers of shape {shape}"
     try:
-        array = jnp.asarray(value)
-        if not jnp.issubdtype(array.dtype, jnp.floating):
-            if not jnp.issubdtype(array.dtype, jnp.integer):
-                raise TypeError
-            array = array.astype(float)
+        array = value if isinstance(value, Array) else namespace(value).asarray(value)
+        is_whole = jnp.issubdtype(array.dtype, jnp.integer)
+        if not (is_whole or jnp.issubdtype(array.dtype, jnp.floating)):
+            raise TypeError
+        # Strong type: a weakly typed leaf would compile a second program for the same scene.
+        array = array.astype(jax.dtypes.canonicalize_dtype(float if is_whole else array.dtype))
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be {kind}, got {value!r}") from None
     if array.shape != shape:
         raise ValueError(f"{name} must be {kind}, got an array of shape {array.shape}")
     if is_known(array) and not np.all(np.isfinite(array)):
         raise ValueError(f"{name} must be finite, got {value!r}")
-    # Strong type: a weakly typed leaf would compile a second program for the same scene.
-    return jax.lax.convert_element_type(array, array.dtype)
+    return array
 
 
-def positive(value: Any, name: str) -> Float[Array, ""]:
+def plain_number(name: str) -> Callable[[Any], float]:
+    """What makes Python's number of an option of that name: a solver is part of what a program is compiled for."""
+    return lambda value: float(number_array(value, name))
+
+
+def positive(value: Any, name: str) -> Float[Numbers, ""]:
     array = number_array(value, name)
-    if is_known(array) and not array > 0:
+    if is_known(array) and not float(array) > 0:
         raise ValueError(f"{name} must be positive, got {float(array):g}")
     return array
 
 
-def not_negative(value: Any, name: str) -> Float[Array, ""]:
+def not_negative(value: Any, name: str) -> Float[Numbers, ""]:
     array = number_array(value, name)
-    if is_known(array) and not array >= 0:
+    if is_known(array) and not float(array) >= 0:
         raise ValueError(f"{name} must not be negative, got {float(array):g}")
     return array
 
 
-def vector(value: Any, name: str) -> Float[Array, "3"]:
+def vector(value: Any, name: str) -> Float[Numbers, "3"]:
     return number_array(value, name, (3,))
 
 
-def direction(value: Any, name: str) -> Float[Array, "3"]:
+def direction(value: Any, name: str) -> Float[Numbers, "3"]:
     """`value` as a unit vector."""
     array = vector(value, name)
     if is_known(array) and not np.any(array):
         raise ValueError(f"{name} must be a direction, got the zero vector")
-    return array / jnp.linalg.norm(array)
+    xp = namespace(array)
+    return xp.asarray(array) / xp.linalg.norm(array)
 
 
-def rotation(value: Any, name: str) -> Float[Array, "3 3"]:
+def rotation(value: Any, name: str) -> Float[Numbers, "3 3"]:
     """`value` as a right-handed orthonormal matrix."""
     array = number_array(value, name, (3, 3))
     if is_known(array):

@@ -1,23 +1,36 @@
 """solve(): the equilibrium of a scene."""
 
+import functools
+import typing
 import warnings
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, whole_number
+from rodjax.discretization.dead_loads import energy_of_origin, load_energy
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.results import resultants
 from rodjax.guess import Guess, cubic, first_shape, resampled
-from rodjax.scene import Scene, nondimensional
-from rodjax.solvers.newton_krylov import find_equilibrium
-from rodjax.solvers.nonlinear_cg import Minimum, NonlinearCG, minimize
+from rodjax.plane import check_planar, plane
+from rodjax.scene import Scene, dead_end_moment, nondimensional
+from rodjax.solvers.newton import Newton, find_minimum, is_stable
+from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Status, is_converged
 from rodjax.units import Units
 
+Solver = Newton | NonlinearCG
+
+# Edges that differ by so many roundings are the same.
+SAME_EDGES = 64
+
 DEFAULT_SEGMENTS = 50
+DEFAULT_SOLVER = Newton()
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
@@ -27,9 +40,13 @@ class NotConvergedWarning(UserWarning):
 
 
 class SolverState(eqx.Module):
-    """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units."""
+    """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
+
+    `end_force`: the force at s = L between held ends, else zero.
+    """
 
     polyline: Polyline
+    end_force: Float[Array, "... 3"]
     units: Units
 
 
@@ -49,7 +66,10 @@ class Equilibrium(eqx.Module):
       moment depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
-    - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient
+    - `stable` [...] bool: converged, and the energy has no negative curvature there; with a dead moment, which has no
+      potential, this is not examined and False
+    - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
+      a step of a path took: 1, or more where it was split
     - `residual` [...] largest component of the gradient, in EI/L^2
     - `radius` [...] of the rod, m, or `None`: for pictures
     """
@@ -68,9 +88,11 @@ class Equilibrium(eqx.Module):
     end_force: Float[Array, "... 3"]
     end_moment: Float[Array, "... 3"]
     converged: Bool[Array, "..."]
+    stable: Bool[Array, "..."]
     status: Int[Array, "..."]
     iterations: Int[Array, "..."]
     evaluations: Int[Array, "..."]
+    substeps: Int[Array, "..."]
     residual: Float[Array, "..."]
     radius: Float[Array, "..."] | None
     state: SolverState
@@ -101,8 +123,9 @@ def solve(
     *,
     segments: int | None = None,
     discretization: Literal["finite_difference"] = "finite_difference",
-    solver: NonlinearCG | None = None,
+    solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
 ) -> Equilibrium:
     """The equilibrium of a scene.
 
@@ -113,9 +136,11 @@ def solve(
     - `scene`: `Scene`.
     - `segments`: of the mesh; `None`: those of a guess that is an `Equilibrium`, else 50.
     - `discretization`: `"finite_difference"`, the only one in this version: second order in 1/segments.
-    - `solver`: `NonlinearCG`; `None` for its defaults.
+    - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
       supports and gravity.
+    - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
+      motions out of the plane too.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
@@ -126,10 +151,10 @@ def solve(
             f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
-    segments, solver = checked_options(segments, discretization, solver, guess)
-    equilibrium = _solve(scene, guess, segments, solver)
-    warn_if_not_converged(equilibrium)
-    return equilibrium
+    segments, solver = checked_options(scene, segments, discretization, solver, guess, planar)
+    result = _solve(scene, guess, segments, solver, planar)
+    warn_if_not_converged(result)
+    return result
 
 
 def describe(equilibrium: Equilibrium) -> str:
@@ -144,8 +169,13 @@ def describe(equilibrium: Equilibrium) -> str:
 
 
 def checked_options(
-    segments: int | None, discretization: str, solver: NonlinearCG | None, guess: Guess | Equilibrium | None
-) -> tuple[int, NonlinearCG]:
+    scene: Scene,
+    segments: int | None,
+    discretization: str,
+    solver: Solver | None,
+    guess: Guess | Equilibrium | None,
+    planar: bool,
+) -> tuple[int, Solver]:
     """Segments and solver with the library's choice for `None`."""
     if discretization != "finite_difference":
         raise ValueError(f"discretization must be 'finite_difference' in this version, got {discretization!r}")
@@ -155,66 +185,140 @@ def checked_options(
         segments = guess.s.shape[-1] - 1 if isinstance(guess, Equilibrium) else DEFAULT_SEGMENTS
     segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
     if solver is None:
-        solver = NonlinearCG()
-    instance(solver, "solver", NonlinearCG)
+        solver = DEFAULT_SOLVER
+    instance(solver, "solver", typing.get_args(Solver))
+    if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
+    if planar:
+        if isinstance(solver, NonlinearCG):
+            raise ValueError("solver must be a Newton where planar is True")
+        check_planar(scene)
     return segments, solver
 
 
 def first_state(scene: Scene, guess: Guess | Equilibrium | None, segments: int) -> tuple[SolverState, Float[Array, ""]]:
     """Where to begin, and the total twist to stay near to [rad]."""
     scaled, units = nondimensional(scene)
+    no_force = jnp.zeros(3, scene.rod.length.dtype)
     if guess is None:
         shape = Polyline.through(first_shape(scaled, segments))
-        return SolverState(shape, units), jnp.zeros_like(scene.rod.length)
+        return SolverState(shape, no_force, units), jnp.zeros_like(scene.rod.length)
     if isinstance(guess, Guess):
-        return SolverState(guess.polyline(units, segments), units), guess.total_twist
-    if guess.s.shape[-1] - 1 == segments:
-        return guess.state, guess.total_twist
-    nodes = guess.state.polyline.nodes
-    return SolverState(Polyline.through(resampled(nodes, segments)), guess.state.units), guess.total_twist
+        return SolverState(guess.polyline(units, segments), no_force, units), guess.total_twist
+    state = guess.state
+    if guess.s.shape[-1] - 1 != segments:
+        polyline = Polyline.through(resampled(state.polyline.nodes, segments))
+        state = SolverState(polyline, state.end_force, state.units)
+    return state, guess.total_twist
 
 
-def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver: NonlinearCG) -> Equilibrium:
-    """The one code path of every solve: from a state to an equilibrium."""
+class Found(eqx.Module):
+    """Where a solver stopped, nondimensional."""
+
+    polyline: Polyline
+    point: MixedPoint
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    status: Int[Array, ""]
+    is_stable: Bool[Array, ""]
+
+
+def solve_from(
+    scene: Scene, state: SolverState, twist: Float[Array, ""], solver: Solver, planar: bool
+) -> tuple[Found, Units]:
+    """The one code path of every solve: from a state to where the solver stops."""
     scaled, units = nondimensional(scene)
     polyline = _in_units(state, units)
-    minimum = _found(scaled, polyline, twist, solver=solver)
-    problem, point = minimum.problem, minimum.point
-    resultants = problem.resultants(point)
-    n = len(point.edges)
-    fraction = jnp.linspace(0.0, 1.0, n + 1, dtype=point.nodes.dtype)
+    end_force = state.end_force * (state.units.force / units.force)
+    return _found(scaled, polyline, end_force, twist, solver=solver, planar=planar), units
+
+
+def equilibrium(scene: Scene, found: Found, units: Units, substeps: Int[Array, ""]) -> Equilibrium:
+    """What a solver found, in SI units."""
+    scaled, _ = nondimensional(scene)
+    n = len(found.polyline.edges)
+    form = MixedForm.of(scaled, n)
+    point = found.point
+    results = resultants(scaled, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
+    elastic_energy = form.elastic_energy(point)
+    loads = load_energy(scaled, found.polyline.nodes)
+    potential = elastic_energy if loads is None else elastic_energy + loads
+    fraction = jnp.linspace(0.0, 1.0, n + 1, dtype=elastic_energy.dtype)
+    converged = is_converged(found.status)
     return Equilibrium(
         s=fraction * scene.rod.length,
-        nodes=units.origin[None] + units.length * point.nodes,
-        frames=resultants.frames,
-        curvature=resultants.curvature / units.length,
-        twist=resultants.twist / units.length,
-        total_twist=resultants.total_twist,
-        tension=resultants.tension * units.force,
-        energy=units.energy * minimum.energy + problem.energy_of_origin(units),
-        elastic_energy=units.energy * problem.elastic_energy(point),
-        start_force=resultants.start_force * units.force,
-        start_moment=resultants.start_moment * units.energy,
-        end_force=resultants.end_force * units.force,
-        end_moment=resultants.end_moment * units.energy,
-        converged=is_converged(minimum.status),
-        status=minimum.status,
-        iterations=minimum.iterations,
-        evaluations=minimum.evaluations,
-        residual=minimum.residual,
+        nodes=units.origin[None] + units.length * found.polyline.nodes,
+        frames=results.frames,
+        curvature=results.curvature / units.length,
+        twist=results.twist / units.length,
+        total_twist=point.total_twist,
+        tension=results.tension * units.force,
+        energy=units.energy * potential + energy_of_origin(scaled, units),
+        elastic_energy=units.energy * elastic_energy,
+        start_force=results.start_force * units.force,
+        start_moment=results.start_moment * units.energy,
+        end_force=results.end_force * units.force,
+        end_moment=results.end_moment * units.energy,
+        converged=converged,
+        stable=converged & found.is_stable,
+        status=found.status,
+        iterations=found.iterations,
+        evaluations=found.evaluations,
+        substeps=substeps,
+        residual=found.residual,
         radius=scene.rod.radius,
-        state=SolverState(point, units),
+        state=SolverState(found.polyline, point.end_force, units),
     )
 
 
 @eqx.filter_custom_jvp
-def _found(scene: Scene, polyline: Polyline, twist: Float[Array, ""], *, solver: NonlinearCG) -> Minimum:
-    problem, start = FiniteDifference.begin(scene, polyline, twist)
-    return (minimize if problem.has_potential else find_equilibrium)(problem, start, solver)
+def _found(
+    scene: Scene,
+    guess: Polyline,
+    end_force: Float[Array, "3"],
+    twist: Float[Array, ""],
+    *,
+    solver: Solver,
+    planar: bool,
+) -> Found:
+    problem, start = FiniteDifference.begin(scene, guess, twist)
+    form = MixedForm.of(scene, len(start.edges))
+    if isinstance(solver, NonlinearCG):
+        minimum = minimize(problem, start, solver)
+        point = minimum.problem.mixed_point(minimum.point)
+        polyline, stable = minimum.point, is_stable(form, point)
+    else:
+        begin = eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
+        normal = None
+        if planar:
+            normal, axes = plane(scene, begin.tangents)
+            begin = begin.flattened(axes)
+            form = form.along(axes)
+        minimum = find_minimum(form, begin, solver)
+        point = minimum.point
+        edges = form.edges(point)
+        # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
+        change = jnp.max(jnp.abs(edges - start.edges)) * len(edges)
+        is_start = (minimum.iterations == 0) & (change <= SAME_EDGES * jnp.finfo(edges.dtype).eps)
+        reached = Polyline(form.nodes(edges), edges)
+        polyline = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
+        stable = minimum.is_stable
+        if normal is not None:
+            stable &= is_stable(form.along(normal[:, None]), point)
+    return Found(
+        polyline=polyline,
+        point=point,
+        residual=minimum.residual,
+        iterations=minimum.iterations,
+        evaluations=minimum.evaluations,
+        status=minimum.status,
+        is_stable=stable,
+    )
 
 
 @_found.def_jvp
-def _no_derivative(primals, tangents, *, solver: NonlinearCG):
+def _no_derivative(primals, tangents, *, solver: Solver, planar: bool):
     # Differentiating the iterations would give numbers that look right and are not.
     raise NotImplementedError(
         "the derivative of a solve is not part of this version; "
@@ -222,10 +326,11 @@ def _no_derivative(primals, tangents, *, solver: NonlinearCG):
     )
 
 
-@eqx.filter_jit
-def _solve(scene: Scene, guess: Guess | Equilibrium | None, segments: int, solver: NonlinearCG) -> Equilibrium:
+# Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
+@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar"))
+def _solve(scene: Scene, guess: Guess | Equilibrium | None, segments: int, solver: Solver, planar: bool) -> Equilibrium:
     state, twist = first_state(scene, guess, segments)
-    return solve_from(scene, state, twist, solver)
+    return equilibrium(scene, *solve_from(scene, state, twist, solver, planar), jnp.ones((), int))
 
 
 def _in_units(state: SolverState, units: Units) -> Polyline:

@@ -27,7 +27,7 @@ from rodjax.status import Status
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 1
+FORMAT = 2
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -45,13 +45,16 @@ FIELDS = {
     "end_force": ("N", "force of the support at s = L on the rod, global axes"),
     "end_moment": ("N m", "moment of the support at s = L on the rod, about the centerline, global axes"),
     "converged": ("1", "whether the solve converged"),
+    "stable": ("1", "whether the energy has no negative curvature there"),
     "status": ("1", "how the solve ended: " + ", ".join(f"{status.value} {status.name}" for status in Status)),
     "iterations": ("1", "iterations of the solver"),
     "evaluations": ("1", "evaluations of the energy and its gradient"),
+    "substeps": ("1", "solves that a step of a path took"),
     "residual": ("1", "largest component of the gradient, in EI/L^2"),
     "radius": ("m", "radius of the rod; absent where it is not known"),
     "state/polyline/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
     "state/polyline/edges": ("1", "differences of these nodes, free of the rounding of the positions"),
+    "state/end_force": ("1", "force at s = L between held ends, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
@@ -143,6 +146,11 @@ def _check_format(group: h5py.Group, path: Path) -> None:
         raise ValueError(
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
             f"this rodjax reads formats up to {FORMAT}: update it"
+        )
+    if written < FORMAT:
+        raise ValueError(
+            f"{path} has format {written}, written by rodjax {group.attrs.get('version')}, which lacks fields of "
+            f"format {FORMAT}: solve its scene again"
         )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import number_array
+from rodjax.checks import leaf, number_array
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.scene import Scene
 from rodjax.supports import Directed, Free, Held, Support
@@ -29,8 +29,8 @@ class Guess(eqx.Module):
         shape = np.shape(points)
         if len(shape) != 2 or shape[0] < 2 or shape[1] != 3:
             raise ValueError(f"points must have the shape (m, 3) with m >= 2, got {shape}")
-        self.points = number_array(points, "points", shape)
-        self.total_twist = number_array(total_twist, "total_twist")
+        self.points = leaf(number_array(points, "points", shape))
+        self.total_twist = leaf(number_array(total_twist, "total_twist"))
 
     def polyline(self, units: Units, segments: int) -> Polyline:
         """The nodes of a mesh on this shape, nondimensional."""

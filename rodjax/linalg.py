@@ -1,146 +1,216 @@
-"""Symmetric positive definite block-tridiagonal systems by block cyclic reduction.
+"""Saddle-point systems along a rod: a symmetric block-tridiagonal matrix with a border, by block cyclic reduction.
 
-Every level eliminates the blocks of odd number, all at once, by Cholesky factorisation: log2(n) levels of a few batched
-operations each, where block Thomas elimination would take n steps one after another. Any number of blocks is allowed.
+    [ H    A ] [x]   [f]
+    [ A^T -C ] [y] = [c]
+
+H couples neighbours, n blocks of b x b; the k columns of A are few and full: what all of the rod has in common. H may
+be indefinite, and the number of negative eigenvalues of the whole follows from the factorisation (Haynsworth 1968).
+Loads without a potential have other rows than columns in the border.
+
+Every level eliminates the blocks of odd number, all at once: log2(n) levels of a few loops each, where block Thomas
+elimination would take n steps one after another. The inverses of blocks are explicit, and arrays have the place along
+the rod as their last axis, (b, b, n): all loops are then vector loops along the rod, on a processor or an accelerator.
 Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tridiagonal linear systems" (1976).
 """
 
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
-class SymmetricBlockTridiagonal(eqx.Module):
-    """A symmetric matrix of n x n blocks: `diagonal[i]` is block (i, i), `lower[i]` is block (i + 1, i)."""
+class SaddlePointSystem(eqx.Module):
+    """The matrix above: `diagonal[..., i]` is block (i, i) of H, `lower[..., i]` block (i + 1, i).
 
-    diagonal: Float[Array, "n b b"]
-    lower: Float[Array, "n-1 b b"]
+    `border` holds A, `compliance` C, symmetric; `rows` stand in the place of A^T where they are given. Blocks of size 1
+    and 2.
+    """
+
+    diagonal: Float[Array, "b b n"]
+    lower: Float[Array, "b b n-1"]
+    border: Float[Array, "b k n"]
+    compliance: Float[Array, "k k"]
+    rows: Float[Array, "b k n"] | None = None
 
     def __check_init__(self):
-        n, b, _ = self.diagonal.shape
-        if self.diagonal.shape != (n, b, b) or self.lower.shape != (n - 1, b, b):
+        b, k, n = self.border.shape
+        rows = self.border if self.rows is None else self.rows
+        given = [x.shape for x in (self.diagonal, self.lower, self.border, self.compliance, rows)]
+        if b not in (1, 2) or given != [(b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n)]:
             raise ValueError(
-                "a block-tridiagonal matrix needs blocks of shapes (n, b, b) and (n - 1, b, b), "
-                f"got {self.diagonal.shape} and {self.lower.shape}"
+                "a saddle-point system needs arrays of shapes (b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n) "
+                f"with b = 1 or 2, got {', '.join(map(str, given))}"
             )
 
-    def __matmul__(self, x: Float[Array, "n b"]) -> Float[Array, "n b"]:
-        product = _apply(self.diagonal, x)
-        product = product.at[1:].add(_apply(self.lower, x[:-1]))
-        return product.at[:-1].add(_apply_transpose(self.lower, x[1:]))
+    def shifted(self, shift: Float[Array, ""]) -> "SaddlePointSystem":
+        """H + shift I in the place of H."""
+        identity = jnp.eye(self.diagonal.shape[0], dtype=shift.dtype)[..., None]
+        return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift * identity)
+
+
+class Factors(eqx.Module):
+    """The factorisation of a `SaddlePointSystem`.
+
+    `negative`: the number of its negative eigenvalues beyond the k of the border. Where that is 0, H is positive
+    definite on the x with A^T x = 0, and a solution is the minimum under the constraints. 0 without symmetry.
+    """
+
+    elimination: "_Elimination"
+    rows: Float[Array, "b k n"]
+    border_solution: Float[Array, "b k n"]
+    complement: Float[Array, "k k"]
+    negative: Int[Array, ""]
+
+    @property
+    def is_minimum(self) -> Bool[Array, ""]:
+        """Whether H is positive definite under the constraints; not where a block of the elimination was singular."""
+        is_finite = jnp.isfinite(jnp.sum(self.elimination.last_inverse) + jnp.sum(self.complement))
+        return (self.negative == 0) & is_finite
+
+    def solve(self, f: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        return self._bordered(self.elimination.solve(f[:, None])[:, 0], c)
+
+    def _bordered(self, x: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        """The solution, from that without border."""
+        y = jnp.sum(self.complement * (c - _dots(self.rows, x))[None], axis=1)
+        return x - jnp.sum(self.border_solution * y[None, :, None], axis=1), y
+
+
+def factor(system: SaddlePointSystem) -> Factors:
+    """Factorisation by cyclic reduction, O(n). A block that happens to be singular makes infinities or NaN."""
+    return _factor(system, system.border)[0]
+
+
+def factor_and_solve(
+    system: SaddlePointSystem, f: Float[Array, "b n"], c: Float[Array, "k"]
+) -> tuple[Factors, Float[Array, "b n"], Float[Array, "k"]]:
+    """Factorisation and the solution for one right side, in one sweep."""
+    factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1))
+    return factors, *factors._bordered(x[:, -1], c)
+
+
+def _factor(system: SaddlePointSystem, right_sides: Float[Array, "b j n"]) -> tuple[Factors, Float[Array, "b j n"]]:
+    elimination, negative, x = _eliminate(system.diagonal, system.lower, right_sides)
+    k = system.border.shape[1]
+    solution = x[:, :k]
+    if system.rows is None:
+        rows = system.border
+        complement, below = _symmetric_inverse(-system.compliance - _dots(rows[:, :, None], solution))
+        negative += below - k
+    else:
+        rows = system.rows
+        complement = jnp.linalg.inv(-system.compliance - _dots(rows[:, :, None], solution))
+        negative = jnp.zeros_like(negative)
+    return Factors(elimination, rows, solution, complement, negative), x
 
 
 class _Level(eqx.Module):
-    """One level: with D = L L^T the odd blocks on the diagonal, inverse L, L^-1 left and L^-1 right."""
+    """One level: the inverses of the odd blocks D, and D^-1 times the blocks that couple them to their neighbours."""
 
-    inverse: Float[Array, "m b b"]
-    left: Float[Array, "m b b"]
-    right: Float[Array, "m b b"]
+    inverse: Float[Array, "b b m"]
+    left: Float[Array, "b b m"]
+    right: Float[Array, "b b m"]
 
 
-class BlockCholesky(eqx.Module):
-    """The factorisation of a `SymmetricBlockTridiagonal`; NaN where that is not positive definite."""
-
+class _Elimination(eqx.Module):
     levels: tuple[_Level, ...]
-    last_inverse: Float[Array, "1 b b"]
+    last_inverse: Float[Array, "b b 1"]
 
-    @property
-    def is_positive_definite(self) -> Bool[Array, ""]:
-        # A failed block is NaN, and what it is eliminated into becomes NaN with it, down to the last block.
-        return jnp.all(jnp.isfinite(self.last_inverse))
-
-    def solve(self, right_side: Float[Array, "n b"]) -> Float[Array, "n b"]:
-        f = right_side
+    def solve(self, f: Float[Array, "b j n"]) -> Float[Array, "b j n"]:
+        """H^-1 f for j right sides."""
         eliminated = []
         for level in self.levels:
-            w = _apply(level.inverse, f[1::2])
-            eliminated.append(w)
-            f = _subtract_neighbours(f[0::2], _apply_transpose(level.left, w), _apply_transpose(level.right, w))
-        x = _apply_transpose(self.last_inverse, _apply(self.last_inverse, f))
-        for level, w in zip(reversed(self.levels), reversed(eliminated), strict=True):
-            n_odd, n_even = len(w), len(x)
-            w = w - _apply(level.left, x[:n_odd]) - _apply(level.right, _padded(x[1:], n_odd))
-            odd = _apply_transpose(level.inverse, w)
-            x = jnp.stack([x, _padded(odd, n_even)], axis=1).reshape(2 * n_even, -1)[: n_odd + n_even]
+            odd = f[..., 1::2]
+            eliminated.append(_product(level.inverse, odd))
+            from_neighbours = _transpose_product(level.left, odd), _transpose_product(level.right, odd)
+            f = _less_neighbours(f[..., 0::2], *from_neighbours)
+        return self.back_substituted(_product(self.last_inverse, f), eliminated)
+
+    def back_substituted(self, x: Float[Array, "b j 1"], eliminated: list[Array]) -> Float[Array, "b j n"]:
+        for level, odd in zip(reversed(self.levels), reversed(eliminated), strict=True):
+            n_odd, n_even = odd.shape[-1], x.shape[-1]
+            after = _padded(x[..., 1:], n_odd)
+            odd = odd - _product(level.left, x[..., :n_odd]) - _product(level.right, after)
+            pairs = jnp.stack([x, _padded(odd, n_even)], axis=-1)
+            x = pairs.reshape(*x.shape[:-1], 2 * n_even)[..., : n_odd + n_even]
         return x
 
 
-def factor(matrix: SymmetricBlockTridiagonal) -> BlockCholesky:
-    """Cholesky factorisation by cyclic reduction, O(n b^3)."""
-    diagonal, lower = matrix.diagonal, matrix.lower
-    levels = []
-    while len(diagonal) > 1:
-        odd = diagonal[1::2]
-        left = lower[0::2][: len(odd)]  # blocks (odd, odd - 1)
-        right = _padded(jnp.swapaxes(lower[1::2], 1, 2), len(odd))  # blocks (odd, odd + 1), none beyond the last
-        level = _factor_level(odd, left, right)
-        levels.append(level)
-        diagonal = _subtract_neighbours(diagonal[0::2], _gram(level.left, level.left), _gram(level.right, level.right))
-        lower = -_gram(level.right, level.left)[: len(diagonal) - 1]
-    return BlockCholesky(tuple(levels), _inverse_cholesky(diagonal))
+def _eliminate(
+    diagonal: Float[Array, "b b n"], lower: Float[Array, "b b n-1"], right_sides: Float[Array, "b j n"]
+) -> tuple[_Elimination, Int[Array, ""], Float[Array, "b j n"]]:
+    """The factorisation of H, how many negative eigenvalues it has, and H^-1 right_sides, in one sweep.
 
-
-def pair_blocks(
-    diagonal: Float[Array, "n b b"], lower: Float[Array, "n-1 b b"], second_lower: Float[Array, "n-2 b b"]
-) -> SymmetricBlockTridiagonal:
-    """A block-pentadiagonal matrix as a block-tridiagonal one of twice the block size.
-
-    `lower[i]` is block (i + 1, i), `second_lower[i]` block (i + 2, i). An odd number of blocks is filled up by the
-    identity.
+    Diagonal and right sides stand side by side in `rows`, so that a level is few and large loops.
     """
-    n, b, _ = diagonal.shape
-    pairs = (n + 1) // 2
-    filled = _padded(diagonal, 2 * pairs)
-    if n % 2:
-        filled = filled.at[-1].set(jnp.eye(b, dtype=diagonal.dtype))
-    first = _padded(lower, 2 * pairs)
-    second = _padded(second_lower, 2 * pairs)
-    inside = first[0::2]
-    diagonal_pairs = _blocks([[filled[0::2], jnp.swapaxes(inside, 1, 2)], [inside, filled[1::2]]])
-    between = [[second[0::2], first[1::2]], [jnp.zeros_like(inside), second[1::2]]]
-    return SymmetricBlockTridiagonal(diagonal_pairs, _blocks(between)[: pairs - 1])
+    b = len(diagonal)
+    rows = jnp.concatenate([diagonal, right_sides], axis=1)
+    levels, eliminated = [], []
+    negative = jnp.zeros((), int)
+    while rows.shape[-1] > 1:
+        odd, even = rows[..., 1::2], rows[..., 0::2]
+        left = lower[..., 0::2][..., : odd.shape[-1]]  # blocks (odd, odd - 1)
+        right = _padded(jnp.swapaxes(lower[..., 1::2], 0, 1), odd.shape[-1])  # (odd, odd + 1), none beyond the last
+        inverse, below = _inverse(odd[:, :b])
+        scaled = _product(inverse, jnp.concatenate([left, right, odd[:, b:]], axis=1))
+        level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b])
+        levels.append(level)
+        eliminated.append(scaled[:, 2 * b :])
+        negative += below
+        from_left = _transpose_product(left, jnp.concatenate([level.left, eliminated[-1]], axis=1))
+        from_right = _transpose_product(right, scaled[:, b:])
+        rows = _less_neighbours(even, from_left, from_right)
+        lower = -_transpose_product(right, level.left)[..., : even.shape[-1] - 1]
+    last_inverse, below = _inverse(rows[:, :b])
+    elimination = _Elimination(tuple(levels), last_inverse)
+    x = elimination.back_substituted(_product(last_inverse, rows[:, b:]), eliminated)
+    return elimination, negative + below, x
 
 
-def _factor_level(odd: Float[Array, "m b b"], left: Float[Array, "m b b"], right: Float[Array, "m b b"]) -> _Level:
-    b = odd.shape[-1]
-    cholesky = jnp.linalg.cholesky(odd, symmetrize_input=False)
-    identity = jnp.broadcast_to(jnp.eye(b, dtype=odd.dtype), odd.shape)
-    sides = jnp.concatenate([identity, left, right], axis=-1)
-    solved = jax.lax.linalg.triangular_solve(cholesky, sides, left_side=True, lower=True)
-    return _Level(solved[..., :b], solved[..., b : 2 * b], solved[..., 2 * b :])
+def _inverse(blocks: Float[Array, "b b m"]) -> tuple[Float[Array, "b b m"], Int[Array, ""]]:
+    """Inverses of symmetric blocks, and how many negative eigenvalues these have together."""
+    if blocks.shape[0] == 1:
+        return 1 / blocks, jnp.sum(blocks < 0)
+    a, b, d = blocks[0, 0], blocks[1, 0], blocks[1, 1]
+    determinant = a * d - b * b
+    off = -b / determinant
+    inverse = jnp.stack([jnp.stack([d / determinant, off]), jnp.stack([off, a / determinant])])
+    return inverse, jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
 
 
-def _inverse_cholesky(block: Float[Array, "1 b b"]) -> Float[Array, "1 b b"]:
-    cholesky = jnp.linalg.cholesky(block, symmetrize_input=False)
-    identity = jnp.broadcast_to(jnp.eye(block.shape[-1], dtype=block.dtype), block.shape)
-    return jax.lax.linalg.triangular_solve(cholesky, identity, left_side=True, lower=True)
+def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:
+    """Inverse of a small symmetric matrix by sweeps, and the number of its negative eigenvalues."""
+    negative = jnp.zeros((), int)
+    for j in range(len(matrix)):
+        pivot, row = matrix[j, j], matrix[j]
+        negative += jnp.where(pivot < 0, 1, 0)
+        swept = matrix - row[:, None] * (row / pivot)[None, :]
+        matrix = swept.at[j, :].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1 / pivot)
+    return -matrix, negative
 
 
-def _subtract_neighbours(even: Array, from_left: Array, from_right: Array) -> Array:
+def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:
+    """A^T x."""
+    return jnp.sum(border * x[:, None], axis=(0, -1))
+
+
+def _product(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
+    return functools.reduce(jnp.add, (a[:, k, None] * b[None, k] for k in range(a.shape[1])))
+
+
+def _transpose_product(a: Float[Array, "k i m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
+    """a^T b block by block."""
+    return functools.reduce(jnp.add, (a[k, :, None] * b[k, None] for k in range(a.shape[0])))
+
+
+def _less_neighbours(even: Array, from_left: Array, from_right: Array) -> Array:
     """The even entries less what the odd one to the right (its left side) and the one to the left contribute."""
-    return even.at[: len(from_left)].add(-from_left).at[1:].add(-from_right[: len(even) - 1])
-
-
-def _gram(a: Float[Array, "m b b"], b: Float[Array, "m b b"]) -> Float[Array, "m b b"]:
-    """a^T b block by block, as a sum of outer products: XLA fuses these, where a batched dot takes twice the time."""
-    return functools.reduce(jnp.add, (a[:, k, :, None] * b[:, k, None, :] for k in range(a.shape[1])))
-
-
-def _apply(a: Float[Array, "m b b"], x: Float[Array, "m b"]) -> Float[Array, "m b"]:
-    return jnp.sum(a * x[:, None, :], axis=2)
-
-
-def _apply_transpose(a: Float[Array, "m b b"], x: Float[Array, "m b"]) -> Float[Array, "m b"]:
-    return jnp.sum(a * x[:, :, None], axis=1)
+    n = even.shape[-1]
+    shifted = jnp.concatenate([jnp.zeros_like(from_right[..., :1]), from_right], axis=-1)
+    return even - _padded(from_left, n) - shifted[..., :n]
 
 
 def _padded(x: Array, length: int) -> Array:
-    missing = length - len(x)
-    return x if missing == 0 else jnp.concatenate([x, jnp.zeros((missing, *x.shape[1:]), x.dtype)])
-
-
-def _blocks(rows: list[list[Float[Array, "m b b"]]]) -> Float[Array, "m 2b 2b"]:
-    return jnp.concatenate([jnp.concatenate(row, axis=2) for row in rows], axis=1)
+    missing = length - x.shape[-1]
+    return x if missing == 0 else jnp.concatenate([x, jnp.zeros((*x.shape[:-1], missing), x.dtype)], axis=-1)

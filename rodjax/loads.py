@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from rodjax.checks import not_negative, vector
+from rodjax.checks import leaf, not_negative, vector
 from rodjax.units import Units
 
 
@@ -16,8 +16,8 @@ class PointForce(eqx.Module):
     force: Float[Array, "3"]
 
     def __init__(self, at: Any, force: Any):
-        self.at = not_negative(at, "at")
-        self.force = vector(force, "force")
+        self.at = leaf(not_negative(at, "at"))
+        self.force = leaf(vector(force, "force"))
 
     def in_units(self, units: Units) -> "PointForce":
         """The same force in the units of the rod: see `rodjax.scene.nondimensional`."""

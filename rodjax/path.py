@@ -1,23 +1,39 @@
 """Quasistatic paths: a sequence of scenes, each solved from the last, in one compiled scan."""
 
+import functools
 from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import instance
+from rodjax.checks import instance, leaf, namespace
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Equilibrium,
+    Found,
+    Solver,
+    SolverState,
     checked_options,
+    equilibrium,
     first_state,
     solve_from,
     warn_if_not_converged,
 )
 from rodjax.guess import Guess
-from rodjax.scene import Scene
-from rodjax.solvers.nonlinear_cg import NonlinearCG
+from rodjax.scene import Scene, between, nondimensional
+from rodjax.status import is_converged
+from rodjax.units import Units
+
+# A step is halved at most so often, to a sixty-fourth of it.
+MAX_SPLITS = 6
+# The last step points on where the scene changes at less than 37 degrees from how it did, and less than twice as far.
+LEAST_ALIGNMENT = 0.8
+MOST_EXTRAPOLATION = 2.0
 
 
 def solve_path(
@@ -25,8 +41,9 @@ def solve_path(
     *,
     segments: int | None = None,
     discretization: Literal["finite_difference"] = "finite_difference",
-    solver: NonlinearCG | None = None,
+    solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
     progress: bool = False,
 ) -> Equilibrium:
     """The equilibria of a sequence of scenes, each solved from the last; turns are carried along.
@@ -36,13 +53,18 @@ def solve_path(
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames may turn by
       less than pi from one to the next.
     - `progress`: show a progress bar.
-    - `segments`, `discretization`, `solver`, `guess`: as for `rodjax.solve`; the guess is for the first scene.
+
+    A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
+    step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
+
+    - `segments`, `discretization`, `solver`, `guess`, `planar`: as for `rodjax.solve`; the guess is for the first
+      scene.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
-    segments, solver = checked_options(segments, discretization, solver, guess)
-    path = _solve_path(stacked, guess, segments, solver, progress)
+    segments, solver = checked_options(stacked, segments, discretization, solver, guess, planar)
+    path = _solve_path(stacked, guess, segments, solver, planar, progress)
     warn_if_not_converged(path)
     return path
 
@@ -65,7 +87,8 @@ def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
                 f"scenes must all have the same supports and the same kinds of loads, "
                 f"got scenes[0] with {_structure(scenes[0])} and scenes[{k}] with {_structure(scene)}"
             )
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    xp = namespace(scenes)
+    return jax.tree.map(lambda *leaves: leaf(xp.stack(leaves)), *scenes)
 
 
 def _structure(scene: Scene) -> str:
@@ -75,27 +98,125 @@ def _structure(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-@eqx.filter_jit
+@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar", "progress"))
 def _solve_path(
-    scenes: Scene, guess: Guess | Equilibrium | None, segments: int, solver: NonlinearCG, progress: bool
+    scenes: Scene, guess: Guess | Equilibrium | None, segments: int, solver: Solver, planar: bool, progress: bool
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
 
+    first = jax.tree.map(lambda leaf: leaf[0], scenes)
+    state, twist = first_state(first, guess, segments)
+
     def step(carry, numbered):
-        state, twist, bar = carry
+        last, before, bar = carry
         number, scene = numbered
-        equilibrium = solve_from(scene, state, twist, solver)
+        found, units, substeps = _step(last, before, scene, solver, planar, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        return (equilibrium.state, equilibrium.total_twist, bar), equilibrium
+        reached = _Station(scene, SolverState(found.polyline, found.point.end_force, units), found.point.total_twist)
+        return (reached, last, bar), (found, units, substeps)
 
-    state, twist = first_state(jax.tree.map(lambda leaf: leaf[0], scenes), guess, segments)
     bar = None if meter is None else meter.init()
-    (_, _, bar), path = jax.lax.scan(step, (state, twist, bar), (jnp.arange(count), scenes))
+    start = _Station(first, state, twist)
+    (_, _, bar), (found, units, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return path
+    return jax.vmap(equilibrium)(scenes, found, units, substeps)
+
+
+class _Station(eqx.Module):
+    """A scene on the path and the state found for it."""
+
+    scene: Scene
+    state: SolverState
+    total_twist: Float[Array, ""]
+
+
+class _Progress(eqx.Module):
+    """How far a step has come: what is reached, where the next solve begins, and what the last one found."""
+
+    reached: SolverState
+    begin: SolverState
+    total_twist: Float[Array, ""]
+    fraction: Float[Array, ""]
+    share: Float[Array, ""]
+    is_last_try: Bool[Array, ""]
+    solves: Int[Array, ""]
+    found: Found
+    units: Units
+    is_finished: Bool[Array, ""]
+
+
+def _step(
+    last: _Station, before: _Station, scene: Scene, solver: Solver, planar: bool, *, may_split: Bool[Array, ""]
+) -> tuple[Found, Units, Int[Array, ""]]:
+    """The equilibrium of a scene from the last one, at once or by way of scenes between the two; solves it took."""
+
+    def attempt(progress: _Progress) -> _Progress:
+        target = jnp.minimum(progress.fraction + progress.share, 1.0)
+        here = jax.lax.cond(target < 1.0, lambda: between(last.scene, scene, target), lambda: scene)
+        found, units = solve_from(here, progress.begin, progress.total_twist, solver, planar)
+        converged = is_converged(found.status)
+        state = SolverState(found.polyline, found.point.end_force, units)
+        reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), state, progress.reached)
+        is_smallest = progress.share <= 0.5**MAX_SPLITS
+        return _Progress(
+            reached=reached,
+            begin=reached,
+            total_twist=jnp.where(converged, found.point.total_twist, progress.total_twist),
+            fraction=jnp.where(converged, target, progress.fraction),
+            share=jnp.where(converged, 2 * progress.share, jnp.where(is_smallest, 1.0, progress.share / 2)),
+            is_last_try=~converged & is_smallest,
+            solves=progress.solves + 1,
+            found=eqx.tree_at(
+                lambda found: (found.iterations, found.evaluations),
+                found,
+                (progress.found.iterations + found.iterations, progress.found.evaluations + found.evaluations),
+            ),
+            units=units,
+            is_finished=(target >= 1.0) & (converged | progress.is_last_try | ~may_split),
+        )
+
+    zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
+    n = len(last.state.polyline.edges)
+    nowhere = MixedPoint(jnp.zeros((3, n), zero.dtype), jnp.zeros(3, zero.dtype), zero)
+    progress = _Progress(
+        reached=last.state,
+        begin=_predicted(last, before, scene),
+        total_twist=last.total_twist,
+        fraction=zero,
+        share=jnp.ones_like(zero),
+        is_last_try=no,
+        solves=count,
+        found=Found(last.state.polyline, nowhere, zero, count, count, count, no),
+        units=last.state.units,
+        is_finished=no,
+    )
+    progress = jax.lax.while_loop(lambda progress: ~progress.is_finished, attempt, progress)
+    return progress.found, progress.units, progress.solves
+
+
+def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
+    """Where the last two equilibria point, as far as the scenes go on in the direction in which they went."""
+    flat = [ravel_pytree(nondimensional(scene)[0])[0] for scene in (before.scene, last.scene, scene)]
+    previous, change = flat[1] - flat[0], flat[2] - flat[1]
+    sizes = jnp.sqrt(jnp.sum(previous**2)), jnp.sqrt(jnp.sum(change**2))
+    is_aligned = jnp.sum(previous * change) > LEAST_ALIGNMENT * sizes[0] * sizes[1]
+    ratio = sizes[1] / jnp.where(is_aligned, sizes[0], 1.0)
+    goes_on = is_aligned & (ratio < MOST_EXTRAPOLATION)
+    ratio = jnp.where(goes_on, ratio, 0.0)
+
+    state, edges = last.state, last.state.polyline.edges
+    lengths = jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
+    older = before.state.polyline.edges
+    tangents = edges / lengths
+    tangents += ratio * (tangents - older / jnp.sqrt(jnp.sum(older**2, axis=1, keepdims=True)))
+    edges = tangents * (lengths / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True)))
+    nodes = state.polyline.nodes[:1] + jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+    force = before.state.end_force * (before.state.units.force / state.units.force)
+    predicted = SolverState(Polyline(nodes, edges), state.end_force + ratio * (state.end_force - force), state.units)
+    return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), predicted, state)
 
 
 def _progress_meter():

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.checks import not_negative, number_array, positive
+from rodjax.checks import Numbers, leaf, not_negative, number_array, positive
 from rodjax.units import Units
 
 
@@ -34,12 +34,12 @@ class Rod(eqx.Module):
     radius: Float[Array, ""] | None
 
     def __init__(self, length: Any, EI: Any, GJ: Any, EA: Any, mass_per_length: Any = 0.0, radius: Any = None):
-        self.length = positive(length, "length")
-        self.EI = positive(EI, "EI")
-        self.GJ = positive(GJ, "GJ")
-        self.EA = positive(EA, "EA")
-        self.mass_per_length = not_negative(mass_per_length, "mass_per_length")
-        self.radius = None if radius is None else positive(radius, "radius")
+        self.length = leaf(positive(length, "length"))
+        self.EI = leaf(positive(EI, "EI"))
+        self.GJ = leaf(positive(GJ, "GJ"))
+        self.EA = leaf(positive(EA, "EA"))
+        self.mass_per_length = leaf(not_negative(mass_per_length, "mass_per_length"))
+        self.radius = None if radius is None else leaf(positive(radius, "radius"))
 
     def in_units(self, units: Units) -> "Rod":
         """The same rod with L = 1, EI = 1 and mass per length 1: see `rodjax.scene.nondimensional`."""
@@ -82,8 +82,8 @@ class Rod(eqx.Module):
 
 def _round_section(
     length: Any,
-    outer: Float[Array, ""],
-    inner: Float[Array, ""],
+    outer: Float[Numbers, ""],
+    inner: Float[Numbers, ""],
     youngs_modulus: Any,
     shear_modulus: Any,
     poisson_ratio: Any,
@@ -104,7 +104,7 @@ def _round_section(
     )
 
 
-def _shear_modulus(E: Float[Array, ""], shear_modulus: Any, poisson_ratio: Any) -> Float[Array, ""]:
+def _shear_modulus(E: Float[Numbers, ""], shear_modulus: Any, poisson_ratio: Any) -> Float[Numbers, ""]:
     if (shear_modulus is None) == (poisson_ratio is None):
         raise ValueError(
             f"exactly one of shear_modulus and poisson_ratio must be given, got {shear_modulus!r} and {poisson_ratio!r}"

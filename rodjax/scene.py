@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, is_known, number_array, vector
+from rodjax.checks import instance, is_known, leaf, number_array, vector
 from rodjax.loads import PointForce
 from rodjax.rod import Rod
-from rodjax.supports import Clamp, Free, Held, Pin, Support
+from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
 
 # Ends further apart than this many rod lengths are taken for a mistake: no cable is stretched by half of its length.
@@ -59,44 +61,68 @@ class Scene(eqx.Module):
         self.rod = rod
         self.start = start
         self.end = end
-        self.gravity = None if gravity is None else vector(gravity, "gravity")
+        self.gravity = None if gravity is None else leaf(vector(gravity, "gravity"))
         self.point_forces = tuple(point_forces)
-        self.turns = None if turns is None else number_array(turns, "turns")
-        self._check_supports()
-        self._check_numbers()
+        self.turns = None if turns is None else leaf(number_array(turns, "turns"))
+        _check_supports(self)
+        _check_numbers(self)
 
-    def _check_supports(self) -> None:
-        pair = f"{type(self.start).__name__} at the start and {type(self.end).__name__} at the end"
-        ends = (self.start, self.end)
-        if not any(isinstance(end, Held) for end in ends):
-            raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
-        for end, other in (ends, ends[::-1]):
-            if not isinstance(end, Free):
-                continue
-            loaded = self.gravity is not None or self.point_forces or end.force is not None
-            if isinstance(other, Pin) and not loaded:
-                raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
-            if end.moment is not None and not isinstance(other, Clamp):
-                raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
-        if self.turns is not None and not (isinstance(self.start, Clamp) and isinstance(self.end, Clamp)):
-            raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
 
-    def _check_numbers(self) -> None:
-        if not is_known(self):
-            return
-        if self.turns is not None and float(self.turns) != np.round(float(self.turns)):
-            raise ValueError(f"turns must be a whole number, got {float(self.turns):g}")
-        length = float(self.rod.length)
-        for k, force in enumerate(self.point_forces):
-            if float(force.at) > length:
-                raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
-        if isinstance(self.start, Held) and isinstance(self.end, Held):
-            span = float(np.linalg.norm(np.subtract(self.end.position, self.start.position)))
-            if span > MAX_SPAN * length:
-                raise ValueError(
-                    f"the ends are {span:g} m apart, but a rod of length {length:g} m "
-                    f"reaches at most {MAX_SPAN * length:g} m"
-                )
+def _check_supports(scene: Scene) -> None:
+    ends = (scene.start, scene.end)
+    pair = f"{type(scene.start).__name__} at the start and {type(scene.end).__name__} at the end"
+    if not any(isinstance(end, Held) for end in ends):
+        raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
+    for end, other in (ends, ends[::-1]):
+        if not isinstance(end, Free):
+            continue
+        loaded = scene.gravity is not None or scene.point_forces or end.force is not None
+        if isinstance(other, Pin) and not loaded:
+            raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
+        if end.moment is not None and not isinstance(other, Clamp):
+            raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
+    if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
+        raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
+
+
+def _check_numbers(scene: Scene) -> None:
+    if not is_known(scene):
+        return
+    if scene.turns is not None and float(scene.turns) != np.round(float(scene.turns)):
+        raise ValueError(f"turns must be a whole number, got {float(scene.turns):g}")
+    length = float(scene.rod.length)
+    for k, force in enumerate(scene.point_forces):
+        if float(force.at) > length:
+            raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
+    start, end = scene.start, scene.end
+    if isinstance(start, Held) and isinstance(end, Held):
+        span = float(np.linalg.norm(np.subtract(end.position, start.position)))
+        if span > MAX_SPAN * length:
+            raise ValueError(
+                f"the ends are {span:g} m apart, but a rod of length {length:g} m "
+                f"reaches at most {MAX_SPAN * length:g} m"
+            )
+
+
+def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
+    """A scene on the way from one to another: numbers linear, frames by the smallest rotation, as `fraction` of it."""
+
+    def support(end: Support, other: Support) -> Support:
+        mixed = jax.tree.map(number, end, other)
+        if isinstance(end, Clamp) and isinstance(other, Clamp):
+            turn = Rotation.from_matrix(end.frame.T @ other.frame).as_rotvec()
+            frame = end.frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
+            return eqx.tree_at(lambda mixed: mixed.frame, mixed, frame)
+        if isinstance(end, Swivel):
+            return Swivel(mixed.position, mixed.tangent)
+        return mixed
+
+    def number(a, b):
+        return a + fraction * (b - a)
+
+    ends = support(scene.start, other.start), support(scene.end, other.end)
+    mixed = jax.tree.map(number, scene, other)
+    return eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
 
 
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:

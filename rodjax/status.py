@@ -14,6 +14,7 @@ class Status(enum.IntEnum):
     LINE_SEARCH_FAILED = 3
     NOT_FINITE = 4
     RUNNING = 5
+    SADDLE = 6
 
     @property
     def message(self) -> str:
@@ -24,6 +25,7 @@ class Status(enum.IntEnum):
             Status.LINE_SEARCH_FAILED: "not converged: the line search found no better point",
             Status.NOT_FINITE: "not converged: the energy or its gradient is not a finite number",
             Status.RUNNING: "not finished",
+            Status.SADDLE: "not converged: an equilibrium was found that is not a minimum, and no way down from it",
         }[self]
 
 

@@ -4,10 +4,9 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.checks import direction, is_known, rotation, vector
+from rodjax.checks import direction, is_known, leaf, namespace, rotation, vector
 from rodjax.units import Units
 
 
@@ -29,8 +28,8 @@ class Clamp(Support):
     frame: Float[Array, "3 3"]
 
     def __init__(self, position: Any, frame: Any):
-        self.position = vector(position, "position")
-        self.frame = rotation(frame, "frame")
+        self.position = leaf(vector(position, "position"))
+        self.frame = leaf(rotation(frame, "frame"))
 
     def in_units(self, units: Units) -> "Clamp":
         return Clamp((self.position - units.origin) / units.length, self.frame)
@@ -50,8 +49,8 @@ class Swivel(Support):
     tangent: Float[Array, "3"]
 
     def __init__(self, position: Any, tangent: Any):
-        self.position = vector(position, "position")
-        self.tangent = direction(tangent, "tangent")
+        self.position = leaf(vector(position, "position"))
+        self.tangent = leaf(direction(tangent, "tangent"))
 
     def in_units(self, units: Units) -> "Swivel":
         return Swivel((self.position - units.origin) / units.length, self.tangent)
@@ -63,7 +62,7 @@ class Pin(Support):
     position: Float[Array, "3"]
 
     def __init__(self, position: Any):
-        self.position = vector(position, "position")
+        self.position = leaf(vector(position, "position"))
 
     def in_units(self, units: Units) -> "Pin":
         return Pin((self.position - units.origin) / units.length)
@@ -80,8 +79,8 @@ class Free(Support):
     moment: Float[Array, "3"] | None
 
     def __init__(self, force: Any = None, moment: Any = None):
-        self.force = None if force is None else vector(force, "force")
-        self.moment = None if moment is None else vector(moment, "moment")
+        self.force = None if force is None else leaf(vector(force, "force"))
+        self.moment = None if moment is None else leaf(vector(moment, "moment"))
 
     def in_units(self, units: Units) -> "Free":
         return Free(
@@ -102,10 +101,11 @@ def frame(tangent: Any, d2: Any = (0.0, 1.0, 0.0)) -> Float[Array, "3 3"]:
     """
     t = direction(tangent, "tangent")
     d2 = direction(d2, "d2")
-    across = d2 - jnp.dot(d2, t) * t
-    length = jnp.linalg.norm(across)
+    xp = namespace(t, d2)
+    across = d2 - xp.dot(d2, t) * t
+    length = xp.linalg.norm(across)
     # Below this the direction of d2 is mostly rounding of the input.
     if is_known(length) and not length > 1e-6:
         raise ValueError(f"d2 must not be parallel to the tangent, got d2 = {d2} and tangent = {t}")
     d2 = across / length
-    return jnp.stack([jnp.cross(d2, t), d2, t], axis=-1)
+    return leaf(xp.stack([xp.cross(d2, t), d2, t], axis=-1))

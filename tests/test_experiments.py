@@ -2,11 +2,16 @@
 
 import csv
 import importlib.util
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rodjax import problems
+
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+sys.path.insert(0, str(EXPERIMENTS))  # as for a script that is run, so that it finds `measuring`
 
 
 def script(name: str):
@@ -35,11 +40,45 @@ def test_mass_spring(tmp_path, capsys):
     assert (tmp_path / "mass_spring.png").stat().st_size > 10_000
 
 
-def test_kernels(tmp_path):
-    rows = script("kernels").main(["--segments", "4", "--repeats", "1", "--out", str(tmp_path)])
-    assert len(rows) == 6 + 7
-    assert all(row["us"] > 0 for row in rows)
+@pytest.mark.slow
+def test_kernels(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
+    kernels = script("kernels")
+    monkeypatch.setattr(kernels, "LOOPS", 2)
+    limit = tmp_path / "rod"
+    limit.write_text(
+        "#!/bin/sh\necho 'eval N=   4  E+grad: 20.0 ns/segment min, 21.5 median (0.2 us/eval) ; "
+        "E+grad+Hessian+LDL: 200.0 ns/segment min 236.1 median'\n"
+    )
+    limit.chmod(0o755)
+    options = ["--segments", "4", "--steps-at", "4", "--limit", str(limit), "--repeats", "1", "--out", str(tmp_path)]
+    rows, (step,) = kernels.main(options)
+    assert len({row.what for row in rows}) == len(rows) == 20
+    assert all(row.us > 0 for row in rows)
+    assert step.evaluations >= step.iterations + 1
+    # Parts and rest make up the whole, by the definition of the rest.
+    assert step.linearized + step.factored + step.moved + step.rest == pytest.approx(1.0)
+    assert "ns per segment" in capsys.readouterr().out
     assert (tmp_path / "kernels.csv").read_text().count("\n") == len(rows) + 1
+    assert (tmp_path / "kernels_step.csv").read_text().count("\n") == 2
+
+    # What is compared is the same: derivatives written out and by JAX, block and dense solve.
+    by_name = {kernel.what: kernel for kernel in kernels.kernels(6)}
+
+    def of(what):
+        _, function, *arguments = by_name[what]
+        return kernels.compiled(function, *arguments)[0](*arguments)
+
+    ours = of("derivatives of all joints, written out")
+    for what in ("derivatives of all joints, by JAX", "derivatives of each joint, jax.hessian"):
+        gradient, hessian = of(what)
+        # A few roundings of numbers of order 100.
+        np.testing.assert_allclose(gradient, np.concatenate([ours.before, ours.after]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(hessian[2:, :2], ours.after_before, rtol=0, atol=1e-12)
+    _, rotation, multipliers = of(kernels.FACTORED)
+    solution = np.concatenate([np.asarray(rotation).T.ravel(), multipliers])
+    # Rounding times a condition number of 1e4, and as much again to spare.
+    np.testing.assert_allclose(of("jnp.linalg.solve, dense"), solution, rtol=0, atol=1e-8 * np.max(np.abs(solution)))
 
 
 def test_rounding_floor():
@@ -71,3 +110,83 @@ def test_cold_start():
     shares = script("cold_start").main(["--count", "5", "--moments", "1", "--segments", "10"])
     assert len(shares) == 3 + 2 * 4
     assert all(share == 1.0 for name, share in shares.items() if name.startswith("clamps"))
+
+
+@pytest.mark.slow
+def test_work_precision(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    meshes = ["--segments", "6", "12", "--truth", "60", "--others-up-to", "6", "6", "6"]
+    timing = ["--problems", "P1", "P2", "--rounds", "1", "--repeats", "1"]
+    rows = script("work_precision").main([*meshes, *timing, "--out", str(tmp_path)])
+    assert all(row.converged for row in rows if row.method.startswith("finite differences"))
+    # Whatever minimises it, the energy has one minimum and the mesh one error; scipy and optimistix at N = 6 alone.
+    same = [row for row in rows if row.method.startswith(("finite differences", "scipy", "optimistix"))]
+    for problem, coarse, fine in (("P1", 3.91e-3, 1.09e-3), ("P2", 2.14e-2, 6.12e-3)):
+        errors = [[row.error for row in same if (row.problem, row.segments) == (problem, n)] for n in (6, 12)]
+        assert len(errors[0]) == len(errors[1]) + 5
+        np.testing.assert_allclose(errors[0], coarse, rtol=0.01)
+        np.testing.assert_allclose(errors[1], fine, rtol=0.01)
+    assert "least ms (N) with an error below" in capsys.readouterr().out
+    with open(tmp_path / "work_precision.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(rows)
+    assert (tmp_path / "work_precision.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_scaling(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = ["--segments", "6", "200", "--slenderness", "20", "--repeats", "1", "--out", str(tmp_path)]
+    over_mesh, over_slenderness, radians = script("scaling").main(options)
+    assert [row.segments for row in over_mesh] == [6, 200]
+    assert all(row.converged == 25 and row.iterations_max <= 40 for row in over_mesh + over_slenderness)
+    assert over_mesh[0].per_segment > over_mesh[1].per_segment == 1.0
+    assert over_mesh[0].program_mib < over_mesh[1].program_mib < 10
+    (radian,) = radians
+    assert radian.converged
+    assert radian.small_converged
+    assert radian.distance < 1e-8
+    assert "1 rad in one step" in capsys.readouterr().out
+    assert (tmp_path / "scaling.csv").read_text().count("\n") == 4
+    assert (tmp_path / "scaling_radian.csv").read_text().count("\n") == 2
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_interactive(tmp_path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = ["--segments", "6", "--scene", "hanging", "--moves", "40", "--out", str(tmp_path)]
+    rows = script("interactive").main(options)
+    assert all(row.moves == 40 and row.not_converged == 0 for row in rows)
+    *moving, resting = rows
+    assert resting.iterations_max == 0
+    assert all(0 < row.iterations_median <= row.iterations_max < 100 for row in moving)
+    assert all(0 < row.median <= row.percent_99 <= row.percent_99_9 <= row.worst for row in rows)
+    assert (tmp_path / "interactive.csv").read_text().count("\n") == len(rows) + 1
+    assert (tmp_path / "interactive.png").stat().st_size > 10_000
+
+
+def test_a_hand_moves_by_millimetres_and_degrees_within_reach():
+    interactive = script("interactive")
+    clamp = problems.hanging_cable(span=problems.SPAN).end
+    positions, frames = interactive.hand(clamp, np.zeros(3), 2000, 0)
+    moves = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    cosines = (np.einsum("kij,kij->k", frames[:-1], frames[1:]) - 1) / 2
+    assert np.max(moves) < 6e-3
+    assert 1e-3 < np.median(moves) < 4e-3
+    assert np.degrees(np.arccos(np.min(cosines))) < 5
+    reach = np.linalg.norm(positions, axis=1)
+    assert 0.3 <= np.min(reach) < 0.5
+    assert 0.7 < np.max(reach) <= 0.9
+
+
+@pytest.mark.slow
+def test_peers(tmp_path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
+    peers = script("peers")
+    monkeypatch.setattr(peers, "FINE", (40, 80))  # compiles quicker, and is good for three digits
+    options = ["--problems", "P3", "--segments", "10", "--elements", "10", "--rounds", "1", "--repeats", "1"]
+    rows = peers.main([*options, "--out", str(tmp_path)])
+    assert rows[0].error == pytest.approx(8.84e-3, rel=0.01)
+    with open(tmp_path / "peers.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(rows)
+    assert (tmp_path / "peers.png").stat().st_size > 10_000

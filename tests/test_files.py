@@ -294,10 +294,14 @@ def test_what_a_file_lacks_is_named(missing, message, saved):
         load(saved)
 
 
-def test_newer_and_absent_formats_are_refused(saved):
+def test_other_and_absent_formats_are_refused(saved):
     with h5py.File(saved, "r+") as file:
         file["rodjax"].attrs.update({"format": FORMAT + 1, "version": "9.0"})
     with pytest.raises(ValueError, match=rf"format {FORMAT + 1}, written by rodjax 9\.0; .* up to {FORMAT}: update it"):
+        load(saved)
+    with h5py.File(saved, "r+") as file:
+        file["rodjax"].attrs.update({"format": 1, "version": "0.0"})
+    with pytest.raises(ValueError, match=r"format 1, written by rodjax 0\.0, .* solve its scene again"):
         load(saved)
     with h5py.File(saved, "r+") as file:
         del file["rodjax"].attrs["format"]

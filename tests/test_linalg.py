@@ -1,4 +1,4 @@
-"""Block cyclic reduction against dense solves."""
+"""Saddle-point systems by block cyclic reduction, against dense solves and eigenvalues."""
 
 import jax
 import jax.numpy as jnp
@@ -6,110 +6,155 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from rodjax.linalg import SymmetricBlockTridiagonal, factor, pair_blocks
+from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
 
 
-def random_matrix(n: int, b: int, seed: int = 0) -> SymmetricBlockTridiagonal:
-    """Positive definite by diagonal dominance."""
+def random_system(n: int, b: int, k: int, *, dominance: float = 8.0, seed: int = 0) -> SaddlePointSystem:
+    """Positive definite by diagonal dominance; indefinite, mostly, without."""
     rng = np.random.default_rng(seed)
-    diagonal = rng.normal(size=(n, b, b))
-    diagonal = diagonal + diagonal.transpose(0, 2, 1) + 8 * b * np.eye(b)
-    return SymmetricBlockTridiagonal(jnp.asarray(diagonal), jnp.asarray(rng.normal(size=(n - 1, b, b))))
-
-
-def dense(matrix: SymmetricBlockTridiagonal) -> np.ndarray:
-    n, b, _ = matrix.diagonal.shape
-    full = np.zeros((n * b, n * b))
-    for i in range(n):
-        full[i * b : (i + 1) * b, i * b : (i + 1) * b] = matrix.diagonal[i]
-        if i + 1 < n:
-            full[(i + 1) * b : (i + 2) * b, i * b : (i + 1) * b] = matrix.lower[i]
-            full[i * b : (i + 1) * b, (i + 1) * b : (i + 2) * b] = np.asarray(matrix.lower[i]).T
-    return full
-
-
-def check_solve(n: int, b: int) -> None:
-    matrix = random_matrix(n, b)
-    right_side = np.random.default_rng(1).normal(size=(n, b))
-    factors = jax.jit(factor)(matrix)
-    assert factors.is_positive_definite
-    expected = np.linalg.solve(dense(matrix), right_side.ravel()).reshape(n, b)
-    # The condition number is below 10, so that only a few roundings add up.
-    np.testing.assert_allclose(factors.solve(jnp.asarray(right_side)), expected, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(matrix @ expected, right_side, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(("n", "b"), [(1, 1), (2, 3), (3, 8), (5, 2), (6, 6), (7, 5), (16, 4), (33, 7)])
-def test_solve_agrees_with_a_dense_solve(n, b):
-    check_solve(n, b)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("b", range(1, 9))
-def test_solve_agrees_with_a_dense_solve_for_every_size(b):
-    for n in (4, 9, 12, 31, 32, 65, 127, 300):
-        check_solve(n, b)
-
-
-def test_badly_scaled_blocks_keep_a_small_residual():
-    matrix = random_matrix(20, 6)
-    scale = jnp.asarray(10.0 ** np.random.default_rng(2).uniform(-4, 4, size=(20, 6)))
-    matrix = SymmetricBlockTridiagonal(
-        matrix.diagonal * scale[:, :, None] * scale[:, None, :],
-        matrix.lower * scale[1:, :, None] * scale[:-1, None, :],
+    diagonal, compliance = rng.normal(size=(b, b, n)), rng.normal(size=(k, k))
+    return SaddlePointSystem(
+        jnp.asarray(diagonal + diagonal.swapaxes(0, 1) + dominance * np.eye(b)[..., None]),
+        jnp.asarray(rng.normal(size=(b, b, n - 1))),
+        jnp.asarray(rng.normal(size=(b, k, n))),
+        jnp.asarray(compliance @ compliance.T),
     )
-    x = np.random.default_rng(3).normal(size=(20, 6)) / scale
-    solved = factor(matrix).solve(matrix @ x)
-    # Cholesky does not suffer from scaling by a diagonal: condition 1e16, error that of the unscaled matrix.
-    np.testing.assert_allclose(solved * scale, x * scale, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("where", [0, 3, 6])
-def test_an_indefinite_matrix_is_recognised(where):
-    matrix = random_matrix(7, 3)
-    matrix = SymmetricBlockTridiagonal(matrix.diagonal.at[where, 1, 1].add(-200.0), matrix.lower)
-    assert not factor(matrix).is_positive_definite
+def right_side(n: int, b: int, k: int, seed: int = 1) -> tuple[jax.Array, jax.Array]:
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(rng.normal(size=(b, n))), jnp.asarray(rng.normal(size=k))
 
 
-def test_gradient_through_a_solve():
-    matrix, right_side = random_matrix(6, 3), jnp.ones((6, 3))
+def dense(system: SaddlePointSystem) -> np.ndarray:
+    """The whole matrix, unknowns in the order x[:, 0], x[:, 1], ..., y."""
+    b, k, n = system.border.shape
+    matrix = np.zeros((n, b, n, b))
+    for i in range(n):
+        matrix[i, :, i] = system.diagonal[..., i]
+    for i in range(n - 1):
+        matrix[i + 1, :, i] = system.lower[..., i]
+        matrix[i, :, i + 1] = np.asarray(system.lower[..., i]).T
+    border = np.asarray(system.border).transpose(2, 0, 1).reshape(n * b, k)
+    return np.block([[matrix.reshape(n * b, n * b), border], [border.T, -np.asarray(system.compliance)]])
 
-    def total(diagonal, lower, right_side):
-        diagonal = jnp.asarray(diagonal)
-        symmetric = (diagonal + jnp.swapaxes(diagonal, 1, 2)) / 2
-        matrix = SymmetricBlockTridiagonal(symmetric, jnp.asarray(lower))
-        return jnp.sum(factor(matrix).solve(jnp.asarray(right_side)) ** 2)
 
-    # Against finite differences of step 1e-5 or so: 1e-5 relative is what these give.
-    check_grads(jax.jit(total), (matrix.diagonal, matrix.lower, right_side), order=2, rtol=1e-5)
+factored = jax.jit(factor)
+at_once = jax.jit(factor_and_solve)
+afterwards = jax.jit(lambda system, f, c: factor(system).solve(f, c))
+
+
+# All depths of the elimination up to five, odd and even; more columns than unknowns.
+SIZES = [(1, 1, 0), (1, 2, 4), (2, 1, 2), (2, 2, 1), (3, 2, 4), (4, 2, 0), (5, 1, 3), (16, 2, 4), (33, 2, 3)]
+
+
+@pytest.mark.parametrize(("n", "b", "k"), SIZES)
+def test_solutions_and_signs_agree_with_dense_matrices(n, b, k):
+    """Definite, and three indefinite systems."""
+    f, c = right_side(n, b, k)
+    for seed, dominance in enumerate([8.0, 0.0, 0.0, 0.0]):
+        system = random_system(n, b, k, dominance=dominance, seed=seed)
+        matrix = dense(system)
+        expected = np.linalg.solve(matrix, np.concatenate([f.T.ravel(), c]))
+        factors, *solution = at_once(system, f, c)
+        # Definite: solutions of order 1, condition numbers below 1e3. Otherwise a small block, as blocks are not
+        # exchanged for larger ones, costs some digits.
+        atol = 1e-12 if dominance else 1e-10
+        for x, y in (solution, afterwards(system, f, c)):
+            np.testing.assert_allclose(x, expected[: b * n].reshape(n, b).T, rtol=0, atol=atol)
+            np.testing.assert_allclose(y, expected[b * n :], rtol=0, atol=atol)
+        negative = np.sum(np.linalg.eigvalsh(matrix) < 0) - k
+        assert factors.negative == negative
+        assert factors.is_minimum == (negative == 0)
+
+
+def test_a_minimum_under_the_constraints_may_be_indefinite_without_them():
+    system = random_system(7, 2, 1)
+    dipped = SaddlePointSystem(
+        diagonal=system.diagonal.at[0, 0, 3].add(-40.0),
+        lower=system.lower,
+        border=jnp.zeros((2, 1, 7)).at[0, 0, 3].set(1.0),  # holds the one unknown with negative curvature
+        compliance=jnp.zeros((1, 1)),
+    )
+    assert np.linalg.eigvalsh(dense(dipped)[:14, :14])[0] < 0
+    assert factored(dipped).is_minimum
+    alone = SaddlePointSystem(dipped.diagonal, dipped.lower, jnp.zeros((2, 0, 7)), jnp.zeros((0, 0)))
+    assert factored(alone).negative == 1
+
+
+@pytest.mark.parametrize("block", [[[0.0, 0.0], [0.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 0.0]]])
+def test_a_singular_block_is_no_minimum(block):
+    system = random_system(7, 2, 1)
+    for where in range(7):
+        diagonal = system.diagonal.at[..., where].set(jnp.array(block))
+        decoupled = SaddlePointSystem(diagonal, jnp.zeros_like(system.lower), system.border, system.compliance)
+        assert not factored(decoupled).is_minimum
+        coupled = SaddlePointSystem(diagonal, system.lower, system.border, system.compliance)
+        if where % 2:  # eliminated first, so that nothing has changed it yet
+            assert not factored(coupled).is_minimum
+
+
+def test_a_shift_is_added_to_the_diagonal_only():
+    system = random_system(5, 2, 2)
+    shift = np.diag([0.7] * 10 + [0.0] * 2)
+    np.testing.assert_array_equal(dense(system.shifted(jnp.array(0.7))), dense(system) + shift)
+
+
+@jax.jit
+def solution(system: SaddlePointSystem, f: jax.Array, c: jax.Array) -> jax.Array:
+    x, y = factor(system).solve(f, c)
+    return jnp.concatenate([x.T.ravel(), y])
+
+
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (6, 3)])
+def test_other_rows_than_columns_give_the_solution_of_the_unsymmetric_matrix(n, k):
+    system = random_system(n, 2, k)
+    rows = random_system(n, 2, k, seed=5).border
+    matrix = dense(system)
+    matrix[2 * n :, : 2 * n] = np.asarray(rows).transpose(1, 2, 0).reshape(k, 2 * n)
+    f, c = right_side(n, 2, k)
+    expected = np.linalg.solve(matrix, np.concatenate([f.T.ravel(), c]))
+    system = SaddlePointSystem(system.diagonal, system.lower, system.border, system.compliance, rows)
+    # Solutions of order 1, condition numbers below 1e3.
+    np.testing.assert_allclose(solution(system, f, c), expected, rtol=0, atol=1e-12)
+    factors, x, y = at_once(system, f, c)
+    np.testing.assert_allclose(jnp.concatenate([x.T.ravel(), y]), expected, rtol=0, atol=1e-12)
+    assert factors.negative == 0  # the sign of a curvature has no meaning without symmetry
 
 
 def test_vmap_agrees_with_one_after_another():
-    matrices = [random_matrix(9, 4, seed) for seed in range(3)]
-    right_sides = jnp.asarray(np.random.default_rng(4).normal(size=(3, 9, 4)))
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *matrices)
-    batched = jax.vmap(lambda matrix, f: factor(matrix).solve(f))(stacked, right_sides)
-    for k, matrix in enumerate(matrices):
-        np.testing.assert_allclose(batched[k], factor(matrix).solve(right_sides[k]), rtol=0, atol=1e-15)
+    systems = [random_system(6, 2, 4, seed=seed) for seed in range(3)]
+    sides = [right_side(6, 2, 4, seed=seed) for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *systems)
+    f, c = (jnp.stack(side) for side in zip(*sides, strict=True))
+    batched = jax.vmap(solution)(stacked, f, c)
+    for k in range(3):
+        # Other loops, so other roundings; solutions of order 1.
+        np.testing.assert_allclose(batched[k], solution(systems[k], *sides[k]), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 8])
-def test_pairing_a_pentadiagonal_matrix_keeps_its_entries(n):
-    rng = np.random.default_rng(5)
-    diagonal = rng.normal(size=(n, 3, 3))
-    diagonal += diagonal.transpose(0, 2, 1)
-    lower, second = rng.normal(size=(max(n - 1, 0), 3, 3)), rng.normal(size=(max(n - 2, 0), 3, 3))
-    full = np.zeros((n + n % 2, 3, n + n % 2, 3))
-    for blocks, offset in ((diagonal, 0), (lower, 1), (second, 2)):
-        for i, block in enumerate(blocks):
-            full[i + offset, :, i, :] = block
-            full[i, :, i + offset, :] = block.T
-    if n % 2:
-        full[n, :, n, :] = np.eye(3)
-    paired = pair_blocks(jnp.asarray(diagonal), jnp.asarray(lower), jnp.asarray(second))
-    np.testing.assert_array_equal(dense(paired), full.reshape(3 * (n + n % 2), -1))
+def test_derivatives_of_a_solution():
+    system = random_system(5, 2, 2)
+
+    def of_symmetric(diagonal, lower, border, compliance, f, c):
+        diagonal, compliance = ((x + jnp.swapaxes(x, 0, 1)) / 2 for x in (diagonal, compliance))
+        return solution(SaddlePointSystem(diagonal, lower, border, compliance), f, c)
+
+    arguments = (system.diagonal, system.lower, system.border, system.compliance, *right_side(5, 2, 2))
+    # Against central differences, which give about 1e-5 relative.
+    check_grads(jax.jit(lambda *given: of_symmetric(*map(jnp.asarray, given))), arguments, order=1, rtol=1e-5)
 
 
-def test_wrong_shapes_are_named():
-    with pytest.raises(ValueError, match=r"\(n, b, b\) and \(n - 1, b, b\)"):
-        SymmetricBlockTridiagonal(jnp.zeros((3, 2, 2)), jnp.zeros((3, 2, 2)))
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        [(2, 2, 3), (2, 2, 3), (2, 1, 3), (1, 1)],
+        [(2, 2, 4), (2, 2, 2), (2, 1, 3), (1, 1)],
+        [(2, 2, 3), (2, 2, 2), (2, 1, 3), (2, 2)],
+        [(3, 3, 3), (3, 3, 2), (3, 1, 3), (1, 1)],
+    ],
+)
+def test_wrong_shapes_are_named(shapes):
+    message = r"shapes \(b, b, n\), .* with b = 1 or 2, got " + ", ".join(rf"\({str(s)[1:-1]}\)" for s in shapes)
+    with pytest.raises(ValueError, match=message):
+        SaddlePointSystem(*map(jnp.zeros, shapes))

@@ -1,4 +1,4 @@
-"""solve_path(): turns carried, the same as single solves, what it refuses."""
+"""solve_path(): turns carried, the same as single solves, prediction, steps that are split, what it refuses."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax import Clamp, Pin, Scene, frame, problems
+from rodjax import Clamp, Pin, Scene, Status, frame, problems
+from rodjax.path import MAX_SPLITS
+from rodjax.scene import between
 
 SEGMENTS = 10
 
@@ -26,7 +28,7 @@ def test_a_path_is_the_single_solves_one_after_another(figure_1):
 
 def test_turns_are_carried(figure_1):
     """Five turns of the end frame in steps of pi/2 on a straight rod give a total twist of 10 pi."""
-    rod = problems.cable(20.0)
+    rod = rj.Rod(1.0, EI=1.0, GJ=0.1, EA=1600.0)  # soft in torsion, so that it stays straight: it buckles at 9 EI/L
     start = Clamp((0, 0, 0), frame((1, 0, 0)))
     scenes = []
     for k in range(1, 21):
@@ -58,10 +60,67 @@ def test_progress_changes_nothing(figure_1, capsys):
 
 
 def test_unconverged_steps_are_counted():
-    solver = rj.NonlinearCG(max_iterations=16)
+    # Even in parts only some of the steps take so few iterations.
+    solver = rj.NonlinearCG(max_iterations=8)
     with pytest.warns(rj.NotConvergedWarning, match="not converged: stopped at the largest number"):
         path = rj.solve_path(problems.figure_1(), segments=SEGMENTS, guess=problems.figure_1_start(), solver=solver)
-    assert 0 < np.sum(path.converged) < 25
+    assert 0 < np.sum(path.converged) < 25  # 7 seen
+
+
+def step(figure_1: rj.Equilibrium, k: int) -> rj.Equilibrium:
+    return jax.tree.map(lambda leaf: leaf[k], figure_1)
+
+
+def test_prediction_saves_iterations(figure_1):
+    """Within a series of like steps, from the third scene on; the 10th is the first that turns the end frame."""
+    assert np.median(figure_1.iterations) == 2
+    assert np.max(figure_1.iterations) <= 3
+    for k in (5, 15):
+        unpredicted = rj.solve(problems.figure_1()[k], guess=step(figure_1, k - 1))
+        assert figure_1.iterations[k] < unpredicted.iterations
+
+
+# --- steps that are split --------------------------------------------------------------------------------------------
+
+
+def test_steps_that_converge_are_not_split(figure_1):
+    np.testing.assert_array_equal(figure_1.substeps, 1)
+    single = rj.solve(problems.figure_1()[0], segments=SEGMENTS, guess=problems.figure_1_start())
+    assert single.substeps == 1
+
+
+def test_a_step_too_large_for_the_solver_is_split(figure_1):
+    """The end frame turned by 3 rad at once takes 4 iterations of Newton's method, of which 3 are allowed."""
+    level, turned = problems.figure_1()[8], problems.omega(np.pi / 6, 3.0)
+    solver = rj.Newton(max_iterations=3)
+    with pytest.warns(rj.NotConvergedWarning, match="largest number of iterations"):
+        rj.solve(turned, guess=step(figure_1, 8), solver=solver)
+    split = rj.solve_path([level, turned], guess=step(figure_1, 8), solver=solver)
+    assert np.all(split.converged)
+    assert split.substeps[0] == 1
+    # One solve that fails at the least; each converged one doubles the share, so that two halves do it at best.
+    assert 3 <= split.substeps[1] <= 2 ** (MAX_SPLITS + 1)
+    assert split.substeps[1] < split.iterations[1] <= 3 * split.substeps[1]
+    fine = [between(level, turned, jnp.asarray(fraction)) for fraction in np.linspace(0.0, 1.0, 25)]
+    path = rj.solve_path(fine, segments=SEGMENTS, guess=problems.figure_1_start())
+    # Residuals of 1e-8 EI/L^2 at most, against a stiffness of 1e2 EI/L^3.
+    np.testing.assert_allclose(split.nodes[-1], path.nodes[-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(split.total_twist[-1], path.total_twist[-1], rtol=0, atol=1e-9)
+
+
+def test_a_step_that_no_split_helps_is_given_up_and_flagged():
+    """One iteration a solve, and no residual is small enough."""
+    scenes = [problems.omega(0.6, 0.0), problems.omega(0.6, 3.0)]
+    solver = rj.Newton(max_iterations=1, tolerance=0.0)
+    with pytest.warns(rj.NotConvergedWarning, match="2 not converged: stopped at the largest number of iterations"):
+        path = rj.solve_path(scenes, segments=SEGMENTS, guess=problems.figure_1_start(), solver=solver)
+    np.testing.assert_array_equal(path.status, Status.MAX_ITERATIONS)
+    assert not np.any(path.stable)
+    # The first scene has nothing to be split from. The second is tried at once, halved so often, and at once again.
+    np.testing.assert_array_equal(path.substeps, [1, 1 + MAX_SPLITS + 1])
+    np.testing.assert_array_equal(path.iterations, path.substeps)  # those of all solves
+    assert np.all(path.evaluations > path.iterations)
+    assert np.all(np.isfinite(path.nodes))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import numpy as np
 import pytest
 
@@ -63,3 +64,18 @@ def test_poisson_ratio_out_of_range(ratio):
 def test_tube_without_a_wall():
     with pytest.raises(ValueError, match="outer_radius - inner_radius must be positive"):
         Rod.tube(1.0, 0.01, 0.01, 1e7, poisson_ratio=0.3)
+
+
+def test_a_section_of_traced_numbers():
+    def stiffness(radius, modulus):
+        return Rod.tube(1.0, radius, 0.004, modulus, poisson_ratio=0.3).EI
+
+    known = stiffness(0.005, 1e7)
+    traced = jax.jit(stiffness)(0.005, 1e7)
+    np.testing.assert_allclose(traced, known, rtol=1e-15)  # one formula; the compiler may reorder it
+    slopes = jax.grad(stiffness, argnums=(0, 1))(0.005, 1e7)
+    # EI = E pi/4 (R^4 - r^4)
+    np.testing.assert_allclose(slopes, [1e7 * math.pi * 0.005**3, known / 1e7], rtol=1e-14)
+    np.testing.assert_allclose(
+        jax.vmap(stiffness, (None, 0))(0.005, np.array([1e7, 2e7])), [known, 2 * known], rtol=1e-15
+    )

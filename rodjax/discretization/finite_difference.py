@@ -3,28 +3,37 @@
 Bending lives at the nodes, stretch on the edges between them. Where an end holds the tangent, the half cell between
 the end node, whose tangent is prescribed, and the middle of the first edge has a bending energy of its own: second
 order in the spacing, as measured in `docs/design.md`.
+
+Here the unknowns are the nodes, as in the report; `mixed.MixedForm` is the same discretization in other unknowns.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.twist import (
-    FramedTangents,
-    TwistReference,
-    angle_about,
-    total_twist,
-    transport,
-    transport_along,
+from rodjax.discretization.dead_loads import forces_on_nodes, load_energy
+from rodjax.discretization.joints import (
+    bending_derivatives,
+    components,
+    dot,
+    joints,
+    tangent_bases,
+    with_held_tangents,
 )
-from rodjax.energy import dead_load_energy, density
-from rodjax.linalg import BlockCholesky, SymmetricBlockTridiagonal, pair_blocks
-from rodjax.rod import Rod
+from rodjax.discretization.mixed import (
+    MixedPoint,
+    assembled,
+    forces_beyond_edges,
+    held_at_both_ends,
+    of_edges,
+    twist_under_moment,
+)
+from rodjax.discretization.twist import FramedTangents, TwistReference, angle_about, total_twist, transport_along
+from rodjax.energy import axial_strain_under, density
+from rodjax.linalg import Factors, SaddlePointSystem, factor
 from rodjax.scene import Scene, dead_end_moment
-from rodjax.strain import axial_strain, curvature
-from rodjax.supports import Clamp, Directed, Free, Held, Support, Swivel
-from rodjax.units import Units
+from rodjax.supports import Clamp, Directed, Held
 
 
 class Polyline(eqx.Module):
@@ -108,97 +117,30 @@ class FiniteDifference(eqx.Module):
     # --- energy ----------------------------------------------------------------------------------------------------
 
     def energies(self, polyline: Polyline) -> Energies:
-        h = 1 / len(polyline.edges)
         rod = self.scene.rod
-        dphi = polyline.edges / h
-        tangents, spacing = _with_end_tangents(self.scene, jax.vmap(_unit)(dphi))
-        bending = jax.vmap(_joint_energy, in_axes=(None, 0, 0, 0))(rod, tangents[:-1], tangents[1:], spacing)
-        stretching = h * jax.vmap(lambda dphi: density(rod, axial_strain=axial_strain(dphi)))(dphi)
+        n = len(polyline.edges)
+        tangents, lengths = _tangents_and_lengths(polyline.edges)
+        stretching = jnp.sum(density(rod, axial_strain=n * lengths - 1)) / n
         torsion = None
         if self.reference is not None:
             torsion = density(rod, twist=self.total_twist(polyline))
-        return Energies(jnp.sum(bending), jnp.sum(stretching), torsion, self._load_energy(polyline))
-
-    def _load_energy(self, polyline: Polyline) -> Float[Array, ""] | None:
-        scene = self.scene
-        nodes = polyline.nodes
-        terms = []
-        if scene.gravity is not None:
-            weights = _trapezoidal_weights(len(nodes), nodes.dtype)
-            terms.append(dead_load_energy(scene.gravity, weights @ nodes))
-        for load in scene.point_forces:
-            terms.append(dead_load_energy(load.force, _position_on(nodes, load.at)))
-        for end, node in ((scene.start, nodes[0]), (scene.end, nodes[-1])):
-            if isinstance(end, Free) and end.force is not None:
-                terms.append(dead_load_energy(end.force, node))
-        return sum(terms[1:], terms[0]) if terms else None
+        bending = joints(self.scene, tangents).bending_energy(rod)
+        return Energies(bending, stretching, torsion, load_energy(self.scene, polyline.nodes))
 
     def total_twist(self, polyline: Polyline) -> Float[Array, ""]:
         """Total twist [rad]: fixed by two clamps, or in equilibrium with a dead moment; zero where an end can spin."""
-        moment = dead_end_moment(self.scene)
-        if self.reference is not None:
-            return total_twist(self.reference, _framed_tangents(self.scene, polyline))
-        if moment is not None:
-            return _end_torque(self.scene, moment, polyline) / self.scene.rod.GJ
-        return jnp.zeros((), polyline.nodes.dtype)
-
-    def energy_of_origin(self, units: Units) -> Float[Array, ""]:
-        """Potential energy [J] of all dead forces at the origin of the nondimensional scene."""
-        scene = self.scene
-        forces = [load.force for load in scene.point_forces]
-        forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
-        if scene.gravity is not None:
-            forces.append(scene.gravity)
-        energy = sum((dead_load_energy(force, units.origin) for force in forces), jnp.zeros_like(units.length))
-        return energy * units.force
-
-    def elastic_energy(self, polyline: Polyline) -> Float[Array, ""]:
-        """Energy stored in the rod, with the torsion under a dead moment, which no frame prescribes."""
-        elastic = self.energies(polyline).elastic
         if dead_end_moment(self.scene) is not None:
-            elastic += density(self.scene.rod, twist=self.total_twist(polyline))
-        return elastic
+            return twist_under_moment(self.scene, _tangents_and_lengths(polyline.edges)[0])
+        if self.reference is None:
+            return jnp.zeros((), polyline.nodes.dtype)
+        return total_twist(self.reference, _framed_tangents(self.scene, polyline))
 
     # --- gradient --------------------------------------------------------------------------------------------------
 
-    @property
-    def has_potential(self) -> bool:
-        """Whether the loads have a potential, so that equilibria are stationary points of an energy."""
-        return dead_end_moment(self.scene) is None
-
-    def energy_from(self, polyline: Polyline, moved: Polyline, energy: Float[Array, ""]) -> Float[Array, ""]:
-        """The energy after a motion, `energy`, less the work of loads without a potential on the way, to second order.
-
-        By this a step is judged; without a dead moment it is the energy.
-        """
-        return energy - self._virtual_work(polyline, moved, self.scene)
-
     def energy_and_gradient(self, polyline: Polyline) -> tuple[Float[Array, ""], Float[Array, "m 3"]]:
-        """Potential energy, and the gradient of energy less virtual work by the displacements."""
-
-        def potential(displacement):
-            moved = self.moved(polyline, displacement)
-            energy = self.energies(moved).total
-            return energy - self._virtual_work(polyline, moved, self.scene), energy
-
-        gradient, energy = jax.grad(potential, has_aux=True)(self.no_displacement(polyline))
-        return energy, gradient
-
-    def _virtual_work(self, polyline: Polyline, moved: Polyline, turned: Scene) -> Float[Array, ""] | float:
-        """Work of a dead end moment M on a small motion: M . (rotation of the end), its derivative exact at no motion.
-
-        The end tangent turns by t x dt, and the end section spins about it by as much as keeps the torque M . t.
-        `turned` is the scene with its ends in the moved position.
-        """
-        moment = dead_end_moment(self.scene)
-        if moment is None:
-            return 0.0
-        edge = 0 if isinstance(self.scene.start, Free) else -1
-        tangent, moved_tangent = (_unit(p.edges[edge]) for p in (polyline, moved))
-        reference = TwistReference(_framed_tangents(self.scene, polyline), jnp.zeros_like(tangent[0]))
-        twist_change = total_twist(reference, _framed_tangents(turned, moved))
-        torque = _end_torque(self.scene, moment, polyline)
-        return jnp.sum(moment * jnp.cross(tangent, moved_tangent)) - torque * twist_change
+        """Potential energy, and its gradient by the displacements."""
+        energy = lambda displacement: self.energies(self.moved(polyline, displacement)).total  # noqa: E731
+        return jax.value_and_grad(energy)(self.no_displacement(polyline))
 
     def rounding_floor(self, polyline: Polyline) -> Float[Array, ""]:
         """Gradient [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
@@ -217,121 +159,77 @@ class FiniteDifference(eqx.Module):
 
     # --- preconditioner --------------------------------------------------------------------------------------------
 
-    def gauss_newton(self, polyline: Polyline) -> SymmetricBlockTridiagonal:
-        """The Gauss-Newton Hessian of bending and stretch: positive definite, block-banded, nodes taken in pairs.
+    def gauss_newton(self, polyline: Polyline) -> "Preconditioner":
+        """The Gauss-Newton Hessian of bending and stretch, factorised: positive definite.
 
         Torsion is left out: it would add a full matrix of rank one.
         """
-        scene = self.scene
-        h = 1 / len(polyline.edges)
-        dphi = polyline.edges / h
-        points, spacing = _with_end_tangents(scene, dphi)
-        bending = jax.vmap(_joint_stiffness, in_axes=(None, 0, 0, 0))(scene.rod, points[:-1], points[1:], spacing)
-        stretching = h * jax.vmap(_stretch_stiffness, in_axes=(None, 0))(scene.rod, dphi)
-        # By the edges: joint k couples points k and k + 1, of which the prescribed end tangents do not vary.
-        zero = jnp.zeros((1, 3, 3), dphi.dtype)
-        by_point = jnp.concatenate([bending[:, :3, :3], zero]) + jnp.concatenate([zero, bending[:, 3:, 3:]])
-        first, n = int(isinstance(scene.start, Directed)), len(dphi)
-        diagonal = (by_point[first : first + n] + stretching) / h**2
-        lower = bending[first : first + n - 1, 3:, :3] / h**2
-        # By the nodes: edge i is node i + 1 less node i.
-        lower_before, lower_after = jnp.concatenate([zero, lower]), jnp.concatenate([lower, zero])
-        below = lower_before - diagonal + lower_after
-        by_node = (
-            jnp.concatenate([zero, diagonal])
-            + jnp.concatenate([diagonal, zero])
-            - jnp.concatenate([zero, lower + jnp.swapaxes(lower, 1, 2), zero])
-        )
-        if not (isinstance(scene.start, Directed) or isinstance(scene.end, Directed)):
-            by_node += PIN_STIFFNESS * h * jnp.eye(3, dtype=dphi.dtype)[None]
-        free = self._free_nodes(by_node)
-        offset = int(isinstance(scene.start, Held))
-        m = len(free)
-        return pair_blocks(free, below[offset : offset + m - 1], -lower[offset : offset + m - 2])
-
-    def precondition(self, factors: BlockCholesky, gradient: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
-        """The displacement that the factorised `gauss_newton` gives for a gradient."""
-        pairs = -(-len(gradient) // 2)
-        filled = jnp.pad(gradient, ((0, 2 * pairs - len(gradient)), (0, 0)))
-        return factors.solve(filled.reshape(pairs, 6)).reshape(-1, 3)[: len(gradient)]
-
-    # --- results ---------------------------------------------------------------------------------------------------
-
-    def resultants(self, polyline: Polyline) -> "Resultants":
-        """Frames, strains and section forces at the nodes, forces and moments at the ends."""
         scene, rod = self.scene, self.scene.rod
         n = len(polyline.edges)
-        h = 1 / n
-        dphi = polyline.edges / h
-        edge_tangents = jax.vmap(_unit)(dphi)
-        (start_force, start_moment), (end_force, end_moment) = self._end_loads(polyline)
+        tangents, lengths = _tangents_and_lengths(polyline.edges)
+        all_bases = tangent_bases(with_held_tangents(scene, tangents))
+        bases = of_edges(scene, all_bases, n)
+        beside = (all_bases[..., :-1], all_bases[..., 1:])
+        derivatives = bending_derivatives(rod, joints(scene, tangents), beside, gauss_newton=True)
+        _, diagonal, lower = assembled(scene, derivatives, n)
+        per_tension = axial_strain_under(rod, jnp.ones_like(lengths)) / n
+        if held_at_both_ends(scene):
+            border = -lengths[None, None] * jnp.swapaxes(bases, 0, 1)
+            compliance = (per_tension[None] * tangents) @ tangents.T
+        else:
+            border, compliance = jnp.zeros((2, 0, n), lengths.dtype), jnp.zeros((0, 0), lengths.dtype)
+        system = SaddlePointSystem(diagonal, lower, border, compliance)
+        if not (isinstance(scene.start, Directed) or isinstance(scene.end, Directed)):
+            system = system.shifted(jnp.asarray(PIN_STIFFNESS / n, lengths.dtype))
+        return Preconditioner(factor(system), tangents, bases, lengths, per_tension)
 
-        start_tangent = _end_tangent(scene.start, edge_tangents[0], h)
-        end_tangent = _end_tangent(scene.end, edge_tangents[-1], h)
-        inner_tangents = jax.vmap(_unit)(edge_tangents[:-1] + edge_tangents[1:])
-        tangents = jnp.concatenate([start_tangent[None], inner_tangents, end_tangent[None]])
-        twist = self.total_twist(polyline)
-        frames = _frames(scene, edge_tangents, tangents, twist)
+    def precondition(self, gauss_newton: "Preconditioner", gradient: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
+        """The displacement that the Gauss-Newton Hessian gives for a gradient.
 
-        inner_curvature = jax.vmap(_joint_curvature, in_axes=(0, 0, None))(edge_tangents[:-1], edge_tangents[1:], h)
-        end_curvatures = [
-            _across(moment, tangent) / rod.EI
-            for moment, tangent in ((start_moment, start_tangent), (end_moment, end_tangent))
-        ]
-        curvatures = jnp.concatenate([end_curvatures[0][None], inner_curvature, end_curvatures[1][None]])
-        edge_tension = rod.EA * jax.vmap(axial_strain)(dphi)
-        end_tensions = [jnp.sum(start_force * start_tangent), jnp.sum(end_force * end_tangent)]
-        tension = jnp.concatenate(
-            [end_tensions[0][None], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1][None]]
-        )
-        return Resultants(
-            frames=frames,
-            curvature=jnp.sqrt(jnp.sum(curvatures**2, axis=1)),
-            twist=jnp.full(n + 1, twist),
-            total_twist=twist,
-            tension=tension,
-            start_force=start_force,
-            start_moment=start_moment,
-            end_force=end_force,
-            end_moment=end_moment,
-        )
+        By the edges that Hessian couples neighbours only. The forces on the nodes add up to forces in the edges, up to
+        one force in all of them, which follows from the closure where both ends are held.
+        """
+        forces = forces_beyond_edges(self.scene, self._all_nodes(gradient).T)
+        changes = gauss_newton.changes_under(forces).T
+        none = jnp.zeros((1, 3), changes.dtype)
+        if isinstance(self.scene.start, Held):
+            return self._free_nodes(jnp.concatenate([none, jnp.cumsum(changes, axis=0)]))
+        return self._free_nodes(jnp.concatenate([-jnp.cumsum(changes[::-1], axis=0)[::-1], none]))
 
-    def _end_loads(self, polyline: Polyline) -> list[tuple[Float[Array, "3"], Float[Array, "3"]]]:
-        """(f, m) at s = 0 and s = L: derivatives of the energy by the positions and rotations of the ends."""
+    # --- the same state in the unknowns of the mixed form ------------------------------------------------------------
 
-        def potential(displacement, rotations):
-            moved = polyline.moved(displacement)
-            ends = (_rotated(self.scene.start, rotations[0]), _rotated(self.scene.end, rotations[1]))
-            scene = eqx.tree_at(lambda scene: (scene.start, scene.end), self.scene, ends)
-            energy = FiniteDifference(scene, self.reference).energies(moved).total
-            return energy - self._virtual_work(polyline, moved, scene)
-
-        no_rotations = jnp.zeros((2, 3), polyline.nodes.dtype)
-        forces, moments = jax.grad(potential, argnums=(0, 1))(jnp.zeros_like(polyline.nodes), no_rotations)
-        loads = []
-        for end, node, sign in ((self.scene.start, 0, -1), (self.scene.end, -1, 1)):
-            if isinstance(end, Free):
-                zero = jnp.zeros(3, polyline.nodes.dtype)
-                force = zero if end.force is None else end.force
-                moment = zero if end.moment is None else end.moment
-                loads.append((sign * force, sign * moment))
-            else:
-                loads.append((sign * forces[node], sign * moments[node]))
-        return loads
+    def mixed_point(self, polyline: Polyline) -> MixedPoint:
+        tangents, _ = _tangents_and_lengths(polyline.edges)
+        end_force = jnp.zeros(3, tangents.dtype)
+        if held_at_both_ends(self.scene):
+            on_end = forces_on_nodes(self.scene, len(polyline.edges))[-1]
+            elastic = lambda edges: self.energies(Polyline(polyline.nodes, edges)).elastic  # noqa: E731
+            end_force = jax.grad(elastic)(polyline.edges)[-1] - on_end
+        return MixedPoint(tangents, end_force, self.total_twist(polyline))
 
 
-class Resultants(eqx.Module):
-    """What a solution says at its nodes and ends; names and signs as in `rodjax.Equilibrium`, nondimensional."""
+class Preconditioner(eqx.Module):
+    """A factorised Gauss-Newton Hessian by the rotations of the edges, and how each edge lengthens under tension."""
 
-    frames: Float[Array, "n+1 3 3"]
-    curvature: Float[Array, "n+1"]
-    twist: Float[Array, "n+1"]
-    total_twist: Float[Array, ""]
-    tension: Float[Array, "n+1"]
-    start_force: Float[Array, "3"]
-    start_moment: Float[Array, "3"]
-    end_force: Float[Array, "3"]
-    end_moment: Float[Array, "3"]
+    factors: Factors
+    tangents: Float[Array, "3 n"]
+    bases: Float[Array, "3 2 n"]
+    lengths: Float[Array, "n"]
+    per_tension: Float[Array, "n"]
+
+    @property
+    def is_positive_definite(self) -> Bool[Array, ""]:
+        return self.factors.is_minimum
+
+    def changes_under(self, forces: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        """The changes of the edges under these forces in them and the one in all that keeps the ends in place."""
+        stretched = self.per_tension * dot(self.tangents, forces)
+        constraints = self.factors.rows.shape[1]
+        closure = (self.tangents @ stretched)[:constraints]
+        rotation, common = self.factors.solve(self.lengths[None] * components(self.bases, forces), closure)
+        if constraints:
+            stretched += self.per_tension * (common @ self.tangents)
+        return self.lengths[None] * jnp.sum(self.bases * rotation[None], axis=1) + stretched[None] * self.tangents
 
 
 # Stiffness against rigid motion, in units of EI/L^3 per length, that the preconditioner adds where no end holds a
@@ -360,150 +258,28 @@ def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     return Polyline(nodes, polyline.edges)
 
 
-def _with_end_tangents(scene: Scene, dphi: Float[Array, "n 3"]) -> tuple[Float[Array, "k 3"], Float[Array, "k-1"]]:
-    """phi' along the edges, with the prescribed tangents before and after, and the distances between these points."""
-    h = 1 / len(dphi)
-    points, spacing = [dphi], [jnp.full(len(dphi) - 1, h, dphi.dtype)]
-    half = jnp.full(1, h / 2, dphi.dtype)
-    if isinstance(scene.start, Directed):
-        points, spacing = [scene.start.tangent[None], *points], [half, *spacing]
-    if isinstance(scene.end, Directed):
-        points, spacing = [*points, scene.end.tangent[None]], [*spacing, half]
-    return jnp.concatenate(points), jnp.concatenate(spacing)
-
-
-def _joint_curvature(
-    before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""] | float
-) -> Float[Array, "3"]:
-    """Curvature from the unit tangents at two points, by central differences halfway between them.
-
-    It grows beyond bounds as the tangents turn against each other. From phi' instead of t it would vanish for edges of
-    different length folded upon each other, and the rod would have a way through the fold.
-    """
-    return curvature((before + after) / 2, (after - before) / spacing)
-
-
-def _joint_energy(
-    rod: Rod, before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""]
-) -> Float[Array, ""]:
-    return spacing * density(rod, curvature=_joint_curvature(before, after, spacing))
-
-
-def _joint_stiffness(
-    rod: Rod, before: Float[Array, "3"], after: Float[Array, "3"], spacing: Float[Array, ""]
-) -> Float[Array, "6 6"]:
-    """Gauss-Newton Hessian of a joint's energy by phi' at the two points: J^T (d2w) J, J = d(curvature)."""
-
-    def strain(before, after):
-        return _joint_curvature(_unit(before), _unit(after), spacing)
-
-    jacobian = jnp.concatenate(jax.jacfwd(strain, argnums=(0, 1))(before, after), axis=1)
-    stiffness = jax.hessian(lambda strain: density(rod, curvature=strain))(strain(before, after))
-    return spacing * jacobian.T @ stiffness @ jacobian
-
-
-def _stretch_stiffness(rod: Rod, dphi: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Gauss-Newton Hessian of the stretching density by phi'."""
-    jacobian = jax.grad(axial_strain)(dphi)
-    stiffness = jax.hessian(lambda strain: density(rod, axial_strain=strain))(axial_strain(dphi))
-    return stiffness * jacobian[:, None] * jacobian[None, :]
-
-
-def _trapezoidal_weights(count: int, dtype) -> Float[Array, "n+1"]:
-    weights = jnp.full(count, 1 / (count - 1), dtype)
-    return weights.at[jnp.array([0, -1])].multiply(0.5)
-
-
-def _position_on(nodes: Float[Array, "n+1 3"], s: Float[Array, ""]) -> Float[Array, "3"]:
-    """Position at an arclength, linear between the nodes."""
-    n = len(nodes) - 1
-    cell = jnp.clip(jnp.floor(s * n).astype(int), 0, n - 1)
-    t = s * n - cell.astype(s.dtype)
-    return (1 - t) * nodes[cell] + t * nodes[cell + 1]
-
-
-def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    return vector / jnp.sqrt(jnp.sum(vector**2))
-
-
-def _across(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The part of `vector` at right angles to the unit `axis`."""
-    return vector - jnp.sum(vector * axis) * axis
-
-
-def _rotated(end: Support, omega: Float[Array, "3"]) -> Support:
-    """The support turned by a small rotation vector [rad], to first order: exact for derivatives at no rotation."""
-    if isinstance(end, Clamp):
-        turned = end.frame + jax.vmap(jnp.cross, in_axes=(None, 1), out_axes=1)(omega, end.frame)
-        return eqx.tree_at(lambda end: end.frame, end, turned)
-    if isinstance(end, Swivel):
-        return eqx.tree_at(lambda end: end.tangent, end, end.tangent + jnp.cross(omega, end.tangent))
-    return end
-
-
-def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float) -> Float[Array, "3"]:
-    """The tangent at an end: prescribed, or that of the edge, turned by what a dead moment bends half an edge."""
-    if isinstance(end, Directed):
-        return end.tangent
-    if isinstance(end, Free) and end.moment is not None:
-        return _unit(edge_tangent + h / 2 * jnp.cross(end.moment, edge_tangent))
-    return edge_tangent
+def _tangents_and_lengths(edges: Float[Array, "n 3"]) -> tuple[Float[Array, "3 n"], Float[Array, "n"]]:
+    lengths = jnp.sqrt(jnp.sum(edges**2, axis=1))
+    return edges.T / lengths[None], lengths
 
 
 # --- torsion ---------------------------------------------------------------------------------------------------------
 
 
 def _framed_tangents(scene: Scene, polyline: Polyline) -> FramedTangents:
-    tangents = [jax.vmap(_unit)(polyline.edges)]
-    if isinstance(scene.start, Directed):
-        tangents = [scene.start.tangent[None], *tangents]
-    if isinstance(scene.end, Directed):
-        tangents = [*tangents, scene.end.tangent[None]]
+    tangents, _ = _tangents_and_lengths(polyline.edges)
     start_d1, end_d1 = (end.frame[:, 0] if isinstance(end, Clamp) else None for end in (scene.start, scene.end))
-    return FramedTangents(jnp.concatenate(tangents), start_d1, end_d1)
+    return FramedTangents(with_held_tangents(scene, tangents), start_d1, end_d1)
 
 
 def _twist_reference(scene: Scene, polyline: Polyline, guess_twist: Float[Array, ""]) -> TwistReference | None:
     state = _framed_tangents(scene, polyline)
     if state.start_d1 is None or state.end_d1 is None:
         return None
-    carried = transport_along(state.start_d1, state.tangents)[-1]
-    principal = angle_about(state.tangents[-1], carried, state.end_d1)
+    carried = transport_along(state.start_d1, state.tangents)[:, -1]
+    principal = angle_about(state.tangents[:, -1], carried, state.end_d1)
     if scene.turns is None:
         turns = jnp.round((guess_twist - principal) / (2 * jnp.pi))
     else:
         turns = scene.turns
     return TwistReference(state, principal + 2 * jnp.pi * turns)
-
-
-def _end_torque(scene: Scene, moment: Float[Array, "3"], polyline: Polyline) -> Float[Array, ""]:
-    """The twisting moment GJ Omega that a dead moment on the free end raises, constant along the rod."""
-    if isinstance(scene.start, Free):
-        return -jnp.sum(moment * _unit(polyline.edges[0]))
-    return jnp.sum(moment * _unit(polyline.edges[-1]))
-
-
-def _frames(
-    scene: Scene,
-    edge_tangents: Float[Array, "n 3"],
-    tangents: Float[Array, "n+1 3"],
-    twist: Float[Array, ""],
-) -> Float[Array, "n+1 3 3"]:
-    """Material frames at the nodes, from the end that holds the twist (or a choice where none does)."""
-    n = len(edge_tangents)
-    start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(tangents[0])
-    along_edges = transport_along(start_d1, jnp.concatenate([tangents[:1], edge_tangents]))
-    # A node's tangent lies on the arc between those of its edges, so that the last node closes the chain.
-    d1 = jax.vmap(transport)(along_edges[1:], edge_tangents, tangents[1:])
-    d1 = jnp.concatenate([start_d1[None], d1])
-    angle = twist * jnp.linspace(0.0, 1.0, n + 1, dtype=twist.dtype)
-    if isinstance(scene.end, Clamp) and not isinstance(scene.start, Clamp):
-        angle += angle_about(tangents[-1], d1[-1], scene.end.frame[:, 0]) - angle[-1]
-    d2 = jax.vmap(jnp.cross)(tangents, d1)
-    turned = jnp.cos(angle)[:, None] * d1 + jnp.sin(angle)[:, None] * d2
-    return jnp.stack([turned, jax.vmap(jnp.cross)(tangents, turned), tangents], axis=-1)
-
-
-def _any_normal(tangent: Float[Array, "3"]) -> Float[Array, "3"]:
-    axis = jnp.eye(3, dtype=tangent.dtype)[jnp.argmin(jnp.abs(tangent))]
-    return _unit(jnp.cross(tangent, axis))

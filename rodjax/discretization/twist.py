@@ -2,6 +2,7 @@
 
 The twist follows from the tangents alone, up to a turn. It is carried from a reference polyline by a formula local in s
 (`strain.swept_angle`), so that turns are kept while the end frames turn by less than pi from the reference.
+Arrays along the rod have the components first.
 """
 
 import equinox as eqx
@@ -9,13 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.joints import components, cross, dot, tangent_bases
 from rodjax.strain import swept_angle
 
 
 class FramedTangents(eqx.Module):
-    """Unit tangents along the rod, (k, 3), and the directors d1 of the end frames, `None` at an end free to spin."""
+    """Unit tangents along the rod, (3, k), and the directors d1 of the end frames, `None` at an end free to spin."""
 
-    tangents: Float[Array, "k 3"]
+    tangents: Float[Array, "3 k"]
     start_d1: Float[Array, "3"] | None
     end_d1: Float[Array, "3"] | None
 
@@ -30,37 +32,45 @@ class TwistReference(eqx.Module):
 def total_twist(reference: TwistReference, state: FramedTangents) -> Float[Array, ""]:
     """Total twist of a state [rad], carried from the reference."""
     old, new = reference.state, state
-    swept = jax.vmap(swept_angle)(new.tangents[:-1], new.tangents[1:], old.tangents[:-1], old.tangents[1:])
-    twist = reference.total_twist + jnp.sum(swept)
+    twist = reference.total_twist + swept_twist(old.tangents, new.tangents)
     if old.start_d1 is not None and new.start_d1 is not None:
-        carried = transport(old.start_d1, old.tangents[0], new.tangents[0])
-        twist -= angle_about(new.tangents[0], carried, new.start_d1)
+        carried = transport(old.start_d1, old.tangents[:, 0], new.tangents[:, 0])
+        twist -= angle_about(new.tangents[:, 0], carried, new.start_d1)
     if old.end_d1 is not None and new.end_d1 is not None:
-        carried = transport(old.end_d1, old.tangents[-1], new.tangents[-1])
-        twist += angle_about(new.tangents[-1], carried, new.end_d1)
+        carried = transport(old.end_d1, old.tangents[:, -1], new.tangents[:, -1])
+        twist += angle_about(new.tangents[:, -1], carried, new.end_d1)
     return twist
 
 
+def swept_twist(old: Float[Array, "3 k"], new: Float[Array, "3 k"]) -> Float[Array, ""]:
+    """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
+    swept = jax.vmap(swept_angle, in_axes=1)(new[:, :-1], new[:, 1:], old[:, :-1], old[:, 1:])
+    return jnp.sum(swept)
+
+
 def transport(
-    vector: Float[Array, "3"], tangent: Float[Array, "3"], next_tangent: Float[Array, "3"]
-) -> Float[Array, "3"]:
+    vector: Float[Array, "3 *k"], tangent: Float[Array, "3 *k"], next_tangent: Float[Array, "3 *k"]
+) -> Float[Array, "3 *k"]:
     """`vector`, at right angles to `tangent`, moved by the smallest rotation from `tangent` to `next_tangent`."""
-    along = jnp.sum(vector * next_tangent) / (1 + jnp.sum(tangent * next_tangent))
-    return vector - along * (tangent + next_tangent)
+    along = dot(vector, next_tangent) / (1 + dot(tangent, next_tangent))
+    return vector - along[None] * (tangent + next_tangent)
 
 
-def transport_along(vector: Float[Array, "3"], tangents: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
+def transport_along(vector: Float[Array, "3"], tangents: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
     """`vector`, at right angles to the first tangent, carried along all of them without twist."""
+    bases = tangent_bases(tangents)
+    d1, d2 = bases[:, 0], bases[:, 1]
+    carried = transport(d1[:, :-1], tangents[:, :-1], tangents[:, 1:])
+    # The angles by which the bases turn from one tangent to the next, and so those at which `vector` lags behind.
+    turned = angle_about(tangents[:, 1:], carried, d1[:, 1:])
+    first = components(bases[:, :, :1], vector[:, None])
+    angle = jnp.concatenate([jnp.zeros_like(turned[:1]), -jnp.cumsum(turned)])
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return (first[0] * cosine - first[1] * sine)[None] * d1 + (first[0] * sine + first[1] * cosine)[None] * d2
 
-    def step(carry, tangent):
-        previous, moved = carry
-        moved = transport(moved, previous, tangent)
-        return (tangent, moved), moved
 
-    _, moved = jax.lax.scan(step, (tangents[0], vector), tangents[1:])
-    return jnp.concatenate([vector[None], moved])
-
-
-def angle_about(axis: Float[Array, "3"], vector: Float[Array, "3"], other: Float[Array, "3"]) -> Float[Array, ""]:
+def angle_about(
+    axis: Float[Array, "3 *k"], vector: Float[Array, "3 *k"], other: Float[Array, "3 *k"]
+) -> Float[Array, "*k"]:
     """Right-handed angle about the unit `axis` from `vector` to `other` [rad], both at right angles to it."""
-    return jnp.arctan2(jnp.sum(axis * jnp.cross(vector, other)), jnp.sum(vector * other))
+    return jnp.arctan2(dot(axis, cross(vector, other)), dot(vector, other))

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from rodjax.checks import instance, not_negative, whole_number
-from rodjax.linalg import BlockCholesky, factor
+from rodjax.checks import instance, not_negative, plain_number, whole_number
 from rodjax.solvers.line_search import Bracket, LineSearch
 from rodjax.status import Status
 
@@ -28,7 +27,7 @@ class NonlinearCG(eqx.Module):
     """
 
     preconditioner: Literal["gauss_newton"] | None = eqx.field(static=True, default="gauss_newton")
-    tolerance: float = 1e-8
+    tolerance: float = eqx.field(default=1e-8, converter=plain_number("tolerance"))
     max_iterations: int = 20000
     refresh: int = 7
     line_search: LineSearch = LineSearch()
@@ -67,7 +66,7 @@ class _State(eqx.Module):
     energy: Float[Array, ""]
     gradient: Float[Array, "m 3"]
     preconditioned: Float[Array, "m 3"]
-    factors: BlockCholesky | None
+    factors: PyTree | None
     direction: Float[Array, "m 3"]
     slope: Float[Array, ""]
     step: Float[Array, ""]
@@ -81,7 +80,7 @@ class _State(eqx.Module):
 
 def progress(
     problem: Any,
-    solver: NonlinearCG,
+    solver: Any,
     point: PyTree,
     energy: Float[Array, ""],
     gradient: Float[Array, "m 3"],
@@ -108,8 +107,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
         trial = here.moved(state.point, state.step * state.direction)
         energy, gradient = here.energy_and_gradient(trial)
         slope = jnp.sum(gradient * state.direction)
-        reached = here.energy_from(state.point, trial, energy)
-        energy_is_low = jnp.isfinite(slope) & (reached <= search.energy_bound(state.energy))
+        energy_is_low = jnp.isfinite(slope) & (energy <= search.energy_bound(state.energy))
         state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
         return jax.lax.cond(
             state.restart | search.accepts(slope, state.slope, energy_is_low),
@@ -117,9 +115,9 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
             lambda: narrowed(state, slope, energy_is_low),
         )
 
-    def prepared(here: Any, point: PyTree) -> tuple[PyTree, BlockCholesky | None]:
+    def prepared(here: Any, point: PyTree) -> tuple[PyTree, PyTree | None]:
         preconditioned = solver.preconditioner is not None
-        return here.reference_at(point), factor(here.gauss_newton(point)) if preconditioned else None
+        return here.reference_at(point), here.gauss_newton(point) if preconditioned else None
 
     def advanced(
         here: Any, state: _State, point: PyTree, energy: Float[Array, ""], gradient: Float[Array, "m 3"]

@@ -1,0 +1,56 @@
+"""Gravity and dead forces on a polyline. Their potential is linear in the nodes, so that the forces do not vary."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.energy import dead_load_energy
+from rodjax.scene import Scene
+from rodjax.supports import Free
+from rodjax.units import Units
+
+
+def load_energy(scene: Scene, nodes: Float[Array, "n+1 3"]) -> Float[Array, ""] | None:
+    """The potential of gravity, by the trapezoidal rule, and of dead forces; `None` in a scene without any."""
+    terms = []
+    if scene.gravity is not None:
+        weights = _trapezoidal_weights(len(nodes), nodes.dtype)
+        terms.append(dead_load_energy(scene.gravity, weights @ nodes))
+    for load in scene.point_forces:
+        terms.append(dead_load_energy(load.force, _position_on(nodes, load.at)))
+    for end, node in ((scene.start, nodes[0]), (scene.end, nodes[-1])):
+        if isinstance(end, Free) and end.force is not None:
+            terms.append(dead_load_energy(end.force, node))
+    return sum(terms[1:], terms[0]) if terms else None
+
+
+def forces_on_nodes(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
+    """What the loads exert on each node."""
+    nodes = jnp.zeros((segments + 1, 3), scene.rod.length.dtype)
+    energy = load_energy(scene, nodes)
+    if energy is None:
+        return nodes
+    return -jax.grad(lambda nodes: load_energy(scene, nodes))(nodes)
+
+
+def _trapezoidal_weights(count: int, dtype) -> Float[Array, "n+1"]:
+    weights = jnp.full(count, 1 / (count - 1), dtype)
+    return weights.at[jnp.array([0, -1])].multiply(0.5)
+
+
+def _position_on(nodes: Float[Array, "n+1 3"], s: Float[Array, ""]) -> Float[Array, "3"]:
+    """Position at an arclength, linear between the nodes."""
+    n = len(nodes) - 1
+    cell = jnp.clip(jnp.floor(s * n).astype(int), 0, n - 1)
+    t = s * n - cell.astype(s.dtype)
+    return (1 - t) * nodes[cell] + t * nodes[cell + 1]
+
+
+def energy_of_origin(scene: Scene, units: Units) -> Float[Array, ""]:
+    """Potential energy [J] of all dead forces of a nondimensional scene at its origin."""
+    forces = [load.force for load in scene.point_forces]
+    forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+    if scene.gravity is not None:
+        forces.append(scene.gravity)
+    energy = sum((dead_load_energy(force, units.origin) for force in forces), jnp.zeros_like(units.length))
+    return energy * units.force

@@ -1,0 +1,186 @@
+"""Joints: where neighbouring edges of a polyline meet, or an edge and the tangent that a support holds.
+
+Bending and torsion of an isotropic rod live there, as functions of the unit tangents on both sides. Arrays have the
+components first and the place along the rod last, so that loops run along the rod.
+
+The derivatives of a joint by rotations of its tangents are written out: those by `jax.hessian` take ten times as long
+and more (`docs/design.md`); the tests compare the two. The energy itself is differentiated by JAX, as a function of the
+one number on which it depends, the squared difference of the tangents.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.energy import density
+from rodjax.rod import Rod
+from rodjax.scene import Scene
+from rodjax.supports import Directed
+
+# In a Gauss-Newton Hessian a joint bent further than this counts as one bent so far: it stays definite.
+LEAST_COSINE = 0.1
+
+
+class Joints(eqx.Module):
+    """Unit tangents before and after each joint, and the distance between the two along the rod."""
+
+    before: Float[Array, "3 k"]
+    after: Float[Array, "3 k"]
+    spacing: Float[Array, "k"]
+
+    @property
+    def squared_curvature(self) -> Float[Array, "k"]:
+        """|t x t'|^2 by central differences between the two tangents: (2 tan(a/2)/h)^2 for the angle a.
+
+        It grows beyond bounds as the tangents turn against each other, so that the rod has no way through a fold.
+        """
+        difference = self.after - self.before
+        return _squared_curvature(dot(difference, difference), self.spacing)
+
+    def bending_energy(self, rod: Rod) -> Float[Array, ""]:
+        return jnp.sum(self.spacing * density(rod, squared_curvature=self.squared_curvature))
+
+
+class JointDerivatives(eqx.Module):
+    """First and second derivatives by the rotations of the tangents before and after, each in its basis."""
+
+    before: Float[Array, "2 k"]
+    after: Float[Array, "2 k"]
+    before_before: Float[Array, "2 2 k"]
+    after_after: Float[Array, "2 2 k"]
+    after_before: Float[Array, "2 2 k"]
+
+
+def joints(scene: Scene, tangents: Float[Array, "3 n"]) -> Joints:
+    """The joints of a polyline of n equal edges; a support that holds the tangent makes one half an edge away."""
+    points = with_held_tangents(scene, tangents)
+    h = 1 / tangents.shape[1]
+    half = jnp.full(1, h / 2, tangents.dtype)
+    spacing = [jnp.full(tangents.shape[1] - 1, h, tangents.dtype)]
+    if isinstance(scene.start, Directed):
+        spacing = [half, *spacing]
+    if isinstance(scene.end, Directed):
+        spacing = [*spacing, half]
+    return Joints(points[:, :-1], points[:, 1:], jnp.concatenate(spacing))
+
+
+def with_held_tangents(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 m"]:
+    """The tangents of the edges, with those that the supports hold before and after them."""
+    points = [tangents]
+    if isinstance(scene.start, Directed):
+        points = [scene.start.tangent[:, None], *points]
+    if isinstance(scene.end, Directed):
+        points = [*points, scene.end.tangent[:, None]]
+    return jnp.concatenate(points, axis=1)
+
+
+def tangent_bases(tangents: Float[Array, "3 n"]) -> Float[Array, "3 2 n"]:
+    """Two unit vectors at right angles to each tangent and to each other, right-handed with it.
+
+    Duff et al., "Building an orthonormal basis, revisited" (2017).
+    """
+    x, y, z = tangents
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return jnp.stack(
+        [jnp.stack([1 + sign * x * x * a, b]), jnp.stack([sign * b, sign + y * y * a]), jnp.stack([-sign * x, -y])]
+    )
+
+
+def rotated(
+    tangents: Float[Array, "3 n"], bases: Float[Array, "3 2 n"], rotation: Float[Array, "2 n"]
+) -> Float[Array, "3 n"]:
+    """Each tangent turned along a great circle, by an angle and in a direction given in its basis [rad]."""
+    across = jnp.sum(bases * rotation[None], axis=1)
+    squared = dot(rotation, rotation)
+    is_zero = squared == 0
+    angle = jnp.sqrt(jnp.where(is_zero, 1.0, squared))
+    # Series at zero, where the derivatives of the square root are infinite.
+    cosine = jnp.where(is_zero, 1 - squared / 2, jnp.cos(angle))
+    sine_by_angle = jnp.where(is_zero, 1 - squared / 6, jnp.sin(angle) / angle)
+    return cosine[None] * tangents + sine_by_angle[None] * across
+
+
+def bending_derivatives(
+    rod: Rod, joints: Joints, bases: tuple[Float[Array, "3 2 k"], Float[Array, "3 2 k"]], *, gauss_newton: bool = False
+) -> JointDerivatives:
+    """Derivatives of the bending energy. With `gauss_newton` the second ones are positive semidefinite.
+
+    With d the difference of the two tangents, d.d changes by -2 a.b; the energy is a function of d.d. Gauss-Newton
+    takes the rotation of the second tangent less that of the first, carried over by parallel transport, for the strain.
+    """
+
+    def energy(squared_difference):
+        curvature = _squared_curvature(squared_difference, joints.spacing)
+        return joints.spacing * density(rod, squared_curvature=curvature)
+
+    difference = joints.after - joints.before
+    squared_difference = dot(difference, difference)
+    first, second = _two_derivatives(energy, squared_difference)
+    before_basis, after_basis = bases
+    toward_after, toward_before = components(before_basis, joints.after), components(after_basis, joints.before)
+    cosine = dot(joints.before, joints.after)
+    between = jnp.sum(after_basis[:, :, None] * before_basis[:, None, :], axis=0)
+    if gauss_newton:
+        transported = between - outer(toward_before, toward_after) / (1 + cosine)[None, None]
+        cosine = jnp.maximum(cosine, LEAST_COSINE)
+        between = cosine[None, None] * transported
+    across = (2 * first * cosine)[None, None] * jnp.eye(before_basis.shape[1], dtype=first.dtype)[..., None]
+    return JointDerivatives(
+        before=-2 * first[None] * toward_after,
+        after=-2 * first[None] * toward_before,
+        before_before=4 * second[None, None] * outer(toward_after, toward_after) + across,
+        after_after=4 * second[None, None] * outer(toward_before, toward_before) + across,
+        after_before=4 * second[None, None] * outer(toward_before, toward_after) - 2 * first[None, None] * between,
+    )
+
+
+def twist_derivatives(joints: Joints, bases: tuple[Float[Array, "3 2 k"], Float[Array, "3 2 k"]]) -> JointDerivatives:
+    """Derivatives of the total twist, `strain.swept_angle` of each joint (Bergou et al. 2010 give the first ones)."""
+    a, b = joints.before, joints.after
+    before_basis, after_basis = bases
+    scale = 1 / (1 + dot(a, b))
+    normal = scale[None] * cross(a, b)
+    normal_before, normal_after = components(before_basis, normal), components(after_basis, normal)
+    toward_after, toward_before = scale[None] * components(before_basis, b), scale[None] * components(after_basis, a)
+    a_cross = jnp.stack([cross(a, after_basis[:, i]) for i in range(after_basis.shape[1])], axis=1)
+    between = scale[None, None] * jnp.sum(a_cross[:, :, None] * before_basis[:, None, :], axis=0)
+    return JointDerivatives(
+        before=normal_before,
+        after=normal_after,
+        before_before=-_symmetric_outer(normal_before, toward_after),
+        after_after=-_symmetric_outer(normal_after, toward_before),
+        after_before=between - outer(toward_before, normal_before),
+    )
+
+
+def _squared_curvature(squared_difference: Float[Array, "k"], spacing: Float[Array, "k"]) -> Float[Array, "k"]:
+    return 4 * squared_difference / ((4 - squared_difference) * spacing**2)
+
+
+def _two_derivatives(function, x: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+    """First and second derivative of a function that acts on each number by itself."""
+    ones = jnp.ones_like(x)
+    return jax.jvp(lambda x: jax.jvp(function, (x,), (ones,))[1], (x,), (ones,))
+
+
+def components(basis: Float[Array, "3 2 k"], vectors: Float[Array, "3 k"]) -> Float[Array, "2 k"]:
+    return jnp.sum(basis * vectors[:, None], axis=0)
+
+
+def dot(a: Float[Array, "c k"], b: Float[Array, "c k"]) -> Float[Array, "k"]:
+    return jnp.sum(a * b, axis=0)
+
+
+def cross(a: Float[Array, "3 k"], b: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Array, "2 2 k"]:
+    return a[:, None] * b[None]
+
+
+def _symmetric_outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Array, "2 2 k"]:
+    return (outer(a, b) + outer(b, a)) / 2

@@ -1,0 +1,350 @@
+"""The finite differences in other unknowns: unit tangents of the edges, and the force that runs through the rod.
+
+Under dead loads the force in every edge is known up to one vector, the force at s = L, and that follows from the
+closure of the polyline between two held ends. So an equilibrium is a saddle point of
+
+    L(t, F) = bending(t) + torsion(t) + sum h [w(e) - n . t (1 + e)] + F . span,    n_i = F + loads beyond edge i,
+
+a minimum over tangents t that close the polyline and a maximum over F (Lagrange's multiplier); the axial strain e of an
+edge is the one at which dw/de = n . t. Tension is in n and not in a difference of lengths, so that neither the
+iterations nor the rounding depend on EA: the mixed treatment of stretch (Magisano, Leonetti & Garcea 2017) carried
+through. Steps are rotations, in which bending is nearly quadratic even where new end tangents kink the rod.
+
+A dead moment M on a free end has no potential. There the virtual work M . (rotation of the end) enters the gradient:
+the tangent t turns by t x dt, and the section spins about it by as much as keeps the torque M . t along the rod. Half
+the squared gradient takes the place of the energy.
+
+The second derivatives couple neighbouring edges only, two numbers each; the closure and the torsion, which all edges
+share, are a border of four columns (`linalg.SaddlePointSystem`). Arrays along the rod have the components first.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rodjax.discretization.dead_loads import forces_on_nodes
+from rodjax.discretization.joints import (
+    JointDerivatives,
+    bending_derivatives,
+    components,
+    dot,
+    joints,
+    outer,
+    rotated,
+    tangent_bases,
+    twist_derivatives,
+    with_held_tangents,
+)
+from rodjax.discretization.twist import swept_twist
+from rodjax.energy import axial_strain_under, density
+from rodjax.linalg import SaddlePointSystem
+from rodjax.scene import Scene, dead_end_moment
+from rodjax.supports import Clamp, Directed, Free, Held
+
+# Multiple of eps (4 |n| + 4 N^2) that is taken for the rounding floor of the gradient.
+FLOOR_SAFETY = 4.0
+# Where the gradient is at the tolerance, the polyline must close to this multiple of it: a hundredth, as a bent rod has
+# about 100 EI/L^3 of stiffness; or to so many roundings.
+CLOSURE_TOLERANCE = 0.01
+CLOSURE_ROUNDINGS = 64
+
+
+class MixedPoint(eqx.Module):
+    """Unit tangents of the edges; the force at s = L between held ends, else zero; the total twist [rad], else zero."""
+
+    tangents: Float[Array, "3 n"]
+    end_force: Float[Array, "3"]
+    total_twist: Float[Array, ""]
+
+    def flattened(self, axes: Float[Array, "3 2"]) -> "MixedPoint":
+        """The point without what leaves the plane of these two axes, and without twist."""
+        in_plane = axes.T @ self.tangents
+        sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
+        in_plane = jnp.where(sizes > 0, in_plane / jnp.where(sizes > 0, sizes, 1.0), jnp.eye(2, 1, dtype=sizes.dtype))
+        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist))
+
+
+class Linearization(eqx.Module):
+    """First and second derivatives of L at a point, by rotations of the tangents in `bases`, by F and by the torque.
+
+    `gradient`: by the rotations; `closure`: by F, what the polyline lacks of the span, and a zero for the torque;
+    `residual`: largest force left on a node; `energy`: L, or without a potential half the squared gradient.
+    """
+
+    bases: Float[Array, "3 b n"]
+    gradient: Float[Array, "b n"]
+    closure: Float[Array, "k"]
+    system: SaddlePointSystem
+    energy: Float[Array, ""]
+    residual: Float[Array, ""]
+
+
+class MixedForm(eqx.Module):
+    """A nondimensional scene on a polyline, as a function of a `MixedPoint`.
+
+    `node_forces`: what the loads exert on the nodes; `forces_beyond`: on what lies beyond each edge; `axes`: unit
+    vectors along which the rod may leave its place, `None` for all of space: two for a rod in a plane, its normal for
+    motions out of it. In a symmetric scene the two kinds do not couple.
+    """
+
+    scene: Scene
+    node_forces: Float[Array, "3 n+1"]
+    forces_beyond: Float[Array, "3 n"]
+    axes: Float[Array, "3 a"] | None = None
+
+    @staticmethod
+    def of(scene: Scene, segments: int) -> "MixedForm":
+        forces = forces_on_nodes(scene, segments).T
+        return MixedForm(scene, forces, forces_beyond_edges(scene, forces))
+
+    def along(self, axes: Float[Array, "3 a"]) -> "MixedForm":
+        return MixedForm(self.scene, self.node_forces, self.forces_beyond, axes)
+
+    def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
+        """The directions in which each tangent may turn."""
+        if self.axes is None:
+            return tangent_bases(tangents)
+        if self.axes.shape[1] == 1:
+            return jnp.broadcast_to(self.axes[..., None], (3, 1, tangents.shape[1]))
+        normal = jnp.cross(self.axes[:, 0], self.axes[:, 1])
+        return jnp.cross(jnp.broadcast_to(normal[:, None], tangents.shape), tangents, axis=0)[:, None]
+
+    @property
+    def has_torsion(self) -> bool:
+        """Whether two clamps prescribe the total twist, and the rod may leave a plane."""
+        is_planar = self.axes is not None and self.axes.shape[1] == 2
+        return isinstance(self.scene.start, Clamp) and isinstance(self.scene.end, Clamp) and not is_planar
+
+    @property
+    def has_potential(self) -> bool:
+        return dead_end_moment(self.scene) is None
+
+    def edge_tension(self, point: MixedPoint) -> Float[Array, "n"]:
+        return dot(point.end_force[:, None] + self.forces_beyond, point.tangents)
+
+    def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
+        strain = axial_strain_under(self.scene.rod, self.edge_tension(point))
+        return ((1 + strain)[None] * point.tangents).T / point.tangents.shape[1]
+
+    def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
+        """Nodes along the edges, between held ends to the last digit."""
+        start, end = self.scene.start, self.scene.end
+        if not isinstance(start, Held):
+            assert isinstance(end, Held), "a scene holds at least one position"
+            return jnp.concatenate([end.position[None] - jnp.cumsum(edges[::-1], axis=0)[::-1], end.position[None]])
+        nodes = start.position[None] + jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        if isinstance(end, Held):
+            s = jnp.linspace(0.0, 1.0, len(nodes), dtype=nodes.dtype)[:, None]
+            nodes = (nodes + s * (end.position - nodes[-1])[None]).at[-1].set(end.position)
+        return nodes
+
+    def end_forces(self, point: MixedPoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The section forces at s = 0 and s = L."""
+        total = jnp.sum(self.node_forces, axis=1)
+        for end, sign in ((self.scene.start, -1), (self.scene.end, 1)):
+            if isinstance(end, Free):
+                given = jnp.zeros_like(total) if end.force is None else sign * end.force
+                return (given, -total) if sign < 0 else (total, given)
+        return point.end_force + total, point.end_force
+
+    def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
+        rod = self.scene.rod
+        strain = axial_strain_under(rod, self.edge_tension(point))
+        stretching = jnp.mean(density(rod, axial_strain=strain))
+        bending = joints(self.scene, point.tangents).bending_energy(rod)
+        return bending + stretching + density(rod, twist=point.total_twist)
+
+    def moved(
+        self,
+        point: MixedPoint,
+        bases: Float[Array, "3 b n"],
+        rotation: Float[Array, "b n"],
+        force_change: Float[Array, "3"],
+    ) -> MixedPoint:
+        tangents = rotated(point.tangents, bases, rotation)
+        twist = point.total_twist
+        if self.has_torsion:
+            before, after = (with_held_tangents(self.scene, t) for t in (point.tangents, tangents))
+            twist += swept_twist(before, after)
+        elif not self.has_potential:
+            twist = twist_under_moment(self.scene, tangents)
+        return MixedPoint(tangents, point.end_force + force_change, twist)
+
+    def linearized(self, point: MixedPoint) -> Linearization:
+        scene, rod, tangents = self.scene, self.scene.rod, point.tangents
+        n = tangents.shape[1]
+        h = 1 / n
+        all_joints = joints(scene, tangents)
+        all_bases = self.bases(with_held_tangents(scene, tangents))
+        beside = (all_bases[..., :-1], all_bases[..., 1:])
+        bases = of_edges(scene, all_bases, n)
+        derivatives = bending_derivatives(rod, all_joints, beside)
+        columns, closure, compliance = [], [], []
+        energy = all_joints.bending_energy(rod)
+        torque_column = None
+        if self.has_torsion or not self.has_potential:
+            twist = twist_derivatives(all_joints, beside)
+            torsion, torque, stiffness = _with_derivatives(lambda twist: density(rod, twist=twist), point.total_twist)
+            derivatives = jax.tree.map(lambda bent, twisted: bent + torque * twisted, derivatives, twist)
+            torque_column = by_edges(scene, twist.before, twist.after, n)[:, None]
+            if self.has_torsion:
+                energy += torsion
+                columns.append(torque_column)
+                closure.append(jnp.zeros(1, energy.dtype))
+                compliance.append(1 / stiffness[None, None])
+        gradient, diagonal, lower = assembled(scene, derivatives, n)
+
+        forces = point.end_force[:, None] + self.forces_beyond
+        tension = dot(forces, tangents)
+        strain, softness = jax.jvp(
+            lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
+        )
+        lengths = h * (1 + strain)
+        across = components(bases, forces)
+        gradient -= lengths[None] * across
+        identity = jnp.eye(bases.shape[1], dtype=energy.dtype)[..., None]
+        diagonal += (lengths * tension)[None, None] * identity - (h * softness)[None, None] * outer(across, across)
+        energy += h * jnp.sum(density(rod, axial_strain=strain) - tension * (1 + strain))
+        if isinstance(scene.start, Held) and isinstance(scene.end, Held):
+            span = scene.end.position - scene.start.position
+            energy += jnp.sum(point.end_force * span)
+            lacking = span - tangents @ lengths
+            directions, along = jnp.swapaxes(bases, 0, 1), tangents
+            if self.axes is not None:
+                lacking = lacking @ self.axes
+                directions = jnp.sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
+                along = self.axes.T @ tangents
+            columns.append(-lengths[None, None] * directions - (h * softness)[None, None] * outer(across, along))
+            closure.append(lacking)
+            compliance.append(((h * softness)[None] * along) @ along.T)
+        rows = None
+        moment = dead_end_moment(scene)
+        if moment is not None:
+            edge = 0 if isinstance(scene.start, Free) else n - 1
+            tangent, basis = tangents[:, edge], bases[..., edge]
+            gradient = gradient.at[:, edge].add(-jnp.cross(moment, tangent) @ basis)
+            # The rotation of the last edge changes the torque, and turns the tangent away from the moment: an
+            # antisymmetric block M . t. Half of it goes, as the section spins by the area that a tangent runs round.
+            sign = -1 if edge == 0 else 1
+            spin = jnp.sum(moment * tangent) / 2 * jnp.array([[1.0, 0.0], [0.0, -1.0]], energy.dtype)
+            at_edge = jnp.zeros((2, 2, n), energy.dtype).at[:, :, edge]
+            columns = [torque_column, at_edge.set(spin)]
+            torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
+            rows = jnp.concatenate([torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))], axis=1)
+            closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
+            energy = n * jnp.sum(gradient**2) / 2
+        return Linearization(
+            bases=bases,
+            gradient=gradient,
+            closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
+            system=SaddlePointSystem(
+                diagonal,
+                lower,
+                jnp.concatenate(columns, axis=1) if columns else jnp.zeros((bases.shape[1], 0, n), energy.dtype),
+                jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
+                rows,
+            ),
+            energy=energy,
+            residual=self._residual(jnp.sum(bases * gradient[None], axis=1) / lengths[None]),
+        )
+
+    @property
+    def _closures(self) -> int:
+        """How many of the multipliers are components of the end force: the last ones."""
+        if not held_at_both_ends(self.scene):
+            return 0
+        return 3 if self.axes is None else self.axes.shape[1]
+
+    def closure(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
+        """The part for the end force, of what is given for all multipliers."""
+        return multipliers[len(multipliers) - self._closures :]
+
+    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3"]:
+        """A change of the end force from its components."""
+        if not self._closures:
+            return jnp.zeros(3, closure.dtype)
+        return closure if self.axes is None else self.axes @ closure
+
+    def closure_softness(self, here: Linearization, change: Float[Array, "c"]) -> Float[Array, "c"]:
+        """By how much less the polyline lacks of its span under another end force, the tangents being the same."""
+        first = len(here.closure) - self._closures
+        return here.system.compliance[first:, first:] @ change
+
+    def closure_gradient(self, here: Linearization, change: Float[Array, "c"]) -> Float[Array, "b n"]:
+        """What another end force adds to the gradient by the rotations."""
+        first = len(here.closure) - self._closures
+        return jnp.sum(here.system.border[:, first:] * change[None, :, None], axis=1)
+
+    def _residual(self, edge_forces: Float[Array, "3 n"]) -> Float[Array, ""]:
+        """Largest component of the force on a free node."""
+        beyond = jnp.zeros_like(edge_forces[:, :1])
+        if not isinstance(self.scene.start, Held):
+            edge_forces = jnp.concatenate([beyond, edge_forces], axis=1)
+        if not isinstance(self.scene.end, Held):
+            edge_forces = jnp.concatenate([edge_forces, beyond], axis=1)
+        return jnp.max(jnp.abs(jnp.diff(edge_forces, axis=1)))
+
+    def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
+        """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
+        largest = jnp.max(jnp.abs(point.end_force[:, None] + self.forces_beyond))
+        eps = jnp.finfo(largest.dtype).eps
+        return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * point.tangents.shape[1] ** 2)
+
+    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
+        least = CLOSURE_ROUNDINGS * jnp.finfo(closure.dtype).eps
+        return jnp.all(jnp.abs(closure) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))
+
+
+def twist_under_moment(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
+    """The total twist that a dead moment on the free end raises: its part about the end tangent, constant in s."""
+    moment = dead_end_moment(scene)
+    assert moment is not None
+    sign, edge = (-1, 0) if isinstance(scene.start, Free) else (1, -1)
+    return sign * jnp.sum(moment * tangents[:, edge]) / scene.rod.GJ
+
+
+def held_at_both_ends(scene: Scene) -> bool:
+    return isinstance(scene.start, Held) and isinstance(scene.end, Held)
+
+
+def forces_beyond_edges(scene: Scene, node_forces: Float[Array, "3 n+1"]) -> Float[Array, "3 n"]:
+    """The sum of the forces on the nodes beyond each edge; where the start is free, less all of them."""
+    if isinstance(scene.start, Held):
+        return jnp.cumsum(node_forces[:, :0:-1], axis=1)[:, ::-1]
+    return -jnp.cumsum(node_forces[:, :-1], axis=1)
+
+
+def of_edges(scene: Scene, by_point: Float[Array, "... m"], segments: int) -> Float[Array, "... n"]:
+    """What belongs to the edges, out of something given for them and the tangents held before and after."""
+    first = int(isinstance(scene.start, Directed))
+    return by_point[..., first : first + segments]
+
+
+def by_edges(
+    scene: Scene, before: Float[Array, "... k"], after: Float[Array, "... k"], segments: int
+) -> Float[Array, "... n"]:
+    """Sums over the joints of each edge of what they give to the edges before and after them."""
+    none = jnp.zeros_like(before[..., :1])
+    by_point = jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
+    return of_edges(scene, by_point, segments)
+
+
+def assembled(
+    scene: Scene, derivatives: JointDerivatives, segments: int
+) -> tuple[Float[Array, "b n"], Float[Array, "b b n"], Float[Array, "b b n-1"]]:
+    """Gradient, and the blocks on and below the diagonal of the second derivatives, by the rotations of the edges."""
+    gradient = by_edges(scene, derivatives.before, derivatives.after, segments)
+    diagonal = by_edges(scene, derivatives.before_before, derivatives.after_after, segments)
+    return gradient, diagonal, of_edges(scene, derivatives.after_before, segments - 1)
+
+
+def _with_derivatives(
+    function: Callable[[Float[Array, ""]], Float[Array, ""]], x: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """A function of one number, its first and second derivative."""
+    (value, first), (_, second) = jax.jvp(jax.value_and_grad(function), (x,), (jnp.ones_like(x),))
+    return value, first, second

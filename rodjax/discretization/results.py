@@ -1,0 +1,137 @@
+"""What an equilibrium says at its nodes and ends, from its tangents, the forces on its ends and its total twist."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.joints import (
+    Joints,
+    bending_derivatives,
+    cross,
+    dot,
+    tangent_bases,
+    twist_derivatives,
+)
+from rodjax.discretization.twist import angle_about, transport, transport_along
+from rodjax.rod import Rod
+from rodjax.scene import Scene
+from rodjax.supports import Clamp, Directed, Free, Support
+
+
+class Resultants(eqx.Module):
+    """Names and signs as in `rodjax.Equilibrium`, nondimensional."""
+
+    frames: Float[Array, "n+1 3 3"]
+    curvature: Float[Array, "n+1"]
+    twist: Float[Array, "n+1"]
+    tension: Float[Array, "n+1"]
+    start_force: Float[Array, "3"]
+    start_moment: Float[Array, "3"]
+    end_force: Float[Array, "3"]
+    end_moment: Float[Array, "3"]
+
+
+def resultants(
+    scene: Scene,
+    tangents: Float[Array, "3 n"],
+    edge_tension: Float[Array, "n"],
+    end_forces: tuple[Float[Array, "3"], Float[Array, "3"]],
+    twist: Float[Array, ""],
+) -> Resultants:
+    """Of a polyline of n equal edges with these unit tangents and tensions, under the forces at s = 0 and s = L."""
+    rod = scene.rod
+    n = tangents.shape[1]
+    h = 1 / n
+    start_moment = _end_moment(scene.start, rod, tangents[:, 0], h, rod.GJ * twist, at_start=True)
+    end_moment = _end_moment(scene.end, rod, tangents[:, -1], h, rod.GJ * twist, at_start=False)
+    start_tangent = _end_tangent(scene.start, tangents[:, 0], h)
+    end_tangent = _end_tangent(scene.end, tangents[:, -1], h)
+    inner = tangents[:, :-1] + tangents[:, 1:]
+    inner /= jnp.sqrt(dot(inner, inner))[None]
+    at_nodes = jnp.concatenate([start_tangent[:, None], inner, end_tangent[:, None]], axis=1)
+    inner_joints = Joints(tangents[:, :-1], tangents[:, 1:], jnp.full(n - 1, h, tangents.dtype))
+    squared_curvatures = [
+        _squared(_across(start_moment, start_tangent) / rod.EI)[None],
+        inner_joints.squared_curvature,
+        _squared(_across(end_moment, end_tangent) / rod.EI)[None],
+    ]
+    end_tensions = [jnp.sum(force * t)[None] for force, t in zip(end_forces, (start_tangent, end_tangent), strict=True)]
+    tension = jnp.concatenate([end_tensions[0], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1]])
+    return Resultants(
+        frames=_frames(scene, tangents, at_nodes, twist),
+        curvature=jnp.sqrt(jnp.concatenate(squared_curvatures)),
+        twist=jnp.full(n + 1, twist),
+        tension=tension,
+        start_force=end_forces[0],
+        start_moment=start_moment,
+        end_force=end_forces[1],
+        end_moment=end_moment,
+    )
+
+
+def _end_moment(
+    end: Support, rod: Rod, edge_tangent: Float[Array, "3"], h: float, torque: Float[Array, ""], *, at_start: bool
+) -> Float[Array, "3"]:
+    """The section moment at an end: the derivative of the energy by a rotation of the support, or the given moment."""
+    sign = -1 if at_start else 1
+    if isinstance(end, Free):
+        return jnp.zeros(3, edge_tangent.dtype) if end.moment is None else sign * end.moment
+    if not isinstance(end, Directed):
+        return jnp.zeros(3, edge_tangent.dtype)
+
+    order = (end.tangent, edge_tangent) if at_start else (edge_tangent, end.tangent)
+    before, after = (tangent[:, None] for tangent in order)
+    half_cell = Joints(before, after, jnp.full(1, h / 2, before.dtype))
+    bases = tangent_bases(before), tangent_bases(after)
+    side = "before" if at_start else "after"
+    by_rotation = getattr(bending_derivatives(rod, half_cell, bases), side)
+    spin = jnp.zeros_like(torque)
+    if isinstance(end, Clamp):
+        by_rotation += torque * getattr(twist_derivatives(half_cell, bases), side)
+        spin = torque
+    along = jnp.sum(bases[not at_start] * by_rotation[None], axis=1)
+    return sign * cross(end.tangent[:, None], along)[:, 0] + spin * end.tangent
+
+
+def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float) -> Float[Array, "3"]:
+    """The tangent at an end: prescribed, or that of the edge, turned by what a dead moment bends half an edge."""
+    if isinstance(end, Directed):
+        return end.tangent
+    if isinstance(end, Free) and end.moment is not None:
+        turned = edge_tangent + h / 2 * jnp.cross(end.moment, edge_tangent)
+        return turned / jnp.sqrt(_squared(turned))
+    return edge_tangent
+
+
+def _frames(
+    scene: Scene, edges: Float[Array, "3 n"], nodes: Float[Array, "3 n+1"], twist: Float[Array, ""]
+) -> Float[Array, "n+1 3 3"]:
+    """Material frames at the nodes, from the end that holds the twist (or a choice where none does).
+
+    `edges`, `nodes`: the tangents there. A node's tangent lies on the arc between those of its edges.
+    """
+    start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(nodes[:, 0])
+    along_edges = transport_along(start_d1, jnp.concatenate([nodes[:, :1], edges], axis=1))
+    d1 = transport(along_edges[:, 1:], edges, nodes[:, 1:])
+    d1 = jnp.concatenate([start_d1[:, None], d1], axis=1)
+    angle = twist * jnp.linspace(0.0, 1.0, nodes.shape[1], dtype=twist.dtype)
+    if isinstance(scene.end, Clamp) and not isinstance(scene.start, Clamp):
+        angle += angle_about(nodes[:, -1], d1[:, -1], scene.end.frame[:, 0]) - angle[-1]
+    d2 = cross(nodes, d1)
+    turned = jnp.cos(angle)[None] * d1 + jnp.sin(angle)[None] * d2
+    return jnp.stack([turned, cross(nodes, turned), nodes]).transpose(2, 1, 0)
+
+
+def _any_normal(tangent: Float[Array, "3"]) -> Float[Array, "3"]:
+    axis = jnp.eye(3, dtype=tangent.dtype)[jnp.argmin(jnp.abs(tangent))]
+    normal = jnp.cross(tangent, axis)
+    return normal / jnp.sqrt(_squared(normal))
+
+
+def _across(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The part of `vector` at right angles to the unit `axis`."""
+    return vector - jnp.sum(vector * axis) * axis
+
+
+def _squared(vector: Float[Array, "3"]) -> Float[Array, ""]:
+    return jnp.sum(vector**2)

@@ -1,0 +1,256 @@
+"""Newton's method on the mixed form: independent of mesh and slenderness, and safeguarded to end in a minimum."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import not_negative, plain_number, whole_number
+from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.linalg import factor, factor_and_solve
+from rodjax.status import Status
+
+
+class Newton(eqx.Module):
+    """Newton's method with tangents of the edges and the force through the rod as unknowns.
+
+    A step solves the linearised equilibrium. Where the energy has negative curvature the Hessian is shifted until it
+    has none. A step is shortened until an augmented Lagrangian falls: energy, closure of the polyline and its square.
+
+    **Arguments:**
+
+    - `tolerance`: largest force on a node, in units of EI/L^2, at which a solve has converged. Where the rounding of
+        the mesh does not let it fall so far, that floor is the tolerance, and the status says so.
+    - `max_iterations`: iterations after which a solve is given up.
+    - `max_rotation` [rad]: the most by which a step may turn a tangent; below pi, as the total twist is carried along.
+    """
+
+    tolerance: float = eqx.field(default=1e-8, converter=plain_number("tolerance"))
+    max_iterations: int = 200
+    max_rotation: float = eqx.field(default=1.0, converter=plain_number("max_rotation"))
+
+    def __check_init__(self):
+        not_negative(self.tolerance, "tolerance")
+        whole_number(self.max_iterations, "max_iterations", 1, 10**9)
+        if not 0.0 < self.max_rotation < 3.0:
+            raise ValueError(f"max_rotation must lie between 0 and 3 rad, got {self.max_rotation!r}")
+
+
+# Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
+# a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
+# costs Newton a factor of 1e7 a step instead of quadratic convergence. The softest mode of a clamped rod has pi^2.
+NEUTRAL = 1e-6
+# Where that is not enough, the shift starts with FIRST_SHIFT and grows by SHIFT_GROWTH until the Hessian is definite.
+FIRST_SHIFT = 1.0
+SHIFT_GROWTH = 4.0
+MAX_FACTORS = 30
+# Weight of the squared closure in the augmented Lagrangian [EI/L^3]: about the stiffness of a bent rod.
+CLOSURE_WEIGHT = 100.0
+# A step is accepted when this fraction of the fall that its slope promises comes true, up to the rounding of energies.
+SUFFICIENT_DECREASE = 1e-4
+ENERGY_ROUNDING = 1e-9
+MAX_HALVINGS = 20
+# A saddle, such as a planar shape in a symmetric scene, is left along its negative curvature by a push of this size
+# [rad], at most so many times. A search that fails within STAGNATION times the rounding floor has met that floor.
+PUSH = 0.03
+MAX_PUSHES = 5
+STAGNATION = 10.0
+
+
+class NewtonMinimum(eqx.Module):
+    """Where the method stopped. `is_stable`: whether the energy has no negative curvature there."""
+
+    point: MixedPoint
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    status: Int[Array, ""]
+    is_stable: Bool[Array, ""]
+
+
+class _State(eqx.Module):
+    # The last accepted point, and the step from it.
+    point: MixedPoint
+    bases: Float[Array, "3 b n"]
+    residual: Float[Array, ""]
+    shift: Float[Array, ""]
+    rotation: Float[Array, "b n"]
+    force_change: Float[Array, "3"]
+    # The augmented Lagrangian at the point with the new force, its slope along the step, and the fraction of it to try.
+    weight: Float[Array, ""]
+    merit: Float[Array, ""]
+    slope: Float[Array, ""]
+    step: Float[Array, ""]
+    halvings: Int[Array, ""]
+    restart: Bool[Array, ""]  # the next trial is the point itself
+    is_pushed: Bool[Array, ""]  # the step leaves a saddle, and is not judged
+    pushes: Int[Array, ""]
+    iterations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    status: Int[Array, ""]
+    is_stable: Bool[Array, ""]
+
+
+def is_stable(form: MixedForm, point: MixedPoint) -> Bool[Array, ""]:
+    """Whether the energy has no negative curvature at an equilibrium, neutral modes apart."""
+    shift = jnp.asarray(NEUTRAL / point.tangents.shape[1], point.tangents.dtype)
+    return factor(form.linearized(point).system.shifted(shift)).is_minimum
+
+
+def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMinimum:
+    """The stable equilibrium reached from `point`.
+
+    One loop, one evaluation of all derivatives a turn: the trial is accepted, factorised and gives the next step, or
+    the step is halved.
+    """
+    dtype = point.tangents.dtype
+    h = 1 / point.tangents.shape[1]
+
+    def turn(state: _State) -> _State:
+        rotation = state.step * state.rotation
+        moved = form.moved(state.point, state.bases, rotation, state.force_change)
+        trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
+        linearization = form.linearized(trial)
+        closure = form.closure(linearization.closure)
+        merit = linearization.energy + state.weight / 2 * jnp.sum(closure**2)
+        promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
+        bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
+        state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
+        return jax.lax.cond(
+            state.restart | state.is_pushed | (merit <= bound),
+            lambda: advanced(state, trial, linearization),
+            lambda: shortened(state),
+        )
+
+    def advanced(state: _State, point: MixedPoint, here: Linearization) -> _State:
+        iterations = state.iterations + jnp.where(state.restart, 0, 1)
+        floor = form.rounding_floor(point)
+        balanced = jnp.where(here.residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
+        balanced = jnp.where(here.residual <= solver.tolerance, Status.CONVERGED, balanced)
+        # Just above the floor, steps that no longer help show that it is reached.
+        stagnates = ~state.restart & (here.residual > state.residual / 2) & (here.residual <= STAGNATION * floor)
+        balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
+        balanced = jnp.where(form.is_closed(here.closure, solver.tolerance), balanced, Status.RUNNING)
+        is_balanced = balanced != Status.RUNNING
+
+        # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
+        least = jnp.asarray(NEUTRAL, dtype)
+        first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
+        may_push = (state.pushes == 0) | is_balanced
+        pattern = jnp.sum(here.bases * _generic_field(point.tangents)[:, None], axis=0)
+
+        def is_indefinite(attempt) -> Bool[Array, ""]:
+            _, is_definite, _, _, count = attempt
+            return ~is_definite & (count < MAX_FACTORS)
+
+        def solved(attempt):
+            shift, _, _, _, count = attempt
+            shift = jnp.where(count == 0, first, jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT))
+            push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
+            factors, rotation, multipliers = factor_and_solve(
+                here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure
+            )
+            return shift, factors.is_minimum, rotation, multipliers, count + 1
+
+        attempt = (
+            first,
+            jnp.array(False),
+            jnp.zeros_like(here.gradient),
+            jnp.zeros_like(here.closure),
+            jnp.zeros((), int),
+        )
+        shift, is_definite, rotation, multipliers, _ = jax.lax.while_loop(is_indefinite, solved, attempt)
+        is_stable = is_definite & (shift <= least)
+        is_pushed = is_definite & ~is_stable & may_push
+        force_change = form.closure(multipliers)
+        largest = jnp.max(jnp.abs(rotation))
+
+        # With the new force in place of the old one; L is quadratic in the force, up to the curvature of w.
+        softness = form.closure_softness(here, force_change)
+        closure = form.closure(here.closure)
+        energy = here.energy + jnp.sum(force_change * (closure - softness / 2))
+        closure -= softness
+        squared = jnp.sum(closure**2)
+        along = jnp.sum(rotation * (here.gradient + form.closure_gradient(here, force_change)))
+        if not form.has_potential:  # the "energy" is a sum of squares that a Newton step makes vanish
+            along = -2 * energy
+        weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(squared > 0, squared, jnp.inf))
+
+        status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
+        has_saddle = is_balanced & ~is_stable & (state.pushes >= MAX_PUSHES)
+        status = jnp.where(has_saddle, Status.SADDLE, status)
+        status = jnp.where(is_balanced & is_stable, balanced, status)
+        # A zero-iteration solve ends before its step is known to be finite, or needed.
+        is_finite = jnp.isfinite(here.residual + here.energy)
+        status = jnp.where(is_finite & (is_definite | is_balanced), status, Status.NOT_FINITE)
+        return _State(
+            point=point,
+            bases=here.bases,
+            residual=here.residual,
+            shift=shift,
+            rotation=rotation,
+            force_change=form.force_change(force_change),
+            weight=weight,
+            merit=energy + weight / 2 * squared,
+            slope=along - weight * squared,
+            step=jnp.minimum(1.0, solver.max_rotation / largest),
+            halvings=jnp.zeros((), int),
+            restart=jnp.array(False),
+            is_pushed=is_pushed,
+            pushes=state.pushes + jnp.where(is_pushed, 1, 0),
+            iterations=iterations,
+            evaluations=state.evaluations,
+            status=status.astype(int),
+            is_stable=is_stable,
+        )
+
+    def shortened(state: _State) -> _State:
+        halvings = state.halvings + 1
+        stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
+        reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
+        failed = halvings > MAX_HALVINGS
+        return eqx.tree_at(
+            lambda state: (state.step, state.halvings, state.status),
+            state,
+            (state.step / 2, halvings, jnp.where(failed, reason, state.status).astype(int)),
+        )
+
+    zero = jnp.zeros((), dtype)
+    bases = form.bases(point.tangents)
+    count = jnp.zeros((), int)
+    no = jnp.array(False)
+    state = _State(
+        point=point,
+        bases=bases,
+        residual=zero,
+        shift=zero,
+        rotation=jnp.zeros(bases.shape[1:], dtype),
+        force_change=jnp.zeros(3, dtype),
+        weight=zero,
+        merit=zero,
+        slope=zero,
+        step=zero,
+        halvings=count,
+        restart=jnp.array(True),
+        is_pushed=no,
+        pushes=count,
+        iterations=count,
+        evaluations=count,
+        status=jnp.full((), Status.RUNNING, int),
+        is_stable=no,
+    )
+    state = jax.lax.while_loop(lambda state: state.status == Status.RUNNING, turn, state)
+    return NewtonMinimum(
+        point=state.point,
+        residual=state.residual,
+        iterations=state.iterations,
+        evaluations=state.evaluations,
+        status=state.status,
+        is_stable=state.is_stable & form.has_potential,
+    )
+
+
+def _generic_field(tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Directions along the rod that no symmetry of a scene shares."""
+    s = jnp.linspace(0.0, 1.0, tangents.shape[1], dtype=tangents.dtype)
+    return jnp.stack([jnp.cos(1.0 + 2.0 * s), jnp.sin(2.0 + 3.0 * s), jnp.cos(3.0 + s)])

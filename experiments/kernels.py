@@ -37,11 +37,12 @@ from rodjax.discretization.joints import (
 )
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
-from rodjax.equilibrium import Found, equilibrium, first_state
+from rodjax.equilibrium import Found, SolverState, equilibrium, first_state
 from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
 from rodjax.path import stack_scenes
 from rodjax.plane import plane
 from rodjax.scene import nondimensional
+from rodjax.status import Outcome
 from rodjax.strain import swept_angle
 
 LOOPS = 300
@@ -141,7 +142,8 @@ def kernels(segments: int) -> Iterator[Kernel]:
     yield Kernel(MOVED, lambda form, given: form.moved(*given), at.form, (at.point, *step))
     yield Kernel("resultants", at_nodes, at.form, at.point)
     count = jnp.zeros((), int)
-    found = Found(at.polyline, at.point, jnp.zeros(()), count, count, count, jnp.array(True))
+    state = SolverState(at.polyline, at.point.end_force, nondimensional(at.scene)[1])
+    found = Found(state, at.point, Outcome(jnp.zeros(()), count, count, count), jnp.array(True))
     yield Kernel("resultants, energies, SI units", in_units, at.scene, found)
 
     free = given["bending and stretch"]
@@ -176,7 +178,7 @@ def at_nodes(form: MixedForm, point: MixedPoint):
 
 
 def in_units(scene: Scene, found: Found):
-    return equilibrium(scene, found, nondimensional(scene)[1], jnp.ones((), int))
+    return equilibrium(scene, found, jnp.ones((), int))
 
 
 def written_out(form: MixedForm, point: MixedPoint):

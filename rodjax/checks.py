@@ -82,7 +82,9 @@ def direction(value: Any, name: str) -> Float[Numbers, "3"]:
     if is_known(array) and not np.any(array):
         raise ValueError(f"{name} must be a direction, got the zero vector")
     xp = namespace(array)
-    return xp.asarray(array) / xp.linalg.norm(array)
+    array = xp.asarray(array)
+    array = array / xp.max(xp.abs(array))  # squares of very small or large numbers would leave the range
+    return array / xp.linalg.norm(array)
 
 
 def rotation(value: Any, name: str) -> Float[Numbers, "3 3"]:

@@ -17,11 +17,11 @@ from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
 from rodjax.guess import Guess, cubic, first_shape, resampled
-from rodjax.plane import check_planar, plane
+from rodjax.plane import check_planar, is_planar, plane
 from rodjax.scene import Scene, dead_end_moment, nondimensional
 from rodjax.solvers.newton import Newton, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
-from rodjax.status import Status, is_converged
+from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -189,10 +189,11 @@ def checked_options(
     instance(solver, "solver", typing.get_args(Solver))
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
+    instance(planar, "planar", bool)
     if planar:
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton where planar is True")
-        check_planar(scene)
+        check_planar(scene, 0.0 if guess is None else guess.total_twist)
     return segments, solver
 
 
@@ -215,40 +216,34 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, segments: int) 
 class Found(eqx.Module):
     """Where a solver stopped, nondimensional."""
 
-    polyline: Polyline
+    state: SolverState
     point: MixedPoint
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    evaluations: Int[Array, ""]
-    status: Int[Array, ""]
+    outcome: Outcome
     is_stable: Bool[Array, ""]
 
 
-def solve_from(
-    scene: Scene, state: SolverState, twist: Float[Array, ""], solver: Solver, planar: bool
-) -> tuple[Found, Units]:
+def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver: Solver, planar: bool) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     scaled, units = nondimensional(scene)
-    polyline = _in_units(state, units)
-    end_force = state.end_force * (state.units.force / units.force)
-    return _found(scaled, polyline, end_force, twist, solver=solver, planar=planar), units
+    return _found(scaled, _in_units(state, units), twist, solver=solver, planar=planar)
 
 
-def equilibrium(scene: Scene, found: Found, units: Units, substeps: Int[Array, ""]) -> Equilibrium:
+def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
     """What a solver found, in SI units."""
     scaled, _ = nondimensional(scene)
-    n = len(found.polyline.edges)
+    point, outcome, units = found.point, found.outcome, found.state.units
+    polyline = found.state.polyline
+    n = len(polyline.edges)
     form = MixedForm.of(scaled, n)
-    point = found.point
     results = resultants(scaled, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
     elastic_energy = form.elastic_energy(point)
-    loads = load_energy(scaled, found.polyline.nodes)
+    loads = load_energy(scaled, polyline.nodes)
     potential = elastic_energy if loads is None else elastic_energy + loads
     fraction = jnp.linspace(0.0, 1.0, n + 1, dtype=elastic_energy.dtype)
-    converged = is_converged(found.status)
+    converged = is_converged(outcome.status)
     return Equilibrium(
         s=fraction * scene.rod.length,
-        nodes=units.origin[None] + units.length * found.polyline.nodes,
+        nodes=units.origin[None] + units.length * polyline.nodes,
         frames=results.frames,
         curvature=results.curvature / units.length,
         twist=results.twist / units.length,
@@ -262,59 +257,45 @@ def equilibrium(scene: Scene, found: Found, units: Units, substeps: Int[Array, "
         end_moment=results.end_moment * units.energy,
         converged=converged,
         stable=converged & found.is_stable,
-        status=found.status,
-        iterations=found.iterations,
-        evaluations=found.evaluations,
+        status=outcome.status,
+        iterations=outcome.iterations,
+        evaluations=outcome.evaluations,
         substeps=substeps,
-        residual=found.residual,
+        residual=outcome.residual,
         radius=scene.rod.radius,
-        state=SolverState(found.polyline, point.end_force, units),
+        state=found.state,
     )
 
 
 @eqx.filter_custom_jvp
-def _found(
-    scene: Scene,
-    guess: Polyline,
-    end_force: Float[Array, "3"],
-    twist: Float[Array, ""],
-    *,
-    solver: Solver,
-    planar: bool,
-) -> Found:
-    problem, start = FiniteDifference.begin(scene, guess, twist)
+def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver: Solver, planar: bool) -> Found:
+    problem, start = FiniteDifference.begin(scene, guess.polyline, twist)
     form = MixedForm.of(scene, len(start.edges))
     if isinstance(solver, NonlinearCG):
         minimum = minimize(problem, start, solver)
         point = minimum.problem.mixed_point(minimum.point)
-        polyline, stable = minimum.point, is_stable(form, point)
+        polyline, stable, outcome = minimum.point, is_stable(form, point), minimum.outcome
     else:
-        begin = eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
+        begin = eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
         normal = None
         if planar:
             normal, axes = plane(scene, begin.tangents)
             begin = begin.flattened(axes)
             form = form.along(axes)
         minimum = find_minimum(form, begin, solver)
-        point = minimum.point
+        point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
         edges = form.edges(point)
         # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
         change = jnp.max(jnp.abs(edges - start.edges)) * len(edges)
-        is_start = (minimum.iterations == 0) & (change <= SAME_EDGES * jnp.finfo(edges.dtype).eps)
+        is_start = (outcome.iterations == 0) & (change <= SAME_EDGES * jnp.finfo(edges.dtype).eps)
         reached = Polyline(form.nodes(edges), edges)
         polyline = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
-        stable = minimum.is_stable
         if normal is not None:
             stable &= is_stable(form.along(normal[:, None]), point)
-    return Found(
-        polyline=polyline,
-        point=point,
-        residual=minimum.residual,
-        iterations=minimum.iterations,
-        evaluations=minimum.evaluations,
-        status=minimum.status,
-        is_stable=stable,
-    )
+            # Inside a user's own jit the scene could not be checked before.
+            status = jnp.where(is_planar(scene, twist), outcome.status, Status.NOT_PLANAR)
+            outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
+    return Found(SolverState(polyline, point.end_force, guess.units), point, outcome, stable)
 
 
 @_found.def_jvp
@@ -330,14 +311,15 @@ def _no_derivative(primals, tangents, *, solver: Solver, planar: bool):
 @functools.partial(jax.jit, static_argnames=("segments", "solver", "planar"))
 def _solve(scene: Scene, guess: Guess | Equilibrium | None, segments: int, solver: Solver, planar: bool) -> Equilibrium:
     state, twist = first_state(scene, guess, segments)
-    return equilibrium(scene, *solve_from(scene, state, twist, solver, planar), jnp.ones((), int))
+    return equilibrium(scene, solve_from(scene, state, twist, solver, planar), jnp.ones((), int))
 
 
-def _in_units(state: SolverState, units: Units) -> Polyline:
+def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     ratio = state.units.length / units.length
     shift = (state.units.origin - units.origin) / units.length
-    return Polyline(state.polyline.nodes * ratio + shift[None], state.polyline.edges * ratio)
+    polyline = Polyline(state.polyline.nodes * ratio + shift[None], state.polyline.edges * ratio)
+    return SolverState(polyline, state.end_force * (state.units.force / units.force), units)
 
 
 def _slopes(nodes: Float[Array, "n+1 3"], tangents: Float[Array, "n+1 3"]) -> Float[Array, "n+1 3"]:

@@ -11,7 +11,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, leaf, namespace
-from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Equilibrium,
@@ -26,8 +25,7 @@ from rodjax.equilibrium import (
 )
 from rodjax.guess import Guess
 from rodjax.scene import Scene, between, nondimensional
-from rodjax.status import is_converged
-from rodjax.units import Units
+from rodjax.status import Outcome, is_converged
 
 # A step is halved at most so often, to a sixty-fourth of it.
 MAX_SPLITS = 6
@@ -111,18 +109,17 @@ def _solve_path(
     def step(carry, numbered):
         last, before, bar = carry
         number, scene = numbered
-        found, units, substeps = _step(last, before, scene, solver, planar, may_split=number > 0)
+        found, substeps = _step(last, before, scene, solver, planar, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        reached = _Station(scene, SolverState(found.polyline, found.point.end_force, units), found.point.total_twist)
-        return (reached, last, bar), (found, units, substeps)
+        return (_Station(scene, found.state, found.point.total_twist), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
     start = _Station(first, state, twist)
-    (_, _, bar), (found, units, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
+    (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return jax.vmap(equilibrium)(scenes, found, units, substeps)
+    return jax.vmap(equilibrium)(scenes, found, substeps)
 
 
 class _Station(eqx.Module):
@@ -144,22 +141,20 @@ class _Progress(eqx.Module):
     is_last_try: Bool[Array, ""]
     solves: Int[Array, ""]
     found: Found
-    units: Units
     is_finished: Bool[Array, ""]
 
 
 def _step(
     last: _Station, before: _Station, scene: Scene, solver: Solver, planar: bool, *, may_split: Bool[Array, ""]
-) -> tuple[Found, Units, Int[Array, ""]]:
+) -> tuple[Found, Int[Array, ""]]:
     """The equilibrium of a scene from the last one, at once or by way of scenes between the two; solves it took."""
 
     def attempt(progress: _Progress) -> _Progress:
         target = jnp.minimum(progress.fraction + progress.share, 1.0)
         here = jax.lax.cond(target < 1.0, lambda: between(last.scene, scene, target), lambda: scene)
-        found, units = solve_from(here, progress.begin, progress.total_twist, solver, planar)
-        converged = is_converged(found.status)
-        state = SolverState(found.polyline, found.point.end_force, units)
-        reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), state, progress.reached)
+        found = solve_from(here, progress.begin, progress.total_twist, solver, planar)
+        converged = is_converged(found.outcome.status)
+        reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
         is_smallest = progress.share <= 0.5**MAX_SPLITS
         return _Progress(
             reached=reached,
@@ -170,11 +165,13 @@ def _step(
             is_last_try=~converged & is_smallest,
             solves=progress.solves + 1,
             found=eqx.tree_at(
-                lambda found: (found.iterations, found.evaluations),
+                lambda found: (found.outcome.iterations, found.outcome.evaluations),
                 found,
-                (progress.found.iterations + found.iterations, progress.found.evaluations + found.evaluations),
+                (
+                    progress.found.outcome.iterations + found.outcome.iterations,
+                    progress.found.outcome.evaluations + found.outcome.evaluations,
+                ),
             ),
-            units=units,
             is_finished=(target >= 1.0) & (converged | progress.is_last_try | ~may_split),
         )
 
@@ -189,12 +186,11 @@ def _step(
         share=jnp.ones_like(zero),
         is_last_try=no,
         solves=count,
-        found=Found(last.state.polyline, nowhere, zero, count, count, count, no),
-        units=last.state.units,
+        found=Found(last.state, nowhere, Outcome(zero, count, count, count), no),
         is_finished=no,
     )
     progress = jax.lax.while_loop(lambda progress: ~progress.is_finished, attempt, progress)
-    return progress.found, progress.units, progress.solves
+    return progress.found, progress.solves
 
 
 def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
@@ -207,15 +203,10 @@ def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
     goes_on = is_aligned & (ratio < MOST_EXTRAPOLATION)
     ratio = jnp.where(goes_on, ratio, 0.0)
 
-    state, edges = last.state, last.state.polyline.edges
-    lengths = jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
-    older = before.state.polyline.edges
-    tangents = edges / lengths
-    tangents += ratio * (tangents - older / jnp.sqrt(jnp.sum(older**2, axis=1, keepdims=True)))
-    edges = tangents * (lengths / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True)))
-    nodes = state.polyline.nodes[:1] + jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+    state = last.state
+    polyline = state.polyline.extrapolated(before.state.polyline, ratio)
     force = before.state.end_force * (before.state.units.force / state.units.force)
-    predicted = SolverState(Polyline(nodes, edges), state.end_force + ratio * (state.end_force - force), state.units)
+    predicted = SolverState(polyline, state.end_force + ratio * (state.end_force - force), state.units)
     return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), predicted, state)
 
 

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import is_known
 from rodjax.scene import Scene, dead_end_moment
@@ -39,12 +39,33 @@ def _normal_to(lead: Float[Array, "3"], directions: Float[Array, "k 3"]) -> Floa
     return normals[jnp.argmax(jnp.sum(normals**2, axis=1))]
 
 
-def check_planar(scene: Scene) -> None:
-    """Raises `ValueError` where a scene, or one of a stack of them, is not symmetric to a plane, as far as is known."""
+def is_planar(scene: Scene, twist: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a scene is symmetric to a plane, and the total twist to stay near to [rad] nearer to none than to 2 pi.
+
+    What `check_planar` tells of its structure is left out.
+    """
+    leaving, twisting = _asymmetry(scene)
+    is_untwisted = jnp.abs(twist) < jnp.pi
+    if not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
+        is_untwisted = jnp.ones_like(is_untwisted)
+    return (leaving <= TOLERANCE) & (twisting <= TOLERANCE) & is_untwisted
+
+
+def check_planar(scene: Scene, twist: Float[Array, "..."] | float) -> None:
+    """Raises `ValueError` where a scene, or one of a stack of them, is not symmetric to a plane, as far as is known.
+
+    `twist`: the total twist of the guess [rad].
+    """
     if dead_end_moment(scene) is not None:
         raise ValueError("planar must be False for a moment on a free end")
     if scene.turns is not None:
         raise ValueError("planar must be False for a scene with turns: a twisted rod leaves the plane")
+    has_torsion = isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)
+    if has_torsion and is_known(twist) and not np.max(np.abs(twist)) < np.pi:
+        raise ValueError(
+            f"planar must be False for a guess with turns, got a total twist of {np.max(np.abs(twist)):.3g} rad: "
+            "a twisted rod leaves the plane"
+        )
     if not is_known(scene):
         return
     leaving, twisting = (jax.vmap(_asymmetry) if scene.rod.length.ndim else _asymmetry)(scene)

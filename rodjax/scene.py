@@ -125,6 +125,11 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     return eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
 
 
+def held_at_both_ends(scene: Scene) -> bool:
+    """Whether the positions of both ends are given."""
+    return isinstance(scene.start, Held) and isinstance(scene.end, Held)
+
+
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
     """The dead moment on a free end, if there is one."""
     for end in (scene.start, scene.end):

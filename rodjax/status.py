@@ -2,7 +2,8 @@
 
 import enum
 
-from jaxtyping import Array, Bool, Int
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
 
 
 class Status(enum.IntEnum):
@@ -15,6 +16,7 @@ class Status(enum.IntEnum):
     NOT_FINITE = 4
     RUNNING = 5
     SADDLE = 6
+    NOT_PLANAR = 7
 
     @property
     def message(self) -> str:
@@ -26,7 +28,17 @@ class Status(enum.IntEnum):
             Status.NOT_FINITE: "not converged: the energy or its gradient is not a finite number",
             Status.RUNNING: "not finished",
             Status.SADDLE: "not converged: an equilibrium was found that is not a minimum, and no way down from it",
+            Status.NOT_PLANAR: "not converged: planar is True, but supports, loads or twist leave the plane",
         }[self]
+
+
+class Outcome(eqx.Module):
+    """How a solver ended: the largest force left, iterations, evaluations of energy and gradient, and a `Status`."""
+
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    status: Int[Array, ""]
 
 
 def is_converged(status: Int[Array, "..."]) -> Bool[Array, "..."]:

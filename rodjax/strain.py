@@ -4,19 +4,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def stretch(dphi: Float[Array, "3"]) -> Float[Array, ""]:
-    """|phi'| [1]."""
-    return jnp.sqrt(jnp.sum(dphi * dphi))
-
-
-def axial_strain(dphi: Float[Array, "3"]) -> Float[Array, ""]:
+def axial_strain(dphi: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """|phi'| - 1 [1], eq. (5) of Linn & Stephan (2008)."""
-    return stretch(dphi) - 1
+    return jnp.sqrt(jnp.sum(dphi * dphi, axis=-1)) - 1
 
 
-def curvature(dphi: Float[Array, "3"], ddphi: Float[Array, "3"]) -> Float[Array, "3"]:
-    """t x t' = phi' x phi'' / |phi'|^2 [1/m], the bending strain of eq. (3) of Linn & Stephan (2008)."""
-    return jnp.cross(dphi, ddphi) / jnp.sum(dphi * dphi)
+def squared_curvature_between(
+    squared_difference: Float[Array, "*k"], spacing: Float[Array, "*k"]
+) -> Float[Array, "*k"]:
+    """|t x t'|^2 [1/m^2] from the squared difference of two unit tangents: (2 tan(a/2)/h)^2 for the angle a.
+
+    The bending strain of eq. (3) of Linn & Stephan (2008) by central differences. It grows beyond bounds as the
+    tangents turn against each other, so that a rod has no way through a fold.
+    """
+    return 4 * squared_difference / ((4 - squared_difference) * spacing**2)
 
 
 def swept_angle(

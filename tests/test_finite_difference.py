@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import GRAVITY, ORIGIN, loaded_scenes
 from scipy.spatial.transform import Rotation
 
 from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
@@ -11,21 +12,6 @@ from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.scene import nondimensional
 
 N = 8
-GRAVITY = (0.0, 3.0, -9.81)
-ORIGIN = (0.0, 0.0, 0.0)
-
-
-def scenes() -> dict[str, Scene]:
-    rod = problems.cable(20.0)
-    clamp, other = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.5, 0.2, 0.0), frame((1, 1, 1)))
-    load = [PointForce(0.43, (0.1, 0.0, 0.2))]
-    EI = float(rod.EI)
-    return {
-        "clamps": Scene(rod, clamp, other, GRAVITY, load),
-        "clamp-swivel": Scene(rod, clamp, Swivel((0.5, 0.2, 0.0), (1, 1, 1))),
-        "pins": Scene(rod, Pin(ORIGIN), Pin((0.5, 0.2, 0.0)), GRAVITY),
-        "cantilever": Scene(rod, clamp, Free(force=(0.0, EI, 2 * EI)), point_forces=load),
-    }
 
 
 def begin(scene: Scene, seed: int = 0) -> tuple[FiniteDifference, Polyline]:
@@ -39,7 +25,7 @@ def begin(scene: Scene, seed: int = 0) -> tuple[FiniteDifference, Polyline]:
 
 @pytest.mark.parametrize("name", ["clamps", "clamp-swivel", "pins", "cantilever"])
 def test_gradient_is_the_derivative_of_the_energy(name):
-    problem, polyline = begin(scenes()[name])
+    problem, polyline = begin(loaded_scenes()[name])
     _, gradient = jax.jit(lambda polyline: problem.energy_and_gradient(polyline))(polyline)
     energy = jax.jit(lambda displacement: problem.energies(problem.moved(polyline, displacement)).total)
     step = 1e-6
@@ -61,7 +47,7 @@ def last_frame_without_twist(frame, polyline: Polyline) -> np.ndarray:
 
 
 def test_total_twist_is_that_of_carried_frames():
-    problem, polyline = begin(scenes()["clamps"])
+    problem, polyline = begin(loaded_scenes()["clamps"])
     for seed in range(3):
         noise = 0.003 * np.random.default_rng(seed).normal(size=(N - 1, 3))
         moved = problem.moved(polyline, jnp.asarray(noise))
@@ -79,7 +65,7 @@ def test_total_twist_is_that_of_carried_frames():
 
 
 def test_energy_is_invariant_under_rigid_motions():
-    scene = scenes()["clamps"]
+    scene = loaded_scenes()["clamps"]
     scene = Scene(scene.rod, scene.start, scene.end, turns=1)
     turn = Rotation.from_rotvec([0.3, -1.2, 0.8]).as_matrix()
     shift = np.array([3.0, -2.0, 1.0])

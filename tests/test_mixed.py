@@ -5,36 +5,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import GRAVITY, ORIGIN, loaded_scenes
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
-from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
+from rodjax import Clamp, Free, PointForce, Scene, Swivel, frame, problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
-from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint, twist_under_moment
-from rodjax.discretization.twist import transport_along
+from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.discretization.twist import transport_along, twist_under_moment
 from rodjax.linalg import SaddlePointSystem
 from rodjax.scene import nondimensional
 
 N = 4
-GRAVITY = (0.0, 3.0, -9.81)
-ORIGIN = (0.0, 0.0, 0.0)
-
-
-def scenes() -> dict[str, Scene]:
-    """A thick rod, so that stretch matters."""
-    rod = problems.cable(20.0)
-    clamp, other = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.5, 0.2, 0.0), frame((1, 1, 1)))
-    load = [PointForce(0.43, (0.1, 0.0, 0.2))]
-    EI = float(rod.EI)
-    return {
-        "clamps": Scene(rod, clamp, other, GRAVITY, load),
-        "clamp-swivel": Scene(rod, clamp, Swivel((0.5, 0.2, 0.0), (1, 1, 1))),
-        "pins": Scene(rod, Pin(ORIGIN), Pin((0.5, 0.2, 0.0)), GRAVITY),
-        "cantilever": Scene(rod, clamp, Free(force=(0.0, EI, 2 * EI)), point_forces=load),
-        "free start": Scene(rod, Free(), other, GRAVITY),
-        "end moment": Scene(rod, clamp, Free(force=(0.0, EI, 0.0), moment=(EI, 2 * EI, -EI))),
-        "start moment": Scene(rod, Free(moment=(EI, 2 * EI, -EI)), other, GRAVITY),
-    }
 
 
 POTENTIAL = ["clamps", "clamp-swivel", "pins", "cantilever", "free start"]
@@ -43,7 +25,7 @@ MOMENT = ["end moment", "start moment"]
 
 def begin(name: str) -> tuple[MixedForm, MixedPoint]:
     """A rough helix under some force; the total twist about 4 rad where the scene has torsion."""
-    scene, _ = nondimensional(scenes()[name])
+    scene, _ = nondimensional(loaded_scenes()[name])
     form = MixedForm.of(scene, N)
     s = (np.arange(N) + 0.5) / N
     tangents = np.stack([np.cos(2 * s), np.sin(4 * s), 1 - s]) + 0.3 * np.random.default_rng(0).normal(size=(3, N))
@@ -168,7 +150,7 @@ def test_transport_along_is_that_by_rotations():
 @pytest.fixture(scope="module", params=POTENTIAL)
 def solved(request) -> tuple[MixedForm, FiniteDifference, Polyline, MixedPoint]:
     """A scene solved to its rounding floor, in both unknowns."""
-    scene = scenes()[request.param]
+    scene = loaded_scenes()[request.param]
     result = rj.solve(scene, segments=N, solver=rj.Newton(tolerance=0.0))
     assert result.converged
     scaled, _ = nondimensional(scene)

@@ -7,6 +7,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
+from rodjax.solvers import newton
 
 # The twisting moment M L/EI up to which a rod between two clamps stays straight: smallest root of tan(M/2) = M/2.
 GREENHILL = 8.986819
@@ -105,6 +106,17 @@ def test_a_thin_rod_pulled_by_a_tenth_converges_to_its_rounding_floor(slendernes
     assert result.iterations <= 10
     # The tension is as good as the closure, which the last steps square.
     np.testing.assert_allclose(result.tension, 0.1 * float(rod.EA), rtol=1e-9)
+
+
+def test_a_saddle_that_is_not_left_is_flagged(monkeypatch):
+    """Without the pushes off a saddle; a mesh that no other test compiles, since they are part of the program."""
+    monkeypatch.setattr(newton, "MAX_PUSHES", 0)
+    ends = [Clamp((x, 0, 0), frame((1, 0, 0))) for x in (0.0, 0.9)]
+    with pytest.warns(rj.NotConvergedWarning, match="an equilibrium was found that is not a minimum"):
+        result = rj.solve(Scene(problems.cable(), *ends), segments=13, guess=rj.Guess([[0, 0, 0], [0.9, 0, 0]]))
+    assert result.status == rj.Status.SADDLE
+    assert not result.converged
+    assert not result.stable
 
 
 # --- options and flags -----------------------------------------------------------------------------------------------

@@ -188,7 +188,28 @@ def test_directions_typed_to_six_digits_lie_in_the_plane():
     tangent = (0.707107, 0.000001, 0.707107)
     scene = Scene(ROD, START, Clamp((0.8, 0, 0), frame(tangent)), DOWN)
     np.testing.assert_allclose(abs(plane(scene)[0]), [0, 1, 0], atol=1e-5)  # the last digit of the tangent
-    check_planar(scene)
+    check_planar(scene, 0.0)
+
+
+def test_a_guess_with_turns_is_refused():
+    guess = rj.Guess(problems.figure_1_start().points, total_twist=2 * np.pi)
+    with pytest.raises(ValueError, match="planar must be False for a guess with turns"):
+        rj.solve(SCENES["omega"], guess=guess, planar=True)
+
+
+def test_planar_must_be_true_or_false():
+    with pytest.raises(TypeError, match="planar must be a bool, got 'yes'"):
+        rj.solve(SCENES["omega"], planar="yes")  # type: ignore[arg-type]
+
+
+def test_inside_jit_a_scene_that_leaves_the_plane_is_flagged():
+    """Where no error can be raised. One program: the first scene lies in the plane, the second does not."""
+    solve = jax.jit(lambda scene: rj.solve(scene, segments=SEGMENTS, planar=True))
+    assert solve(problems.omega(0.6, 0.0)).converged
+    result = solve(problems.omega(0.6, 0.3))
+    assert result.status == rj.Status.NOT_PLANAR
+    assert not result.converged
+    assert not result.stable
 
 
 def test_nonlinear_cg_is_refused():

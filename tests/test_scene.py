@@ -241,3 +241,9 @@ def test_a_frame_half_way_is_turned_by_half(axis, angle):
     # Roundings of a few operations on numbers up to 1.
     np.testing.assert_allclose(mixed, Rotation.from_rotvec(vector / 2).as_matrix() @ start, rtol=0, atol=2e-15)
     np.testing.assert_allclose(mixed.T @ mixed, np.eye(3), rtol=0, atol=2e-15)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e200])
+def test_a_direction_may_have_any_length(size):
+    swivel = Swivel((0, 0, 0), (3 * size, 0, 4 * size))
+    np.testing.assert_allclose(swivel.tangent, [0.6, 0, 0.8], rtol=1e-15)

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from rodjax.energy import dead_load_energy
 from rodjax.scene import Scene
-from rodjax.supports import Free
+from rodjax.supports import Free, Held
 from rodjax.units import Units
 
 
@@ -31,6 +31,13 @@ def forces_on_nodes(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     if energy is None:
         return nodes
     return -jax.grad(lambda nodes: load_energy(scene, nodes))(nodes)
+
+
+def forces_beyond_edges(scene: Scene, node_forces: Float[Array, "3 n+1"]) -> Float[Array, "3 n"]:
+    """The sum of the forces on the nodes beyond each edge; where the start is free, less all of them."""
+    if isinstance(scene.start, Held):
+        return jnp.cumsum(node_forces[:, :0:-1], axis=1)[:, ::-1]
+    return -jnp.cumsum(node_forces[:, :-1], axis=1)
 
 
 def _trapezoidal_weights(count: int, dtype) -> Float[Array, "n+1"]:

@@ -12,27 +12,30 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.dead_loads import forces_on_nodes, load_energy
+from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes, load_energy
 from rodjax.discretization.joints import (
+    assembled,
     bending_derivatives,
     components,
     dot,
     joints,
+    of_edges,
     tangent_bases,
     with_held_tangents,
 )
-from rodjax.discretization.mixed import (
-    MixedPoint,
-    assembled,
-    forces_beyond_edges,
-    held_at_both_ends,
-    of_edges,
+from rodjax.discretization.mixed import FLOOR_SAFETY, MixedPoint
+from rodjax.discretization.twist import (
+    FramedTangents,
+    TwistReference,
+    angle_about,
+    total_twist,
+    transport_along,
     twist_under_moment,
 )
-from rodjax.discretization.twist import FramedTangents, TwistReference, angle_about, total_twist, transport_along
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import Factors, SaddlePointSystem, factor
-from rodjax.scene import Scene, dead_end_moment
+from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
+from rodjax.strain import axial_strain
 from rodjax.supports import Clamp, Directed, Held
 
 
@@ -49,6 +52,21 @@ class Polyline(eqx.Module):
     @staticmethod
     def through(nodes: Float[Array, "n+1 3"]) -> "Polyline":
         return Polyline(nodes, jnp.diff(nodes, axis=0))
+
+    @property
+    def lengths(self) -> Float[Array, "n"]:
+        return jnp.sqrt(jnp.sum(self.edges**2, axis=1))
+
+    @property
+    def tangents(self) -> Float[Array, "3 n"]:
+        return self.edges.T / self.lengths[None]
+
+    def extrapolated(self, older: "Polyline", ratio: Float[Array, ""]) -> "Polyline":
+        """From an older one through this one, on by so much of the way between: by the tangents, with these lengths."""
+        tangents = self.tangents + ratio * (self.tangents - older.tangents)
+        edges = (tangents * (self.lengths / jnp.sqrt(dot(tangents, tangents)))[None]).T
+        ways = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        return Polyline(self.nodes[:1] + ways, edges)
 
     def moved(self, displacement: Float[Array, "n+1 3"]) -> "Polyline":
         return Polyline(self.nodes + displacement, self.edges + jnp.diff(displacement, axis=0))
@@ -119,18 +137,17 @@ class FiniteDifference(eqx.Module):
     def energies(self, polyline: Polyline) -> Energies:
         rod = self.scene.rod
         n = len(polyline.edges)
-        tangents, lengths = _tangents_and_lengths(polyline.edges)
-        stretching = jnp.sum(density(rod, axial_strain=n * lengths - 1)) / n
+        stretching = jnp.mean(density(rod, axial_strain=axial_strain(n * polyline.edges)))
         torsion = None
         if self.reference is not None:
             torsion = density(rod, twist=self.total_twist(polyline))
-        bending = joints(self.scene, tangents).bending_energy(rod)
+        bending = joints(self.scene, polyline.tangents).bending_energy(rod)
         return Energies(bending, stretching, torsion, load_energy(self.scene, polyline.nodes))
 
     def total_twist(self, polyline: Polyline) -> Float[Array, ""]:
         """Total twist [rad]: fixed by two clamps, or in equilibrium with a dead moment; zero where an end can spin."""
         if dead_end_moment(self.scene) is not None:
-            return twist_under_moment(self.scene, _tangents_and_lengths(polyline.edges)[0])
+            return twist_under_moment(self.scene, polyline.tangents)
         if self.reference is None:
             return jnp.zeros((), polyline.nodes.dtype)
         return total_twist(self.reference, _framed_tangents(self.scene, polyline))
@@ -166,7 +183,7 @@ class FiniteDifference(eqx.Module):
         """
         scene, rod = self.scene, self.scene.rod
         n = len(polyline.edges)
-        tangents, lengths = _tangents_and_lengths(polyline.edges)
+        tangents, lengths = polyline.tangents, polyline.lengths
         all_bases = tangent_bases(with_held_tangents(scene, tangents))
         bases = of_edges(scene, all_bases, n)
         beside = (all_bases[..., :-1], all_bases[..., 1:])
@@ -199,7 +216,7 @@ class FiniteDifference(eqx.Module):
     # --- the same state in the unknowns of the mixed form ------------------------------------------------------------
 
     def mixed_point(self, polyline: Polyline) -> MixedPoint:
-        tangents, _ = _tangents_and_lengths(polyline.edges)
+        tangents = polyline.tangents
         end_force = jnp.zeros(3, tangents.dtype)
         if held_at_both_ends(self.scene):
             on_end = forces_on_nodes(self.scene, len(polyline.edges))[-1]
@@ -237,10 +254,6 @@ class Preconditioner(eqx.Module):
 PIN_STIFFNESS = 1.0
 
 
-# Multiple of eps (EA + 4 N^2) that is taken for the rounding floor of the gradient.
-FLOOR_SAFETY = 4.0
-
-
 def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     """The guess moved to the held ends, by a displacement linear in s; unchanged to the last bit where it fits."""
     start, end = scene.start, scene.end
@@ -258,16 +271,11 @@ def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     return Polyline(nodes, polyline.edges)
 
 
-def _tangents_and_lengths(edges: Float[Array, "n 3"]) -> tuple[Float[Array, "3 n"], Float[Array, "n"]]:
-    lengths = jnp.sqrt(jnp.sum(edges**2, axis=1))
-    return edges.T / lengths[None], lengths
-
-
 # --- torsion ---------------------------------------------------------------------------------------------------------
 
 
 def _framed_tangents(scene: Scene, polyline: Polyline) -> FramedTangents:
-    tangents, _ = _tangents_and_lengths(polyline.edges)
+    tangents = polyline.tangents
     start_d1, end_d1 = (end.frame[:, 0] if isinstance(end, Clamp) else None for end in (scene.start, scene.end))
     return FramedTangents(with_held_tangents(scene, tangents), start_d1, end_d1)
 

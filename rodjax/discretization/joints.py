@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from rodjax.energy import density
 from rodjax.rod import Rod
 from rodjax.scene import Scene
+from rodjax.strain import squared_curvature_between
 from rodjax.supports import Directed
 
 # In a Gauss-Newton Hessian a joint bent further than this counts as one bent so far: it stays definite.
@@ -31,12 +32,8 @@ class Joints(eqx.Module):
 
     @property
     def squared_curvature(self) -> Float[Array, "k"]:
-        """|t x t'|^2 by central differences between the two tangents: (2 tan(a/2)/h)^2 for the angle a.
-
-        It grows beyond bounds as the tangents turn against each other, so that the rod has no way through a fold.
-        """
         difference = self.after - self.before
-        return _squared_curvature(dot(difference, difference), self.spacing)
+        return squared_curvature_between(dot(difference, difference), self.spacing)
 
     def bending_energy(self, rod: Rod) -> Float[Array, ""]:
         return jnp.sum(self.spacing * density(rod, squared_curvature=self.squared_curvature))
@@ -113,7 +110,7 @@ def bending_derivatives(
     """
 
     def energy(squared_difference):
-        curvature = _squared_curvature(squared_difference, joints.spacing)
+        curvature = squared_curvature_between(squared_difference, joints.spacing)
         return joints.spacing * density(rod, squared_curvature=curvature)
 
     difference = joints.after - joints.before
@@ -156,8 +153,28 @@ def twist_derivatives(joints: Joints, bases: tuple[Float[Array, "3 2 k"], Float[
     )
 
 
-def _squared_curvature(squared_difference: Float[Array, "k"], spacing: Float[Array, "k"]) -> Float[Array, "k"]:
-    return 4 * squared_difference / ((4 - squared_difference) * spacing**2)
+def of_edges(scene: Scene, by_point: Float[Array, "... m"], segments: int) -> Float[Array, "... n"]:
+    """What belongs to the edges, out of something given for them and the tangents held before and after."""
+    first = int(isinstance(scene.start, Directed))
+    return by_point[..., first : first + segments]
+
+
+def by_edges(
+    scene: Scene, before: Float[Array, "... k"], after: Float[Array, "... k"], segments: int
+) -> Float[Array, "... n"]:
+    """Sums over the joints of each edge of what they give to the edges before and after them."""
+    none = jnp.zeros_like(before[..., :1])
+    by_point = jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
+    return of_edges(scene, by_point, segments)
+
+
+def assembled(
+    scene: Scene, derivatives: JointDerivatives, segments: int
+) -> tuple[Float[Array, "b n"], Float[Array, "b b n"], Float[Array, "b b n-1"]]:
+    """Gradient, and the blocks on and below the diagonal of the second derivatives, by the rotations of the edges."""
+    gradient = by_edges(scene, derivatives.before, derivatives.after, segments)
+    diagonal = by_edges(scene, derivatives.before_before, derivatives.after_after, segments)
+    return gradient, diagonal, of_edges(scene, derivatives.after_before, segments - 1)
 
 
 def _two_derivatives(function, x: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:

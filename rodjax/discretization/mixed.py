@@ -25,26 +25,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.dead_loads import forces_on_nodes
+from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes
 from rodjax.discretization.joints import (
-    JointDerivatives,
+    assembled,
     bending_derivatives,
+    by_edges,
     components,
     dot,
     joints,
+    of_edges,
     outer,
     rotated,
     tangent_bases,
     twist_derivatives,
     with_held_tangents,
 )
-from rodjax.discretization.twist import swept_twist
+from rodjax.discretization.twist import swept_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import SaddlePointSystem
-from rodjax.scene import Scene, dead_end_moment
-from rodjax.supports import Clamp, Directed, Free, Held
+from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
+from rodjax.supports import Clamp, Free, Held
 
-# Multiple of eps (4 |n| + 4 N^2) that is taken for the rounding floor of the gradient.
+# Multiple of eps (stiffness or force + 4 N^2) that is taken for the rounding floor of the gradient.
 FLOOR_SAFETY = 4.0
 # Where the gradient is at the tolerance, the polyline must close to this multiple of it: a hundredth, as a bent rod has
 # about 100 EI/L^3 of stiffness; or to so many roundings.
@@ -297,49 +299,6 @@ class MixedForm(eqx.Module):
         """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
         least = CLOSURE_ROUNDINGS * jnp.finfo(closure.dtype).eps
         return jnp.all(jnp.abs(closure) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))
-
-
-def twist_under_moment(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
-    """The total twist that a dead moment on the free end raises: its part about the end tangent, constant in s."""
-    moment = dead_end_moment(scene)
-    assert moment is not None
-    sign, edge = (-1, 0) if isinstance(scene.start, Free) else (1, -1)
-    return sign * jnp.sum(moment * tangents[:, edge]) / scene.rod.GJ
-
-
-def held_at_both_ends(scene: Scene) -> bool:
-    return isinstance(scene.start, Held) and isinstance(scene.end, Held)
-
-
-def forces_beyond_edges(scene: Scene, node_forces: Float[Array, "3 n+1"]) -> Float[Array, "3 n"]:
-    """The sum of the forces on the nodes beyond each edge; where the start is free, less all of them."""
-    if isinstance(scene.start, Held):
-        return jnp.cumsum(node_forces[:, :0:-1], axis=1)[:, ::-1]
-    return -jnp.cumsum(node_forces[:, :-1], axis=1)
-
-
-def of_edges(scene: Scene, by_point: Float[Array, "... m"], segments: int) -> Float[Array, "... n"]:
-    """What belongs to the edges, out of something given for them and the tangents held before and after."""
-    first = int(isinstance(scene.start, Directed))
-    return by_point[..., first : first + segments]
-
-
-def by_edges(
-    scene: Scene, before: Float[Array, "... k"], after: Float[Array, "... k"], segments: int
-) -> Float[Array, "... n"]:
-    """Sums over the joints of each edge of what they give to the edges before and after them."""
-    none = jnp.zeros_like(before[..., :1])
-    by_point = jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
-    return of_edges(scene, by_point, segments)
-
-
-def assembled(
-    scene: Scene, derivatives: JointDerivatives, segments: int
-) -> tuple[Float[Array, "b n"], Float[Array, "b b n"], Float[Array, "b b n-1"]]:
-    """Gradient, and the blocks on and below the diagonal of the second derivatives, by the rotations of the edges."""
-    gradient = by_edges(scene, derivatives.before, derivatives.after, segments)
-    diagonal = by_edges(scene, derivatives.before_before, derivatives.after_after, segments)
-    return gradient, diagonal, of_edges(scene, derivatives.after_before, segments - 1)
 
 
 def _with_derivatives(

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.joints import components, cross, dot, tangent_bases
+from rodjax.scene import Scene, dead_end_moment
 from rodjax.strain import swept_angle
+from rodjax.supports import Free
 
 
 class FramedTangents(eqx.Module):
@@ -74,3 +76,11 @@ def angle_about(
 ) -> Float[Array, "*k"]:
     """Right-handed angle about the unit `axis` from `vector` to `other` [rad], both at right angles to it."""
     return jnp.arctan2(dot(axis, cross(vector, other)), dot(vector, other))
+
+
+def twist_under_moment(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
+    """The total twist that a dead moment on the free end raises: its part about the end tangent, constant in s."""
+    moment = dead_end_moment(scene)
+    assert moment is not None
+    sign, edge = (-1, 0) if isinstance(scene.start, Free) else (1, -1)
+    return sign * jnp.sum(moment * tangents[:, edge]) / scene.rod.GJ

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import whole_number
+from rodjax.checks import plain_number, whole_number
 
 
 class Bracket(eqx.Module):
@@ -42,9 +42,9 @@ class LineSearch(eqx.Module):
     - `max_trials`: energy evaluations before a direction is given up.
     """
 
-    curvature: float = 0.1
-    energy_tolerance: float = 1e-9
-    expansion: float = 8.0
+    curvature: float = eqx.field(default=0.1, converter=plain_number("curvature"))
+    energy_tolerance: float = eqx.field(default=1e-9, converter=plain_number("energy_tolerance"))
+    expansion: float = eqx.field(default=8.0, converter=plain_number("expansion"))
     max_trials: int = 25
 
     def __check_init__(self):

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import not_negative, plain_number, whole_number
 from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
 from rodjax.linalg import factor, factor_and_solve
-from rodjax.status import Status
+from rodjax.status import Outcome, Status
 
 
 class Newton(eqx.Module):
@@ -61,10 +61,7 @@ class NewtonMinimum(eqx.Module):
     """Where the method stopped. `is_stable`: whether the energy has no negative curvature there."""
 
     point: MixedPoint
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    evaluations: Int[Array, ""]
-    status: Int[Array, ""]
+    outcome: Outcome
     is_stable: Bool[Array, ""]
 
 
@@ -242,10 +239,7 @@ def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMi
     state = jax.lax.while_loop(lambda state: state.status == Status.RUNNING, turn, state)
     return NewtonMinimum(
         point=state.point,
-        residual=state.residual,
-        iterations=state.iterations,
-        evaluations=state.evaluations,
-        status=state.status,
+        outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
         is_stable=state.is_stable & form.has_potential,
     )
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rodjax.checks import instance, not_negative, plain_number, whole_number
 from rodjax.solvers.line_search import Bracket, LineSearch
-from rodjax.status import Status
+from rodjax.status import Outcome, Status
 
 
 class NonlinearCG(eqx.Module):
@@ -52,11 +52,7 @@ class Minimum(eqx.Module):
 
     problem: Any
     point: PyTree
-    energy: Float[Array, ""]
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    evaluations: Int[Array, ""]
-    status: Int[Array, ""]
+    outcome: Outcome
 
 
 class _State(eqx.Module):
@@ -208,9 +204,5 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
     return Minimum(
         problem=problem.with_reference(state.reference),
         point=state.point,
-        energy=state.energy,
-        residual=jnp.max(jnp.abs(state.gradient)),
-        iterations=state.iterations,
-        evaluations=state.evaluations,
-        status=state.status,
+        outcome=Outcome(jnp.max(jnp.abs(state.gradient)), state.iterations, state.evaluations, state.status),
     )

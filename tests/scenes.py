@@ -1,0 +1,23 @@
+"""Scenes that several tests look at."""
+
+from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
+
+GRAVITY = (0.0, 3.0, -9.81)
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def loaded_scenes() -> dict[str, Scene]:
+    """One of each kind of supports and loads, of a thick rod, so that stretch matters."""
+    rod = problems.cable(20.0)
+    clamp, other = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.5, 0.2, 0.0), frame((1, 1, 1)))
+    load = [PointForce(0.43, (0.1, 0.0, 0.2))]
+    EI = float(rod.EI)
+    return {
+        "clamps": Scene(rod, clamp, other, GRAVITY, load),
+        "clamp-swivel": Scene(rod, clamp, Swivel((0.5, 0.2, 0.0), (1, 1, 1))),
+        "pins": Scene(rod, Pin(ORIGIN), Pin((0.5, 0.2, 0.0)), GRAVITY),
+        "cantilever": Scene(rod, clamp, Free(force=(0.0, EI, 2 * EI)), point_forces=load),
+        "free start": Scene(rod, Free(), other, GRAVITY),
+        "end moment": Scene(rod, clamp, Free(force=(0.0, EI, 0.0), moment=(EI, 2 * EI, -EI))),
+        "start moment": Scene(rod, Free(moment=(EI, 2 * EI, -EI)), other, GRAVITY),
+    }

@@ -6,12 +6,14 @@ import platform
 import re
 import statistics
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
+import numpy as np
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # A slow program is repeated for about so long [s] in a round, once at least.
@@ -68,25 +70,35 @@ class Timed(Generic[Result]):
         result = jax.block_until_ready(self.run())
         return result, (time.perf_counter() - begin) * 1e3
 
-    def round(self, repeats: int) -> float:
+    def round(self, repeats: int, seconds: float = ROUND_SECONDS) -> float:
         """Median of some more runs [ms]."""
-        count = max(1, min(repeats, int(ROUND_SECONDS * 1e3 / self._guess)))
+        count = max(1, min(repeats, int(seconds * 1e3 / self._guess)))
         times = [self._timed()[1] for _ in range(count)]
         self.times += times
         return statistics.median(times)
 
 
-def cpp_report(program: Path, problem: str, method: str, tolerance: str, segments: int, folder: Path) -> dict[str, str]:
-    """What the C++ program prints of one mesh: it repeats the problem for two seconds and gives the median.
+class CppRuns:
+    """The C++ program on one mesh; a run repeats the problem for two seconds and leaves the nodes of the last scene."""
 
-    Where `folder` has a folder `out`, it leaves the last nodes there.
-    """
-    command = [str(program.resolve()), problem, method, tolerance, str(segments)]
-    output = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout
-    report = REPORT.search(output)
-    if report is None:
-        raise ValueError(f"{' '.join(command)} printed no line of numbers that this script knows: {output!r}")
-    return report.groupdict()
+    def __init__(self, program: Path, problem: str, method: str, tolerance: str, segments: int):
+        self._command = [str(program.resolve()), problem, method, tolerance, str(segments)]
+        self._nodes_file = f"cpp_{problem}_{method}_{segments}.txt"
+        self.reports: list[dict[str, float]] = []  # the names of `REPORT`; times in ms, of one step in a path
+
+    def round(self) -> float:
+        """Median of a run [ms]."""
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder, "out")
+            out.mkdir()
+            output = subprocess.run(self._command, capture_output=True, text=True, check=True, cwd=folder).stdout
+            report = REPORT.search(output)
+            if report is None:
+                command = " ".join(self._command)
+                raise ValueError(f"{command} printed no line of numbers that this script knows: {output!r}")
+            self.nodes = np.loadtxt(out / self._nodes_file)
+        self.reports.append({name: float(value) for name, value in report.groupdict().items()})
+        return self.reports[-1]["median"]
 
 
 def number(value: float, format_spec: str, width: int) -> str:

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from measuring import ROUND_SECONDS, Timed, compiled, conditions, cpp_report, machine, number, save_rows, set_up
+from measuring import ROUND_SECONDS, CppRuns, Timed, compiled, conditions, machine, number, save_rows, set_up
 
 import rodjax
 from rodjax import problems
@@ -108,53 +108,38 @@ class OurRuns:
         )
 
 
-class CppRuns:
-    """Runs of one C++ method, each of which repeats the path for two seconds and prints the median."""
-
-    def __init__(self, program: Path, limit: Limit, segments: int):
-        self.program, self.limit, self.segments = program, limit, segments
-        self.reports: list[dict[str, str]] = []
-
-    def round(self) -> float:
-        """Median time [ms a step]."""
-        limit = self.limit
-        report = cpp_report(self.program, "p2", limit.argument, limit.tolerance, self.segments, Path.cwd())
-        self.reports.append(report)
-        return float(report["median"])
-
-    def row(self) -> Row:
-        last = self.reports[-1]
-        return Row(
-            segments=self.segments,
-            method=self.limit.name,
-            tolerance=float(self.limit.tolerance),
-            iterations_median=math.nan,
-            iterations_mean=int(last["iterations"]) / STEPS,
-            iterations_max=int(last["most"]),
-            evaluations=int(last["evals"]) / STEPS,
-            ms_median=statistics.median(float(report["median"]) for report in self.reports),
-            ms_min=min(float(report["min"]) for report in self.reports),
-            paths=len(self.reports),
-            compile_s=math.nan,
-            converged=last["failures"] == "0",
-            energy=float(last["energy"]),
-        )
+def cpp_row(limit: Limit, segments: int, reports: Sequence[dict[str, float]]) -> Row:
+    """The line of a C++ method, from what its runs report."""
+    last = reports[-1]
+    return Row(
+        segments=segments,
+        method=limit.name,
+        tolerance=float(limit.tolerance),
+        iterations_median=math.nan,
+        iterations_mean=last["iterations"] / STEPS,
+        iterations_max=int(last["most"]),
+        evaluations=last["evals"] / STEPS,
+        ms_median=statistics.median(report["median"] for report in reports),
+        ms_min=min(report["min"] for report in reports),
+        paths=len(reports),
+        compile_s=math.nan,
+        converged=last["failures"] == 0,
+        energy=last["energy"],
+    )
 
 
 def measured(segments: int, methods: Sequence[Method], program: Path | None, rounds: int, repeats: int) -> list[Row]:
     """All methods at one mesh; those with a C++ partner in rounds of ours, C++, ours, C++, ..."""
     rows = []
     for method in methods:
-        ours = OurRuns(method, segments)
-        cpp = CppRuns(program, method.limit, segments) if program and method.limit else None
-        ratios = []
-        for _ in range(1 if cpp is None else rounds):
-            ms = ours.round(repeats)
-            if cpp is not None:
-                ratios.append(ms / cpp.round())
-        rows.append(ours.row(ratios))
-        if cpp is not None:
-            rows.append(cpp.row())
+        ours, limit = OurRuns(method, segments), method.limit
+        if program is None or limit is None:
+            ours.round(repeats)
+            rows.append(ours.row([]))
+        else:
+            cpp = CppRuns(program, "p2", limit.argument, limit.tolerance, segments)
+            ratios = [ours.round(repeats) / cpp.round() for _ in range(rounds)]
+            rows += [ours.row(ratios), cpp_row(limit, segments, cpp.reports)]
     return rows
 
 

@@ -10,7 +10,6 @@ optimistix on the same compiled energy, what one would otherwise write.
 import argparse
 import math
 import statistics
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -22,7 +21,7 @@ import optimistix
 import scipy.optimize
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
-from measuring import ROUND_SECONDS, Timed, compiled, conditions, cpp_report, machine, number, save_rows, set_up
+from measuring import ROUND_SECONDS, CppRuns, Timed, compiled, conditions, machine, number, save_rows, set_up
 from scipy.interpolate import CubicSpline
 
 import rodjax
@@ -344,36 +343,30 @@ class Runs:
         )
 
 
-class CppRuns:
+class CppNewton:
     """The C++ program on one mesh; P1 in four load steps, of which this counts the sum."""
 
     def __init__(self, program: Path, problem: Problem, segments: int):
-        self.program, self.problem, self.segments = program, problem, segments
-        self.reports: list[dict[str, str]] = []
+        self.problem, self.segments = problem, segments
+        tolerance = f"{TOLERANCE:.0e}" if segments <= CPP_FINEST else CPP_LOOSE
+        self.runs = CppRuns(program, problem.name.lower(), "newton", tolerance, segments)
 
     def round(self, repeats: int) -> None:  # it repeats as it sees fit
-        tolerance = f"{TOLERANCE:.0e}" if self.segments <= CPP_FINEST else CPP_LOOSE
-        name = self.problem.name.lower()
-        with tempfile.TemporaryDirectory() as folder:
-            dumped = Path(folder, "out", f"cpp_{name}_newton_{self.segments}.txt")
-            dumped.parent.mkdir()
-            self.reports.append(cpp_report(self.program, name, "newton", tolerance, self.segments, Path(folder)))
-            self.nodes = np.loadtxt(dumped)
+        self.runs.round()
 
     def row(self, truth: CubicSpline) -> Row:
-        last = self.reports[-1]
-        nodes = self.nodes - self.nodes[0] + truth(0.0)  # its P3 is centered
+        reports, nodes = self.runs.reports, self.runs.nodes
         return Row(
             problem=self.problem.name,
             method=CPP,
             segments=self.segments,
-            error=shape_error(self.problem, nodes, truth),
-            ms_median=statistics.median(float(report["median"]) for report in self.reports),
-            ms_min=min(float(report["min"]) for report in self.reports),
-            runs=len(self.reports),
-            iterations=int(last["iterations"]) / len(self.problem.scenes),
-            residual=float(last["residual"]),
-            converged=last["failures"] == "0",
+            error=shape_error(self.problem, nodes - nodes[0] + truth(0.0), truth),  # its P3 is centered
+            ms_median=statistics.median(report["median"] for report in reports),
+            ms_min=min(report["min"] for report in reports),
+            runs=len(reports),
+            iterations=reports[-1]["iterations"] / len(self.problem.scenes),
+            residual=reports[-1]["residual"],
+            converged=reports[-1]["failures"] == 0,
             compile_s=math.nan,
         )
 
@@ -382,11 +375,11 @@ def measured(
     problem: Problem, segments: int, truth: CubicSpline, program: Path | None, rounds: int, repeats: int
 ) -> list[Row]:
     """Every method on one mesh, in turns, since a shared machine is quicker in one minute than in the next."""
-    runs: list[Runs | CppRuns] = [
+    runs: list[Runs | CppNewton] = [
         Runs(method, problem, segments) for method in METHODS if method.serves(problem, segments)
     ]
     if program is not None:
-        runs.append(CppRuns(program, problem, segments))
+        runs.append(CppNewton(program, problem, segments))
     for _ in range(rounds):
         for run in runs:
             run.round(repeats)

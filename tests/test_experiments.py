@@ -11,7 +11,7 @@ import pytest
 from rodjax import problems
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-sys.path.insert(0, str(EXPERIMENTS))  # as for a script that is run, so that it finds `measuring`
+sys.path.insert(0, str(EXPERIMENTS))  # as for a script that is run, so that it finds `measuring` and `peer_programs`
 
 
 def script(name: str):

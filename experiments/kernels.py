@@ -25,6 +25,7 @@ from measuring import Timed, compiled, conditions, number, save_rows, set_up
 
 import rodjax
 from rodjax import Scene, Swivel, problems
+from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.joints import (
     Joints,
@@ -110,10 +111,12 @@ def scenes() -> dict[str, Scene]:
 
 @eqx.filter_jit
 def discretized(scene: Scene, segments: int) -> Discretized:
-    state, twist = first_state(scene, problems.figure_1_start(), segments)
+    state, twist = first_state(scene, problems.figure_1_start(), segments, "finite_difference")
     scaled, _ = nondimensional(scene)
-    problem, polyline = FiniteDifference.begin(scaled, state.polyline, twist)
-    return Discretized(scene, MixedForm.of(scaled, segments), problem.mixed_point(polyline), problem, polyline)
+    assert isinstance(state.shape, Polyline)
+    problem, polyline = FiniteDifference.begin(scaled, state.shape, twist)
+    form = MixedForm.of(scaled, EdgeTangents.of(scaled, segments))
+    return Discretized(scene, form, problem.mixed_point(polyline), problem, polyline)
 
 
 def kernels(segments: int) -> Iterator[Kernel]:
@@ -174,7 +177,7 @@ def energy_and_gradient(problem: FiniteDifference, polyline: Polyline):
 
 
 def at_nodes(form: MixedForm, point: MixedPoint):
-    return resultants(form.scene, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
+    return resultants(form, point)
 
 
 def in_units(scene: Scene, found: Found):

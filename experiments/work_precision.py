@@ -177,15 +177,17 @@ class Minimizer:
         raise NotImplementedError
 
     def prepared(self, problem: Problem, segments: int) -> Prepared:
-        state, twist = first_state(problem.scenes[0], problem.guess, segments)
-        begin, begin_s = compiled(begun, problem.scenes[0], state.polyline, twist)
-        start = begin(problem.scenes[0], state.polyline, twist)
+        state, twist = first_state(problem.scenes[0], problem.guess, segments, "finite_difference")
+        assert isinstance(state.shape, Polyline)
+        first = state.shape
+        begin, begin_s = compiled(begun, problem.scenes[0], first, twist)
+        start = begin(problem.scenes[0], first, twist)
         zero = jnp.zeros(start[0].no_displacement(start[1]).size)
         finish, finish_s = compiled(reached, *start, zero)
         minimized, minimized_s = self.found(start, zero)
 
         def run() -> tuple[Polyline, list[int], list[Float[Array, ""]]]:
-            polyline, total_twist, iterations, residuals = state.polyline, twist, [], []
+            polyline, total_twist, iterations, residuals = first, twist, [], []
             for scene in problem.scenes:
                 here = begin(scene, polyline, total_twist)
                 x, count = minimized(*here, zero)

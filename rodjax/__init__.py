@@ -1,5 +1,7 @@
 """Shape, forces and derivatives of cables, hoses and wires: quasistatic extensible Kirchhoff rods in JAX."""
 
+from typing import TYPE_CHECKING
+
 from rodjax import problems
 from rodjax.compilation_cache import enable_compilation_cache
 from rodjax.equilibrium import Equilibrium, NotConvergedWarning, describe, solve
@@ -15,6 +17,9 @@ from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel, frame
+
+if TYPE_CHECKING:
+    from rodjax.continuum import solve_continuum
 
 __version__ = "0.1.0"
 
@@ -42,6 +47,16 @@ __all__ = [
     "read_scene",
     "save",
     "solve",
+    "solve_continuum",
     "solve_path",
     "write_scene",
 ]
+
+
+def __getattr__(name: str):
+    # diffrax and optimistix take a second to import, which a solve without them need not wait for.
+    if name == "solve_continuum":
+        from rodjax.continuum import solve_continuum
+
+        return solve_continuum
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,22 +12,30 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, whole_number
-from rodjax.discretization.dead_loads import energy_of_origin, load_energy
+from rodjax.discretization.dead_loads import energy_of_origin
+from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.tangent_field import TangentField
+from rodjax.discretization.twist import nearest_twist, twist_under_moment
+from rodjax.energy import axial_strain_under
 from rodjax.guess import Guess, cubic, first_shape, resampled
 from rodjax.plane import check_planar, is_planar, plane
-from rodjax.scene import Scene, dead_end_moment, nondimensional
+from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
 from rodjax.solvers.newton import Newton, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Outcome, Status, is_converged
+from rodjax.supports import Clamp
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
+Discretization = Literal["finite_difference", "hermite"]
 
-# Edges that differ by so many roundings are the same.
-SAME_EDGES = 64
+# Shapes that differ by so many roundings are the same.
+SAME_SHAPE = 64
 
 DEFAULT_SEGMENTS = 50
 DEFAULT_SOLVER = Newton()
@@ -42,10 +50,11 @@ class NotConvergedWarning(UserWarning):
 class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
-    `end_force`: the force at s = L between held ends, else zero.
+    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements; `end_force`: the force at s = L between
+    held ends, else zero.
     """
 
-    polyline: Polyline
+    shape: Shape
     end_force: Float[Array, "... 3"]
     units: Units
 
@@ -61,7 +70,7 @@ class Equilibrium(eqx.Module):
     - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
     - `curvature` [..., n+1] |t x t'|, 1/m
     - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
-    - `tension` [..., n+1] N
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of a dead
       moment depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
@@ -81,6 +90,7 @@ class Equilibrium(eqx.Module):
     twist: Float[Array, "... n+1"]
     total_twist: Float[Array, "..."]
     tension: Float[Array, "... n+1"]
+    axial_strain: Float[Array, "... n+1"]
     energy: Float[Array, "..."]
     elastic_energy: Float[Array, "..."]
     start_force: Float[Array, "... 3"]
@@ -112,17 +122,19 @@ class Equilibrium(eqx.Module):
             if np.any(s < 0) or np.any(s > length):
                 raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
 
-        def on_one(nodes, tangents, length):
-            return cubic(nodes, _slopes(nodes, tangents), s / length * (len(nodes) - 1))
+        slopes = (1 + self.axial_strain)[..., None] * self.tangents
 
-        return jnp.vectorize(on_one, signature="(n,3),(n,3),()->(k,3)")(self.nodes, self.tangents, self.s[..., -1])
+        def on_one(places, nodes, slopes):
+            return cubic(places, nodes, slopes, s)
+
+        return jnp.vectorize(on_one, signature="(n),(n,3),(n,3)->(k,3)")(self.s, self.nodes, slopes)
 
 
 def solve(
     scene: Scene,
     *,
     segments: int | None = None,
-    discretization: Literal["finite_difference"] = "finite_difference",
+    discretization: Discretization = "finite_difference",
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
@@ -135,7 +147,7 @@ def solve(
 
     - `scene`: `Scene`.
     - `segments`: of the mesh; `None`: those of a guess that is an `Equilibrium`, else 50.
-    - `discretization`: `"finite_difference"`, the only one in this version: second order in 1/segments.
+    - `discretization`: `"finite_difference"`, of second order in 1/segments, or `"hermite"`, of fourth order.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
       supports and gravity.
@@ -152,7 +164,7 @@ def solve(
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
     segments, solver = checked_options(scene, segments, discretization, solver, guess, planar)
-    result = _solve(scene, guess, segments, solver, planar)
+    result = _solve(scene, guess, segments, discretization, solver, planar)
     warn_if_not_converged(result)
     return result
 
@@ -171,14 +183,15 @@ def describe(equilibrium: Equilibrium) -> str:
 def checked_options(
     scene: Scene,
     segments: int | None,
-    discretization: str,
+    discretization: Discretization,
     solver: Solver | None,
     guess: Guess | Equilibrium | None,
     planar: bool,
 ) -> tuple[int, Solver]:
     """Segments and solver with the library's choice for `None`."""
-    if discretization != "finite_difference":
-        raise ValueError(f"discretization must be 'finite_difference' in this version, got {discretization!r}")
+    if discretization not in typing.get_args(Discretization):
+        allowed = " or ".join(map(repr, typing.get_args(Discretization)))
+        raise ValueError(f"discretization must be {allowed}, got {discretization!r}")
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     if segments is None:
@@ -187,6 +200,8 @@ def checked_options(
     if solver is None:
         solver = DEFAULT_SOLVER
     instance(solver, "solver", typing.get_args(Solver))
+    if discretization == "hermite" and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton where discretization is 'hermite'")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     instance(planar, "planar", bool)
@@ -197,19 +212,21 @@ def checked_options(
     return segments, solver
 
 
-def first_state(scene: Scene, guess: Guess | Equilibrium | None, segments: int) -> tuple[SolverState, Float[Array, ""]]:
+def first_state(
+    scene: Scene, guess: Guess | Equilibrium | None, segments: int, discretization: Discretization
+) -> tuple[SolverState, Float[Array, ""]]:
     """Where to begin, and the total twist to stay near to [rad]."""
     scaled, units = nondimensional(scene)
+    kind, pieces = (Polyline, segments) if discretization == "finite_difference" else (Curve, 2 * segments)
     no_force = jnp.zeros(3, scene.rod.length.dtype)
     if guess is None:
-        shape = Polyline.through(first_shape(scaled, segments))
-        return SolverState(shape, no_force, units), jnp.zeros_like(scene.rod.length)
+        return SolverState(kind.through(first_shape(scaled, pieces)), no_force, units), jnp.zeros_like(no_force[0])
     if isinstance(guess, Guess):
-        return SolverState(guess.polyline(units, segments), no_force, units), guess.total_twist
+        return SolverState(kind.through(guess.nodes(units, pieces)), no_force, units), guess.total_twist
     state = guess.state
-    if guess.s.shape[-1] - 1 != segments:
-        polyline = Polyline.through(resampled(state.polyline.nodes, segments))
-        state = SolverState(polyline, state.end_force, state.units)
+    if not isinstance(state.shape, kind) or guess.s.shape[-1] - 1 != segments:
+        shape = kind.through(resampled(state.shape.nodes, pieces))
+        state = SolverState(shape, state.end_force, state.units)
     return state, guess.total_twist
 
 
@@ -232,23 +249,21 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
     """What a solver found, in SI units."""
     scaled, _ = nondimensional(scene)
     point, outcome, units = found.point, found.outcome, found.state.units
-    polyline = found.state.polyline
-    n = len(polyline.edges)
-    form = MixedForm.of(scaled, n)
-    results = resultants(scaled, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
+    nodes = found.state.shape.nodes
+    form = MixedForm.of(scaled, _field(scaled, found.state.shape))
+    results = resultants(form, point)
     elastic_energy = form.elastic_energy(point)
-    loads = load_energy(scaled, polyline.nodes)
-    potential = elastic_energy if loads is None else elastic_energy + loads
-    fraction = jnp.linspace(0.0, 1.0, n + 1, dtype=elastic_energy.dtype)
+    potential = elastic_energy + form.load_energy(point)
     converged = is_converged(outcome.status)
     return Equilibrium(
-        s=fraction * scene.rod.length,
-        nodes=units.origin[None] + units.length * polyline.nodes,
+        s=form.field.s * scene.rod.length,
+        nodes=units.origin[None] + units.length * nodes,
         frames=results.frames,
         curvature=results.curvature / units.length,
         twist=results.twist / units.length,
         total_twist=point.total_twist,
         tension=results.tension * units.force,
+        axial_strain=axial_strain_under(scaled.rod, results.tension),
         energy=units.energy * potential + energy_of_origin(scaled, units),
         elastic_energy=units.energy * elastic_energy,
         start_force=results.start_force * units.force,
@@ -269,33 +284,56 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
 
 @eqx.filter_custom_jvp
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver: Solver, planar: bool) -> Found:
-    problem, start = FiniteDifference.begin(scene, guess.polyline, twist)
-    form = MixedForm.of(scene, len(start.edges))
+    form = MixedForm.of(scene, _field(scene, guess.shape))
     if isinstance(solver, NonlinearCG):
+        assert isinstance(guess.shape, Polyline)
+        problem, start = FiniteDifference.begin(scene, guess.shape, twist)
         minimum = minimize(problem, start, solver)
         point = minimum.problem.mixed_point(minimum.point)
-        polyline, stable, outcome = minimum.point, is_stable(form, point), minimum.outcome
-    else:
-        begin = eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
-        normal = None
-        if planar:
-            normal, axes = plane(scene, begin.tangents)
-            begin = begin.flattened(axes)
-            form = form.along(axes)
-        minimum = find_minimum(form, begin, solver)
-        point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
-        edges = form.edges(point)
-        # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
-        change = jnp.max(jnp.abs(edges - start.edges)) * len(edges)
-        is_start = (outcome.iterations == 0) & (change <= SAME_EDGES * jnp.finfo(edges.dtype).eps)
-        reached = Polyline(form.nodes(edges), edges)
-        polyline = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
-        if normal is not None:
-            stable &= is_stable(form.along(normal[:, None]), point)
-            # Inside a user's own jit the scene could not be checked before.
-            status = jnp.where(is_planar(scene, twist), outcome.status, Status.NOT_PLANAR)
-            outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
-    return Found(SolverState(polyline, point.end_force, guess.units), point, outcome, stable)
+        state = SolverState(minimum.point, point.end_force, guess.units)
+        return Found(state, point, minimum.outcome, is_stable(form, point))
+    start, begin = _first_point(form, guess, twist)
+    normal = None
+    if planar:
+        normal, axes = plane(scene, begin.tangents)
+        begin = begin.flattened(axes)
+        form = form.along(axes)
+    minimum = find_minimum(form, begin, solver)
+    point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
+    reached = start.reached(form, point)
+    # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
+    is_start = (outcome.iterations == 0) & (start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps)
+    shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
+    if normal is not None:
+        stable &= is_stable(form.along(normal[:, None]), point)
+        # Inside a user's own jit the scene could not be checked before.
+        status = jnp.where(is_planar(scene, twist), outcome.status, Status.NOT_PLANAR)
+        outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
+    return Found(SolverState(shape, point.end_force, guess.units), point, outcome, stable)
+
+
+def _field(scene: Scene, shape: Shape) -> TangentField:
+    segments = len(shape.nodes) - 1
+    return (EdgeTangents if isinstance(shape, Polyline) else HermiteElements).of(scene, segments)
+
+
+def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, MixedPoint]:
+    """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
+    scene, shape, field = form.scene, guess.shape, form.field
+    if isinstance(shape, Polyline):
+        problem, start = FiniteDifference.begin(scene, shape, twist)
+        return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
+    assert isinstance(field, HermiteElements)
+    assert isinstance(shape, Curve)
+    tangents = shape.turned_to_ends(scene, field.places)
+    total_twist = jnp.zeros_like(twist)
+    if dead_end_moment(scene) is not None:
+        total_twist = twist_under_moment(scene, tangents)
+    elif isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp):
+        principal = field.total_twist(tangents, scene.start.frame[:, 0], scene.end.frame[:, 0])
+        total_twist = nearest_twist(principal, twist, scene.turns)
+    end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
+    return shape, MixedPoint(tangents, end_force, total_twist)
 
 
 @_found.def_jvp
@@ -308,25 +346,23 @@ def _no_derivative(primals, tangents, *, solver: Solver, planar: bool):
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
-@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar"))
-def _solve(scene: Scene, guess: Guess | Equilibrium | None, segments: int, solver: Solver, planar: bool) -> Equilibrium:
-    state, twist = first_state(scene, guess, segments)
+@functools.partial(jax.jit, static_argnames=("segments", "discretization", "solver", "planar"))
+def _solve(
+    scene: Scene,
+    guess: Guess | Equilibrium | None,
+    segments: int,
+    discretization: Discretization,
+    solver: Solver,
+    planar: bool,
+) -> Equilibrium:
+    state, twist = first_state(scene, guess, segments, discretization)
     return equilibrium(scene, solve_from(scene, state, twist, solver, planar), jnp.ones((), int))
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
-    ratio = state.units.length / units.length
-    shift = (state.units.origin - units.origin) / units.length
-    polyline = Polyline(state.polyline.nodes * ratio + shift[None], state.polyline.edges * ratio)
-    return SolverState(polyline, state.end_force * (state.units.force / units.force), units)
-
-
-def _slopes(nodes: Float[Array, "n+1 3"], tangents: Float[Array, "n+1 3"]) -> Float[Array, "n+1 3"]:
-    """Derivatives by the node number: tangents as long as the edges beside them."""
-    lengths = jnp.sqrt(jnp.sum(jnp.diff(nodes, axis=0) ** 2, axis=1))
-    beside = jnp.concatenate([lengths[:1], lengths]) + jnp.concatenate([lengths, lengths[-1:]])
-    return beside[:, None] / 2 * tangents
+    shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
+    return SolverState(shape, state.end_force * (state.units.force / units.force), units)
 
 
 def warn_if_not_converged(equilibrium: Equilibrium) -> None:

@@ -22,12 +22,15 @@ from jaxtyping import Array, Float
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import instance, is_known
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.hermite import Curve
+from rodjax.discretization.shape import Shape
 from rodjax.equilibrium import Equilibrium
 from rodjax.status import Status
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 2
+FORMAT = 3
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -38,6 +41,7 @@ FIELDS = {
     "twist": ("rad/m", "twist Omega at the nodes"),
     "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
     "tension": ("N", "tension at the nodes"),
+    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes"),
     "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
     "elastic_energy": ("J", "elastic energy"),
     "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
@@ -52,8 +56,10 @@ FIELDS = {
     "substeps": ("1", "solves that a step of a path took"),
     "residual": ("1", "largest component of the gradient, in EI/L^2"),
     "radius": ("m", "radius of the rod; absent where it is not known"),
-    "state/polyline/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
-    "state/polyline/edges": ("1", "differences of these nodes, free of the rounding of the positions"),
+    "state/shape/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
+    "state/shape/edges": ("1", "finite differences: differences of these nodes, free of the rounding of the positions"),
+    "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
+    "state/shape/s": ("1", "Hermite elements: arclength of the nodes as a part of the length"),
     "state/end_force": ("1", "force at s = L between held ends, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
@@ -170,7 +176,10 @@ def _read(group: h5py.Group, kind: Any, path: Path) -> Any:
     for field in dataclasses.fields(kind):
         entry = group.get(field.name)
         if isinstance(entry, h5py.Group):
-            values[field.name] = _read(entry, field.type, path)
+            kind_of_field = field.type
+            if kind_of_field is Shape:
+                kind_of_field = Polyline if "edges" in entry else Curve
+            values[field.name] = _read(entry, kind_of_field, path)
         elif isinstance(entry, h5py.Dataset):
             values[field.name] = entry[()]
         elif types.NoneType in typing.get_args(field.type):

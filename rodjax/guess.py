@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, number_array
-from rodjax.discretization.finite_difference import Polyline
 from rodjax.scene import Scene
 from rodjax.supports import Directed, Free, Held, Support
 from rodjax.units import Units
@@ -32,9 +31,9 @@ class Guess(eqx.Module):
         self.points = leaf(number_array(points, "points", shape))
         self.total_twist = leaf(number_array(total_twist, "total_twist"))
 
-    def polyline(self, units: Units, segments: int) -> Polyline:
+    def nodes(self, units: Units, segments: int) -> Float[Array, "n+1 3"]:
         """The nodes of a mesh on this shape, nondimensional."""
-        return Polyline.through(resampled((self.points - units.origin[None]) / units.length, segments))
+        return resampled((self.points - units.origin[None]) / units.length, segments)
 
 
 def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
@@ -45,14 +44,18 @@ def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3
     ends = (2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1])
     extended = jnp.concatenate([ends[0], points, ends[1]])
     slopes = (extended[2:] - extended[:-2]) / 2
-    return cubic(points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
+    places = jnp.arange(m + 1, dtype=points.dtype)
+    return cubic(places, points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
 
 
-def cubic(points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Array, "k"]) -> Float[Array, "k 3"]:
-    """Cubic Hermite interpolation: `points` and `slopes` are value and derivative at x = 0, 1, ..., m - 1."""
-    cell = jnp.clip(jnp.floor(x), 0, len(points) - 2).astype(int)
-    t = (x - cell.astype(x.dtype))[:, None]
-    weights = ((1 + 2 * t) * (1 - t) ** 2, t * (1 - t) ** 2, t**2 * (3 - 2 * t), t**2 * (t - 1))
+def cubic(
+    places: Float[Array, "m"], points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Array, "k"]
+) -> Float[Array, "k 3"]:
+    """Cubic Hermite interpolation: `points` and `slopes` are value and derivative at the increasing `places`."""
+    cell = jnp.clip(jnp.searchsorted(places, x, side="right") - 1, 0, len(points) - 2)
+    width = places[cell + 1] - places[cell]
+    t, h = ((x - places[cell]) / width)[:, None], width[:, None]
+    weights = ((1 + 2 * t) * (1 - t) ** 2, h * t * (1 - t) ** 2, t**2 * (3 - 2 * t), h * t**2 * (t - 1))
     values = (points[cell], slopes[cell], points[cell + 1], slopes[cell + 1])
     return functools.reduce(jnp.add, (weight * value for weight, value in zip(weights, values, strict=True)))
 

@@ -23,7 +23,8 @@ from jaxtyping import Array, Bool, Float, Int
 class SaddlePointSystem(eqx.Module):
     """The matrix above: `diagonal[..., i]` is block (i, i) of H, `lower[..., i]` block (i + 1, i).
 
-    `border` holds A, `compliance` C, symmetric; `rows` stand in the place of A^T where they are given. Blocks of size 1
+    `border` holds A, `compliance` C, symmetric; `rows` stand in the place of A^T where they are given. Every second
+    block of H may also be coupled with the next but one: `across[..., i]` is block (2 i + 2, 2 i). Blocks of size 1
     and 2.
     """
 
@@ -32,11 +33,14 @@ class SaddlePointSystem(eqx.Module):
     border: Float[Array, "b k n"]
     compliance: Float[Array, "k k"]
     rows: Float[Array, "b k n"] | None = None
+    across: Float[Array, "b b (n-1)/2"] | None = None
 
     def __check_init__(self):
         b, k, n = self.border.shape
         rows = self.border if self.rows is None else self.rows
         given = [x.shape for x in (self.diagonal, self.lower, self.border, self.compliance, rows)]
+        if self.across is not None and (n % 2 == 0 or self.across.shape != (b, b, n // 2)):
+            raise ValueError(f"across must have the shape {(b, b, n // 2)} for odd n, got {self.across.shape}, n = {n}")
         if b not in (1, 2) or given != [(b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n)]:
             raise ValueError(
                 "a saddle-point system needs arrays of shapes (b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n) "
@@ -91,7 +95,7 @@ def factor_and_solve(
 
 
 def _factor(system: SaddlePointSystem, right_sides: Float[Array, "b j n"]) -> tuple[Factors, Float[Array, "b j n"]]:
-    elimination, negative, x = _eliminate(system.diagonal, system.lower, right_sides)
+    elimination, negative, x = _eliminate(system.diagonal, system.lower, system.across, right_sides)
     k = system.border.shape[1]
     solution = x[:, :k]
     if system.rows is None:
@@ -138,7 +142,10 @@ class _Elimination(eqx.Module):
 
 
 def _eliminate(
-    diagonal: Float[Array, "b b n"], lower: Float[Array, "b b n-1"], right_sides: Float[Array, "b j n"]
+    diagonal: Float[Array, "b b n"],
+    lower: Float[Array, "b b n-1"],
+    across: Float[Array, "b b (n-1)/2"] | None,
+    right_sides: Float[Array, "b j n"],
 ) -> tuple[_Elimination, Int[Array, ""], Float[Array, "b j n"]]:
     """The factorisation of H, how many negative eigenvalues it has, and H^-1 right_sides, in one sweep.
 
@@ -162,6 +169,8 @@ def _eliminate(
         from_right = _transpose_product(right, scaled[:, b:])
         rows = _less_neighbours(even, from_left, from_right)
         lower = -_transpose_product(right, level.left)[..., : even.shape[-1] - 1]
+        if across is not None:
+            lower, across = lower + across, None
     last_inverse, below = _inverse(rows[:, :b])
     elimination = _Elimination(tuple(levels), last_inverse)
     x = elimination.back_substituted(_product(last_inverse, rows[:, b:]), eliminated)

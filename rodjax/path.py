@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -13,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import instance, leaf, namespace
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
+    Discretization,
     Equilibrium,
     Found,
     Solver,
@@ -38,7 +38,7 @@ def solve_path(
     scenes: Sequence[Scene] | Scene,
     *,
     segments: int | None = None,
-    discretization: Literal["finite_difference"] = "finite_difference",
+    discretization: Discretization = "finite_difference",
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
@@ -62,7 +62,7 @@ def solve_path(
     """
     stacked = stack_scenes(scenes)
     segments, solver = checked_options(stacked, segments, discretization, solver, guess, planar)
-    path = _solve_path(stacked, guess, segments, solver, planar, progress)
+    path = _solve_path(stacked, guess, segments, discretization, solver, planar, progress)
     warn_if_not_converged(path)
     return path
 
@@ -96,15 +96,21 @@ def _structure(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar", "progress"))
+@functools.partial(jax.jit, static_argnames=("segments", "discretization", "solver", "planar", "progress"))
 def _solve_path(
-    scenes: Scene, guess: Guess | Equilibrium | None, segments: int, solver: Solver, planar: bool, progress: bool
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    segments: int,
+    discretization: Discretization,
+    solver: Solver,
+    planar: bool,
+    progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
 
     first = jax.tree.map(lambda leaf: leaf[0], scenes)
-    state, twist = first_state(first, guess, segments)
+    state, twist = first_state(first, guess, segments, discretization)
 
     def step(carry, numbered):
         last, before, bar = carry
@@ -176,8 +182,7 @@ def _step(
         )
 
     zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
-    n = len(last.state.polyline.edges)
-    nowhere = MixedPoint(jnp.zeros((3, n), zero.dtype), jnp.zeros(3, zero.dtype), zero)
+    nowhere = MixedPoint(jnp.zeros_like(last.state.shape.unknown_tangents), jnp.zeros(3, zero.dtype), zero)
     progress = _Progress(
         reached=last.state,
         begin=_predicted(last, before, scene),
@@ -204,9 +209,9 @@ def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
     ratio = jnp.where(goes_on, ratio, 0.0)
 
     state = last.state
-    polyline = state.polyline.extrapolated(before.state.polyline, ratio)
+    shape = state.shape.extrapolated(before.state.shape, ratio)
     force = before.state.end_force * (before.state.units.force / state.units.force)
-    predicted = SolverState(polyline, state.end_force + ratio * (state.end_force - force), state.units)
+    predicted = SolverState(shape, state.end_force + ratio * (state.end_force - force), state.units)
     return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), predicted, state)
 
 

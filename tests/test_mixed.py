@@ -10,8 +10,11 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Free, PointForce, Scene, Swivel, frame, problems
+from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import transport_along, twist_under_moment
 from rodjax.linalg import SaddlePointSystem
 from rodjax.scene import nondimensional
@@ -21,14 +24,22 @@ N = 4
 
 POTENTIAL = ["clamps", "clamp-swivel", "pins", "cantilever", "free start"]
 MOMENT = ["end moment", "start moment"]
+KINDS = ["edges", "elements"]
 
 
-def begin(name: str) -> tuple[MixedForm, MixedPoint]:
+def field(scene: Scene, kind: str = "edges") -> TangentField:
+    """Four edges, or three elements of different lengths."""
+    return EdgeTangents.of(scene, N) if kind == "edges" else HermiteElements(jnp.array([0.0, 0.25, 0.65, 1.0]))
+
+
+def begin(name: str, kind: str = "edges") -> tuple[MixedForm, MixedPoint]:
     """A rough helix under some force; the total twist about 4 rad where the scene has torsion."""
     scene, _ = nondimensional(loaded_scenes()[name])
-    form = MixedForm.of(scene, N)
-    s = (np.arange(N) + 0.5) / N
-    tangents = np.stack([np.cos(2 * s), np.sin(4 * s), 1 - s]) + 0.3 * np.random.default_rng(0).normal(size=(3, N))
+    form = MixedForm.of(scene, field(scene, kind))
+    points = len(form.field.weights)
+    s = (np.arange(points) + 0.5) / points
+    rough = 0.3 * np.random.default_rng(0).normal(size=(3, points))
+    tangents = np.stack([np.cos(2 * s), np.sin(4 * s), 1 - s]) + rough
     tangents = jnp.asarray(tangents / np.linalg.norm(tangents, axis=0))
     force = [0.0, 0.0, 0.0] if isinstance(scene.start, Free) or isinstance(scene.end, Free) else [3.0, -20.0, 5.0]
     twist = 4.0 if form.has_torsion else 0.0
@@ -49,6 +60,10 @@ def by_all(system: SaddlePointSystem) -> tuple[np.ndarray, np.ndarray, np.ndarra
     for i in range(n - 1):
         hessian[i + 1, :, i] = system.lower[..., i]
         hessian[i, :, i + 1] = np.asarray(system.lower[..., i]).T
+    if system.across is not None:
+        for i in range(n // 2):
+            hessian[2 * i + 2, :, 2 * i] = system.across[..., i]
+            hessian[2 * i, :, 2 * i + 2] = np.asarray(system.across[..., i]).T
     hessian = hessian.reshape(n * b, n * b)
     columns = np.asarray(system.border).transpose(2, 0, 1).reshape(n * b, k)
     rows = columns if system.rows is None else np.asarray(system.rows).transpose(2, 0, 1).reshape(n * b, k)
@@ -73,9 +88,10 @@ def vector_and_closure(here: Linearization) -> tuple[jax.Array, jax.Array]:
     return jnp.sum(here.bases * here.gradient[None], axis=1), here.closure[-3:]
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", POTENTIAL)
-def test_gradient_is_the_derivative_of_the_energy(name):
-    form, point = begin(name)
+def test_gradient_is_the_derivative_of_the_energy(name, kind):
+    form, point = begin(name, kind)
     here, energy, nowhere = derivatives(form, point, lambda here: here.energy)
     by_rotation, by_force = jax.jit(jax.grad(energy, argnums=(0, 1)))(*nowhere)
     # Derivatives up to 1e3, and a few hundred roundings.
@@ -84,19 +100,22 @@ def test_gradient_is_the_derivative_of_the_energy(name):
         np.testing.assert_allclose(here.closure[-3:], by_force, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", POTENTIAL + MOMENT)
-def test_the_system_is_the_derivative_of_gradient_and_closure(name):
-    form, point = begin(name)
+def test_the_system_is_the_derivative_of_gradient_and_closure(name, kind):
+    form, point = begin(name, kind)
     here, both, nowhere = derivatives(form, point, vector_and_closure)
     (vectors, vectors_by_force), (closure, closure_by_force) = jax.jit(jax.jacfwd(both, argnums=(0, 1)))(*nowhere)
-    by_rotation = np.einsum("cin,cnjm->nimj", here.bases, vectors).reshape(2 * N, 2 * N)
+    size = here.gradient.size
+    by_rotation = np.einsum("cin,cnjm->nimj", here.bases, vectors).reshape(size, size)
+    by_rotation += np.diag(np.einsum("cin->ni", here.bases**2).ravel() == 0)  # the unit block of a held tangent
     hessian, mixed, by_force = by_all(here.system)
     # Entries up to 1e4 in joints bent by a radian over a quarter of the rod.
     np.testing.assert_allclose(hessian, by_rotation, rtol=0, atol=1e-10)
     if mixed.shape[1]:
-        columns = np.einsum("cin,cnf->nif", here.bases, vectors_by_force).reshape(2 * N, 3)
+        columns = np.einsum("cin,cnf->nif", here.bases, vectors_by_force).reshape(size, 3)
         np.testing.assert_allclose(mixed, columns, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(mixed, np.asarray(closure).transpose(2, 1, 0).reshape(2 * N, 3), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(mixed, np.asarray(closure).transpose(2, 1, 0).reshape(size, 3), rtol=0, atol=1e-12)
         np.testing.assert_allclose(by_force, closure_by_force, rtol=0, atol=1e-14)
 
 
@@ -112,7 +131,8 @@ def test_gradient_with_a_dead_moment_is_that_of_the_work_on_the_end_frame(name):
     free, clamp = (scene.start, scene.end) if isinstance(scene.start, Free) else (scene.end, scene.start)
     without = eqx.tree_at(lambda free: free.moment, free, None)
     ends = (without, clamp) if isinstance(scene.start, Free) else (clamp, without)
-    only_force = MixedForm.of(Scene(scene.rod, *ends, scene.gravity), N)
+    bare = Scene(scene.rod, *ends, scene.gravity)
+    only_force = MixedForm.of(bare, field(bare))
     for sign in (1, -1):
         moved = form.moved(point, here.bases, sign * step * direction, jnp.zeros(3))
         energies.append(float(linearized(only_force, moved).energy))
@@ -154,9 +174,9 @@ def solved(request) -> tuple[MixedForm, FiniteDifference, Polyline, MixedPoint]:
     result = rj.solve(scene, segments=N, solver=rj.Newton(tolerance=0.0))
     assert result.converged
     scaled, _ = nondimensional(scene)
-    problem, polyline = FiniteDifference.begin(scaled, result.state.polyline, result.total_twist)
+    problem, polyline = FiniteDifference.begin(scaled, result.state.shape, result.total_twist)
     point = MixedPoint(problem.mixed_point(polyline).tangents, result.state.end_force, result.total_twist)
-    return MixedForm.of(scaled, N), problem, polyline, point
+    return MixedForm.of(scaled, field(scaled)), problem, polyline, point
 
 
 def test_unknowns_change_back_and_forth(solved):
@@ -202,7 +222,7 @@ def jaxpr_text(scene: Scene) -> str:
     scaled, _ = nondimensional(scene)
 
     def moved_and_linearized(scaled, point, rotation):
-        form = MixedForm.of(scaled, N)
+        form = MixedForm.of(scaled, field(scaled))
         here = form.linearized(point)
         return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros(3))).gradient
 

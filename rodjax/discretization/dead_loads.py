@@ -33,6 +33,15 @@ def forces_on_nodes(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     return -jax.grad(lambda nodes: load_energy(scene, nodes))(nodes)
 
 
+def total_force(scene: Scene) -> Float[Array, "3"]:
+    """All loads together."""
+    forces = [load.force for load in scene.point_forces]
+    forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+    if scene.gravity is not None:
+        forces.append(scene.gravity)
+    return sum(forces, jnp.zeros(3, scene.rod.length.dtype))
+
+
 def forces_beyond_edges(scene: Scene, node_forces: Float[Array, "3 n+1"]) -> Float[Array, "3 n"]:
     """The sum of the forces on the nodes beyond each edge; where the start is free, less all of them."""
     if isinstance(scene.start, Held):
@@ -55,9 +64,4 @@ def _position_on(nodes: Float[Array, "n+1 3"], s: Float[Array, ""]) -> Float[Arr
 
 def energy_of_origin(scene: Scene, units: Units) -> Float[Array, ""]:
     """Potential energy [J] of all dead forces of a nondimensional scene at its origin."""
-    forces = [load.force for load in scene.point_forces]
-    forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
-    if scene.gravity is not None:
-        forces.append(scene.gravity)
-    energy = sum((dead_load_energy(force, units.origin) for force in forces), jnp.zeros_like(units.length))
-    return energy * units.force
+    return dead_load_energy(total_force(scene), units.origin) * units.force

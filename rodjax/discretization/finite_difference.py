@@ -7,6 +7,8 @@ order in the spacing, as measured in `docs/design.md`.
 Here the unknowns are the nodes, as in the report; `mixed.MixedForm` is the same discretization in other unknowns.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,11 +25,13 @@ from rodjax.discretization.joints import (
     tangent_bases,
     with_held_tangents,
 )
-from rodjax.discretization.mixed import FLOOR_SAFETY, MixedPoint
+from rodjax.discretization.mixed import FLOOR_SAFETY, MixedForm, MixedPoint
+from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import (
     FramedTangents,
     TwistReference,
     angle_about,
+    nearest_twist,
     total_twist,
     transport_along,
     twist_under_moment,
@@ -39,7 +43,7 @@ from rodjax.strain import axial_strain
 from rodjax.supports import Clamp, Directed, Held
 
 
-class Polyline(eqx.Module):
+class Polyline(Shape):
     """Nodes and the edges between them.
 
     The edges are kept, not recomputed: as differences of nodes they would be off by the rounding of the positions,
@@ -50,8 +54,8 @@ class Polyline(eqx.Module):
     edges: Float[Array, "n 3"]
 
     @staticmethod
-    def through(nodes: Float[Array, "n+1 3"]) -> "Polyline":
-        return Polyline(nodes, jnp.diff(nodes, axis=0))
+    def through(points: Float[Array, "n+1 3"]) -> "Polyline":
+        return Polyline(points, jnp.diff(points, axis=0))
 
     @property
     def lengths(self) -> Float[Array, "n"]:
@@ -61,8 +65,21 @@ class Polyline(eqx.Module):
     def tangents(self) -> Float[Array, "3 n"]:
         return self.edges.T / self.lengths[None]
 
-    def extrapolated(self, older: "Polyline", ratio: Float[Array, ""]) -> "Polyline":
-        """From an older one through this one, on by so much of the way between: by the tangents, with these lengths."""
+    @property
+    def unknown_tangents(self) -> Float[Array, "3 n"]:
+        return self.tangents
+
+    def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "Polyline":
+        return Polyline(self.nodes * scale + shift[None], self.edges * scale)
+
+    def reached(self, form: MixedForm, point: MixedPoint) -> "Polyline":
+        edges = form.edges(point)
+        return Polyline(form.nodes(edges), edges)
+
+    def change_to(self, other: Any) -> Float[Array, ""]:
+        return jnp.max(jnp.abs(other.edges - self.edges)) * len(self.edges)
+
+    def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> "Polyline":
         tangents = self.tangents + ratio * (self.tangents - older.tangents)
         edges = (tangents * (self.lengths / jnp.sqrt(dot(tangents, tangents)))[None]).T
         ways = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
@@ -286,8 +303,4 @@ def _twist_reference(scene: Scene, polyline: Polyline, guess_twist: Float[Array,
         return None
     carried = transport_along(state.start_d1, state.tangents)[:, -1]
     principal = angle_about(state.tangents[:, -1], carried, state.end_d1)
-    if scene.turns is None:
-        turns = jnp.round((guess_twist - principal) / (2 * jnp.pi))
-    else:
-        turns = scene.turns
-    return TwistReference(state, principal + 2 * jnp.pi * turns)
+    return TwistReference(state, nearest_twist(principal, guess_twist, scene.turns))

@@ -25,22 +25,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes
-from rodjax.discretization.joints import (
-    assembled,
-    bending_derivatives,
-    by_edges,
-    components,
-    dot,
-    joints,
-    of_edges,
-    outer,
-    rotated,
-    tangent_bases,
-    twist_derivatives,
-    with_held_tangents,
-)
-from rodjax.discretization.twist import swept_twist, twist_under_moment
+from rodjax.discretization.dead_loads import total_force
+from rodjax.discretization.joints import components, dot, outer, rotated, tangent_bases
+from rodjax.discretization.tangent_field import TangentField
+from rodjax.discretization.twist import twist_under_moment
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import SaddlePointSystem
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
@@ -85,28 +73,27 @@ class Linearization(eqx.Module):
 
 
 class MixedForm(eqx.Module):
-    """A nondimensional scene on a polyline, as a function of a `MixedPoint`.
+    """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
-    `node_forces`: what the loads exert on the nodes; `forces_beyond`: on what lies beyond each edge; `axes`: unit
+    `forces_beyond`: what the loads exert on what lies beyond each point; `axes`: unit
     vectors along which the rod may leave its place, `None` for all of space: two for a rod in a plane, its normal for
     motions out of it. In a symmetric scene the two kinds do not couple.
     """
 
     scene: Scene
-    node_forces: Float[Array, "3 n+1"]
-    forces_beyond: Float[Array, "3 n"]
+    field: TangentField
+    forces_beyond: Float[Array, "3 m"]
     axes: Float[Array, "3 a"] | None = None
 
     @staticmethod
-    def of(scene: Scene, segments: int) -> "MixedForm":
-        forces = forces_on_nodes(scene, segments).T
-        return MixedForm(scene, forces, forces_beyond_edges(scene, forces))
+    def of(scene: Scene, field: TangentField) -> "MixedForm":
+        return MixedForm(scene, field, field.forces_beyond(scene))
 
     def along(self, axes: Float[Array, "3 a"]) -> "MixedForm":
-        return MixedForm(self.scene, self.node_forces, self.forces_beyond, axes)
+        return MixedForm(self.scene, self.field, self.forces_beyond, axes)
 
     def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
-        """The directions in which each tangent may turn."""
+        """Directions at right angles to each tangent, along the axes."""
         if self.axes is None:
             return tangent_bases(tangents)
         if self.axes.shape[1] == 1:
@@ -127,9 +114,14 @@ class MixedForm(eqx.Module):
     def edge_tension(self, point: MixedPoint) -> Float[Array, "n"]:
         return dot(point.end_force[:, None] + self.forces_beyond, point.tangents)
 
-    def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
+    def slopes(self, point: MixedPoint) -> Float[Array, "3 m"]:
+        """The derivative of the centerline by arclength."""
         strain = axial_strain_under(self.scene.rod, self.edge_tension(point))
-        return ((1 + strain)[None] * point.tangents).T / point.tangents.shape[1]
+        return (1 + strain)[None] * point.tangents
+
+    def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
+        """From node to node."""
+        return self.field.ways(self.slopes(point))
 
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
         """Nodes along the edges, between held ends to the last digit."""
@@ -145,18 +137,26 @@ class MixedForm(eqx.Module):
 
     def end_forces(self, point: MixedPoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""
-        total = jnp.sum(self.node_forces, axis=1)
+        total = total_force(self.scene)
         for end, sign in ((self.scene.start, -1), (self.scene.end, 1)):
             if isinstance(end, Free):
                 given = jnp.zeros_like(total) if end.force is None else sign * end.force
                 return (given, -total) if sign < 0 else (total, given)
         return point.end_force + total, point.end_force
 
+    def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
+        """The potential of gravity and dead forces, zero at the origin."""
+        start, end = self.scene.start, self.scene.end
+        held = start if isinstance(start, Held) else end
+        assert isinstance(held, Held), "a scene holds at least one position"
+        work = jnp.sum(self.field.weights * dot(self.forces_beyond, self.slopes(point)))
+        return -work - jnp.sum(total_force(self.scene) * held.position)
+
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod
         strain = axial_strain_under(rod, self.edge_tension(point))
-        stretching = jnp.mean(density(rod, axial_strain=strain))
-        bending = joints(self.scene, point.tangents).bending_energy(rod)
+        stretching = jnp.sum(self.field.weights * density(rod, axial_strain=strain))
+        bending = self.field.bending_energy(self.scene, point.tangents)
         return bending + stretching + density(rod, twist=point.total_twist)
 
     def moved(
@@ -169,47 +169,43 @@ class MixedForm(eqx.Module):
         tangents = rotated(point.tangents, bases, rotation)
         twist = point.total_twist
         if self.has_torsion:
-            before, after = (with_held_tangents(self.scene, t) for t in (point.tangents, tangents))
-            twist += swept_twist(before, after)
+            twist += self.field.swept(self.scene, point.tangents, tangents)
         elif not self.has_potential:
             twist = twist_under_moment(self.scene, tangents)
         return MixedPoint(tangents, point.end_force + force_change, twist)
 
     def linearized(self, point: MixedPoint) -> Linearization:
-        scene, rod, tangents = self.scene, self.scene.rod, point.tangents
-        n = tangents.shape[1]
-        h = 1 / n
-        all_joints = joints(scene, tangents)
-        all_bases = self.bases(with_held_tangents(scene, tangents))
-        beside = (all_bases[..., :-1], all_bases[..., 1:])
-        bases = of_edges(scene, all_bases, n)
-        derivatives = bending_derivatives(rod, all_joints, beside)
+        scene, rod, field, tangents = self.scene, self.scene.rod, self.field, point.tangents
+        weights = field.weights
+        all_bases = self.bases(field.with_held(scene, tangents))
+        bases = field.basis(scene, all_bases)
+        energy, blocks = field.bending(scene, tangents, all_bases)
         columns, closure, compliance = [], [], []
-        energy = all_joints.bending_energy(rod)
         torque_column = None
         if self.has_torsion or not self.has_potential:
-            twist = twist_derivatives(all_joints, beside)
+            twist = field.twist(scene, tangents, all_bases)
             torsion, torque, stiffness = _with_derivatives(lambda twist: density(rod, twist=twist), point.total_twist)
-            derivatives = jax.tree.map(lambda bent, twisted: bent + torque * twisted, derivatives, twist)
-            torque_column = by_edges(scene, twist.before, twist.after, n)[:, None]
+            blocks = jax.tree.map(lambda bent, twisted: bent + torque * twisted, blocks, twist)
+            torque_column = twist.gradient[:, None]
             if self.has_torsion:
                 energy += torsion
                 columns.append(torque_column)
                 closure.append(jnp.zeros(1, energy.dtype))
                 compliance.append(1 / stiffness[None, None])
-        gradient, diagonal, lower = assembled(scene, derivatives, n)
+        gradient, diagonal = blocks.gradient, blocks.diagonal
 
         forces = point.end_force[:, None] + self.forces_beyond
         tension = dot(forces, tangents)
         strain, softness = jax.jvp(
             lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
         )
-        lengths = h * (1 + strain)
+        lengths = weights * (1 + strain)
         across = components(bases, forces)
         gradient -= lengths[None] * across
         identity = jnp.eye(bases.shape[1], dtype=energy.dtype)[..., None]
-        diagonal += (lengths * tension)[None, None] * identity - (h * softness)[None, None] * outer(across, across)
-        energy += h * jnp.sum(density(rod, axial_strain=strain) - tension * (1 + strain))
+        diagonal += (lengths * tension)[None, None] * identity
+        diagonal -= (weights * softness)[None, None] * outer(across, across)
+        energy += jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
         if isinstance(scene.start, Held) and isinstance(scene.end, Held):
             span = scene.end.position - scene.start.position
             energy += jnp.sum(point.end_force * span)
@@ -219,12 +215,13 @@ class MixedForm(eqx.Module):
                 lacking = lacking @ self.axes
                 directions = jnp.sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
                 along = self.axes.T @ tangents
-            columns.append(-lengths[None, None] * directions - (h * softness)[None, None] * outer(across, along))
+            columns.append(-lengths[None, None] * directions - (weights * softness)[None, None] * outer(across, along))
             closure.append(lacking)
-            compliance.append(((h * softness)[None] * along) @ along.T)
+            compliance.append(((weights * softness)[None] * along) @ along.T)
         rows = None
         moment = dead_end_moment(scene)
         if moment is not None:
+            n = tangents.shape[1]
             edge = 0 if isinstance(scene.start, Free) else n - 1
             tangent, basis = tangents[:, edge], bases[..., edge]
             gradient = gradient.at[:, edge].add(-jnp.cross(moment, tangent) @ basis)
@@ -237,20 +234,21 @@ class MixedForm(eqx.Module):
             torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
             rows = jnp.concatenate([torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))], axis=1)
             closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
-            energy = n * jnp.sum(gradient**2) / 2
+            energy = jnp.sum(gradient**2 / weights[None]) / 2
         return Linearization(
             bases=bases,
             gradient=gradient,
             closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
-                diagonal,
-                lower,
-                jnp.concatenate(columns, axis=1) if columns else jnp.zeros((bases.shape[1], 0, n), energy.dtype),
+                field.held(scene, diagonal),
+                blocks.lower,
+                jnp.concatenate(columns, axis=1) if columns else jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1])),
                 jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
                 rows,
+                blocks.across,
             ),
             energy=energy,
-            residual=self._residual(jnp.sum(bases * gradient[None], axis=1) / lengths[None]),
+            residual=field.residual(scene, jnp.sum(bases * gradient[None], axis=1), lengths),
         )
 
     @property
@@ -280,20 +278,11 @@ class MixedForm(eqx.Module):
         first = len(here.closure) - self._closures
         return jnp.sum(here.system.border[:, first:] * change[None, :, None], axis=1)
 
-    def _residual(self, edge_forces: Float[Array, "3 n"]) -> Float[Array, ""]:
-        """Largest component of the force on a free node."""
-        beyond = jnp.zeros_like(edge_forces[:, :1])
-        if not isinstance(self.scene.start, Held):
-            edge_forces = jnp.concatenate([beyond, edge_forces], axis=1)
-        if not isinstance(self.scene.end, Held):
-            edge_forces = jnp.concatenate([edge_forces, beyond], axis=1)
-        return jnp.max(jnp.abs(jnp.diff(edge_forces, axis=1)))
-
     def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
         largest = jnp.max(jnp.abs(point.end_force[:, None] + self.forces_beyond))
         eps = jnp.finfo(largest.dtype).eps
-        return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * point.tangents.shape[1] ** 2)
+        return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 / self.field.finest**2)
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         """Whether the polyline spans its ends as well as befits a residual of this tolerance."""

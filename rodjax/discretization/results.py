@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.joints import (
     Joints,
     bending_derivatives,
@@ -12,6 +13,7 @@ from rodjax.discretization.joints import (
     tangent_bases,
     twist_derivatives,
 )
+from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import angle_about, transport, transport_along
 from rodjax.rod import Rod
 from rodjax.scene import Scene
@@ -31,7 +33,46 @@ class Resultants(eqx.Module):
     end_moment: Float[Array, "3"]
 
 
-def resultants(
+def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
+    """Of an equilibrium."""
+    if isinstance(form.field, HermiteElements):
+        return _on_elements(form, form.field, point)
+    return _on_edges(form.scene, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
+
+
+def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> Resultants:
+    """Moments are the derivatives of the energy of the element beside by the tangent of a node: of fourth order too."""
+    scene, rod, tangents = form.scene, form.scene.rod, point.tangents
+    nodes = tangents[:, ::2]
+    torque = rod.GJ * point.total_twist
+    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
+    curvature = jnp.sqrt(dot(moments, moments)) / rod.EI
+    moments += torque * nodes
+    forces = form.end_forces(point)
+    tension = form.edge_tension(point)[::2]
+    ends = [jnp.sum(force * nodes[:, k])[None] for k, force in zip((0, -1), forces, strict=True)]
+    start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(nodes[:, 0])
+    return Resultants(
+        frames=_turning_frames(scene, nodes, field.carried(start_d1, tangents), point.total_twist * field.s),
+        curvature=curvature,
+        twist=jnp.full_like(field.s, point.total_twist),
+        tension=jnp.concatenate([ends[0], tension[1:-1], ends[1]]),
+        start_force=forces[0],
+        start_moment=_given_moment(scene.start, moments[:, 0], sign=-1),
+        end_force=forces[1],
+        end_moment=_given_moment(scene.end, moments[:, -1], sign=1),
+    )
+
+
+def _given_moment(end: Support, held: Float[Array, "3"], *, sign: int) -> Float[Array, "3"]:
+    """The section moment at an end: that which holds it, or the given one."""
+    if isinstance(end, Directed):
+        return held
+    return sign * end.moment if isinstance(end, Free) and end.moment is not None else jnp.zeros_like(held)
+
+
+def _on_edges(
     scene: Scene,
     tangents: Float[Array, "3 n"],
     edge_tension: Float[Array, "n"],
@@ -74,10 +115,8 @@ def _end_moment(
 ) -> Float[Array, "3"]:
     """The section moment at an end: the derivative of the energy by a rotation of the support, or the given moment."""
     sign = -1 if at_start else 1
-    if isinstance(end, Free):
-        return jnp.zeros(3, edge_tangent.dtype) if end.moment is None else sign * end.moment
     if not isinstance(end, Directed):
-        return jnp.zeros(3, edge_tangent.dtype)
+        return _given_moment(end, jnp.zeros(3, edge_tangent.dtype), sign=sign)
 
     order = (end.tangent, edge_tangent) if at_start else (edge_tangent, end.tangent)
     before, after = (tangent[:, None] for tangent in order)
@@ -114,7 +153,13 @@ def _frames(
     along_edges = transport_along(start_d1, jnp.concatenate([nodes[:, :1], edges], axis=1))
     d1 = transport(along_edges[:, 1:], edges, nodes[:, 1:])
     d1 = jnp.concatenate([start_d1[:, None], d1], axis=1)
-    angle = twist * jnp.linspace(0.0, 1.0, nodes.shape[1], dtype=twist.dtype)
+    return _turning_frames(scene, nodes, d1, twist * jnp.linspace(0.0, 1.0, nodes.shape[1], dtype=twist.dtype))
+
+
+def _turning_frames(
+    scene: Scene, nodes: Float[Array, "3 n+1"], d1: Float[Array, "3 n+1"], angle: Float[Array, "n+1"]
+) -> Float[Array, "n+1 3 3"]:
+    """Frames about these tangents, from directors carried without twist and the angles by which to turn them."""
     if isinstance(scene.end, Clamp) and not isinstance(scene.start, Clamp):
         angle += angle_about(nodes[:, -1], d1[:, -1], scene.end.frame[:, 0]) - angle[-1]
     d2 = cross(nodes, d1)

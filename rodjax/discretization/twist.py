@@ -78,6 +78,15 @@ def angle_about(
     return jnp.arctan2(dot(axis, cross(vector, other)), dot(vector, other))
 
 
+def nearest_twist(
+    principal: Float[Array, ""], guess: Float[Array, ""], turns: Float[Array, ""] | None
+) -> Float[Array, ""]:
+    """The total twist [rad] which is `principal` up to whole turns: these turns, or those nearest to a guess."""
+    if turns is None:
+        turns = jnp.round((guess - principal) / (2 * jnp.pi))
+    return principal + 2 * jnp.pi * turns
+
+
 def twist_under_moment(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
     """The total twist that a dead moment on the free end raises: its part about the end tangent, constant in s."""
     moment = dead_end_moment(scene)

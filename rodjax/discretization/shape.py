@@ -1,0 +1,41 @@
+"""What a solve starts from and ends in: the nodes, and the unknowns of its discretization."""
+
+from abc import abstractmethod
+from typing import Any, Self
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+
+
+class Shape(eqx.Module):
+    """A centerline in nondimensional units, to the last bit."""
+
+    nodes: eqx.AbstractVar[Float[Array, "n+1 3"]]
+
+    @property
+    @abstractmethod
+    def unknown_tangents(self) -> Float[Array, "3 m"]:
+        """The tangents of a `MixedPoint`."""
+
+    @staticmethod
+    @abstractmethod
+    def through(points: Float[Array, "k 3"]) -> "Shape":
+        """Through equally spaced points."""
+
+    @abstractmethod
+    def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> Self:
+        """Scaled, then shifted."""
+
+    @abstractmethod
+    def reached(self, form: MixedForm, point: MixedPoint) -> Self:
+        """The shape of a solution."""
+
+    @abstractmethod
+    def change_to(self, other: Any) -> Float[Array, ""]:
+        """Largest difference to another of its kind, as a part of the length that it belongs to."""
+
+    @abstractmethod
+    def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> Self:
+        """From an older one of its kind through this one, on by so much of the way between, as far as tangents go."""

@@ -1,0 +1,83 @@
+"""What a discretization in tangents hands to the mixed form."""
+
+from typing import Protocol
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from rodjax.scene import Scene
+
+
+class Blocks(eqx.Module):
+    """First and second derivatives of an energy by rotations of the tangents at m points along the rod.
+
+    `diagonal[..., i]`: block (i, i) of the second derivatives; `lower[..., i]`: (i + 1, i); `across[..., i]`:
+    (2 i + 2, 2 i), between the ends of an element with a point in its middle.
+    """
+
+    gradient: Float[Array, "b m"]
+    diagonal: Float[Array, "b b m"]
+    lower: Float[Array, "b b m-1"]
+    across: Float[Array, "b b (m-1)/2"] | None = None
+
+
+class TangentField(Protocol):
+    """Unit tangents at m points along the rod, and the strains, places and loads that belong to them.
+
+    `bases` in the arguments are those of `with_held`; what comes back belongs to the m points.
+    """
+
+    @property
+    def s(self) -> Float[Array, "n+1"]:
+        """Arclengths of the nodes: 0, ..., 1."""
+        ...
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        """The length of rod that each point stands for."""
+        ...
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        """The shortest distance between points."""
+        ...
+
+    def with_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 k"]:
+        """With the tangents that supports hold beyond the points."""
+        ...
+
+    def basis(self, scene: Scene, bases: Float[Array, "3 b k"]) -> Float[Array, "3 b m"]:
+        """The directions in which the tangents may turn: none where a support holds one."""
+        ...
+
+    def held(self, scene: Scene, diagonal: Float[Array, "b b m"]) -> Float[Array, "b b m"]:
+        """With a unit block for each tangent that does not turn."""
+        ...
+
+    def bending_energy(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]: ...
+
+    def bending(
+        self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b k"]
+    ) -> tuple[Float[Array, ""], Blocks]:
+        """The bending energy and its derivatives by rotations of the tangents."""
+        ...
+
+    def twist(self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b k"]) -> Blocks:
+        """Derivatives of the total twist by rotations of the tangents."""
+        ...
+
+    def swept(self, scene: Scene, old: Float[Array, "3 m"], new: Float[Array, "3 m"]) -> Float[Array, ""]:
+        """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
+        ...
+
+    def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:
+        """From node to node, of a curve with these derivatives by arclength at the points."""
+        ...
+
+    def forces_beyond(self, scene: Scene) -> Float[Array, "3 m"]:
+        """What the loads beyond each point exert on it; where the start is free, less all of them."""
+        ...
+
+    def residual(self, scene: Scene, gradient: Float[Array, "3 m"], lengths: Float[Array, "m"]) -> Float[Array, ""]:
+        """The largest force [EI/L^2] that a gradient of the energy by rotations leaves."""
+        ...

@@ -12,7 +12,7 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from scipy.interpolate import CubicSpline
 import rodjax
 from rodjax import problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
-from rodjax.equilibrium import first_state
+from rodjax.equilibrium import Discretization, first_state
 from rodjax.path import stack_scenes
 from rodjax.scene import nondimensional
 
@@ -100,7 +100,7 @@ class Rodjax:
     def __init__(
         self,
         name: str,
-        discretization: Literal["finite_difference"],
+        discretization: Discretization,
         solver: Any,
         on: Sequence[str] = ("P1", "P2", "P3"),
         up_to: int = 1000,
@@ -254,8 +254,9 @@ class Optimistix(Minimizer):
         return compiled(minimized, *start, x)
 
 
-NEWTON = "finite differences, Newton"
+NEWTON, HERMITE = "finite differences, Newton", "Hermite elements, Newton"
 METHODS: list[Method] = [
+    Rodjax(HERMITE, "hermite", rodjax.Newton(tolerance=TOLERANCE), up_to=200),
     Rodjax(NEWTON, "finite_difference", rodjax.Newton(tolerance=TOLERANCE)),
     Rodjax("finite differences, NCG", "finite_difference", rodjax.NonlinearCG(tolerance=TOLERANCE)),
     Rodjax(
@@ -274,6 +275,7 @@ METHODS: list[Method] = [
 ]
 CPP = "C++ Newton"
 STYLES = {
+    HERMITE: ("C5", "o-"),
     NEWTON: ("C0", "o-"),
     "finite differences, NCG": ("C1", "o-"),
     "finite differences, plain NCG": ("C3", "o-"),
@@ -434,7 +436,7 @@ def picture(rows: Sequence[Row], benchmark: Sequence[Problem]) -> Figure:
                     markerfacecolor=fill,
                     markersize=5,
                 )
-            for row in curve if method == NEWTON else ():
+            for row in curve if method in (NEWTON, HERMITE) else ():
                 offset = {"textcoords": "offset points", "xytext": (0, 7), "fontsize": 7, "color": color}
                 axes.annotate(str(row.segments), (row.error, row.ms_median), ha="center", **offset)
         axes.invert_xaxis()

@@ -509,6 +509,7 @@ def _equilibrium(
         evaluations=jnp.asarray(iterations) + 1,
         substeps=none + 1,
         residual=residual,
+        error_estimate=jnp.full_like(scene.rod.length, jnp.nan),
         radius=scene.rod.radius,
         state=_warm_start(scaled, nodes, last, units),
     )

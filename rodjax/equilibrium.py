@@ -1,6 +1,7 @@
 """solve(): the equilibrium of a scene."""
 
 import functools
+import math
 import typing
 import warnings
 from typing import Any, Literal
@@ -11,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import instance, is_known, whole_number
+from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.edges import EdgeTangents
+from rodjax.discretization.error import estimated_errors
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
@@ -24,6 +26,7 @@ from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under
 from rodjax.guess import Guess, cubic, first_shape, resampled
 from rodjax.plane import check_planar, is_planar, plane
+from rodjax.refinement import SAFETY, SIZES, graded, next_size
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
 from rodjax.solvers.newton import Newton, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
@@ -38,6 +41,11 @@ Discretization = Literal["finite_difference", "hermite"]
 SAME_SHAPE = 64
 
 DEFAULT_SEGMENTS = 50
+# Elements of the first mesh on the way to a tolerance, and of the only one inside jit.
+FIRST_SIZE = 6
+TRACED_SEGMENTS = 32
+# A smaller error than this drowns in the residual of 1e-8 EI/L^2 at which a solve stops.
+LEAST_RTOL = 1e-10
 DEFAULT_SOLVER = Newton()
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
@@ -80,6 +88,8 @@ class Equilibrium(eqx.Module):
     - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
       a step of a path took: 1, or more where it was split
     - `residual` [...] largest component of the gradient, in EI/L^2
+    - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; Hermite elements
+      only, else NaN
     - `radius` [...] of the rod, m, or `None`: for pictures
     """
 
@@ -104,6 +114,7 @@ class Equilibrium(eqx.Module):
     evaluations: Int[Array, "..."]
     substeps: Int[Array, "..."]
     residual: Float[Array, "..."]
+    error_estimate: Float[Array, "..."]
     radius: Float[Array, "..."] | None
     state: SolverState
 
@@ -134,7 +145,8 @@ def solve(
     scene: Scene,
     *,
     segments: int | None = None,
-    discretization: Discretization = "finite_difference",
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
@@ -147,7 +159,11 @@ def solve(
 
     - `scene`: `Scene`.
     - `segments`: of the mesh; `None`: those of a guess that is an `Equilibrium`, else 50.
-    - `discretization`: `"finite_difference"`, of second order in 1/segments, or `"hermite"`, of fourth order.
+    - `rtol`: the relative error of the shape that is wanted, instead of `segments`: Hermite elements are added, where
+      they are needed, until the estimated error is below it. Where the numbers of the scene are not known, as inside
+      `jit`, the mesh has 32 equal elements whatever `rtol`, and `error_estimate` says what that gives.
+    - `discretization`: `"finite_difference"`, of second order in 1/segments, or `"hermite"`, of fourth order. `None`:
+      `"hermite"` where `rtol` is given, else `"finite_difference"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
       supports and gravity.
@@ -163,10 +179,71 @@ def solve(
             f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
+    if discretization is None:
+        discretization = "finite_difference" if rtol is None else "hermite"
+    if rtol is not None:
+        _check_rtol(rtol, segments, discretization)
+        segments = _first_size(guess) if is_known(scene, guess) else TRACED_SEGMENTS
     segments, solver = checked_options(scene, segments, discretization, solver, guess, planar)
     result = _solve(scene, guess, segments, discretization, solver, planar)
+    if rtol is not None and is_known(result):
+        result = _refined(scene, result, float(rtol), solver, planar)
     warn_if_not_converged(result)
     return result
+
+
+def _check_rtol(rtol: float, segments: int | None, discretization: Discretization) -> None:
+    if segments is not None:
+        raise ValueError(f"segments must be None where rtol is given, got segments={segments!r} and rtol={rtol!r}")
+    if discretization != "hermite":
+        raise ValueError(f"discretization must be 'hermite' where rtol is given, got {discretization!r}")
+    if not LEAST_RTOL <= float(positive(rtol, "rtol")) <= 1.0:
+        raise ValueError(f"rtol must lie in {LEAST_RTOL:g} to 1, got {rtol!r}")
+
+
+def _first_size(guess: Guess | Equilibrium | None) -> int:
+    if isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Curve):
+        return guess.s.shape[-1] - 1
+    return FIRST_SIZE
+
+
+def _refined(scene: Scene, result: Equilibrium, rtol: float, solver: Solver, planar: bool) -> Equilibrium:
+    """Solved again, each time from the last, on meshes of more elements until the estimated error is below `rtol`."""
+    while True:
+        segments, error = result.s.shape[-1] - 1, float(result.error_estimate)
+        if (bool(result.converged) and SAFETY * error <= rtol) or segments >= SIZES[-1]:
+            break
+        if not result.converged:
+            error = math.nan
+        iterations, evaluations = result.iterations, result.evaluations
+        result = _solve_finer(scene, result, next_size(segments, error, rtol), solver, planar)
+        result = eqx.tree_at(
+            lambda result: (result.iterations, result.evaluations),
+            result,
+            (result.iterations + iterations, result.evaluations + evaluations),
+        )
+    if result.converged and not error <= rtol:
+        warnings.warn(
+            f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh of {segments} elements",
+            NotConvergedWarning,
+            stacklevel=3,
+        )
+    return result
+
+
+@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar"))
+def _solve_finer(scene: Scene, coarse: Equilibrium, segments: int, solver: Solver, planar: bool) -> Equilibrium:
+    """On elements where the coarse solution, if it is one, shows defects."""
+    scaled, _ = nondimensional(scene)
+    state = coarse.state
+    shape = state.shape
+    assert isinstance(shape, Curve)
+    form = MixedForm.of(scaled, _field(scaled, shape))
+    errors = estimated_errors(form, MixedPoint(shape.tangents, state.end_force, coarse.total_twist))
+    is_usable = coarse.converged & jnp.all(jnp.isfinite(errors.defects))
+    s = graded(shape.s, jnp.where(is_usable, errors.defects, 1.0), segments)
+    state = SolverState(shape.on(s), state.end_force, state.units)
+    return equilibrium(scene, solve_from(scene, state, coarse.total_twist, solver, planar), jnp.ones((), int))
 
 
 def describe(equilibrium: Equilibrium) -> str:
@@ -277,9 +354,16 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         evaluations=outcome.evaluations,
         substeps=substeps,
         residual=outcome.residual,
+        error_estimate=_error_estimate(form, point),
         radius=scene.rod.radius,
         state=found.state,
     )
+
+
+def _error_estimate(form: MixedForm, point: MixedPoint) -> Float[Array, ""]:
+    if not isinstance(form.field, HermiteElements):
+        return jnp.full((), jnp.nan, point.tangents.dtype)
+    return jnp.sqrt(jnp.max(jnp.sum(estimated_errors(form, point).nodes ** 2, axis=1)))
 
 
 @eqx.filter_custom_jvp
@@ -313,8 +397,9 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver:
 
 
 def _field(scene: Scene, shape: Shape) -> TangentField:
-    segments = len(shape.nodes) - 1
-    return (EdgeTangents if isinstance(shape, Polyline) else HermiteElements).of(scene, segments)
+    if isinstance(shape, Curve):
+        return HermiteElements.of(scene, shape.s)
+    return EdgeTangents.of(scene, len(shape.nodes) - 1)
 
 
 def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, MixedPoint]:

@@ -55,6 +55,10 @@ FIELDS = {
     "evaluations": ("1", "evaluations of the energy and its gradient"),
     "substeps": ("1", "solves that a step of a path took"),
     "residual": ("1", "largest component of the gradient, in EI/L^2"),
+    "error_estimate": (
+        "1",
+        "estimated largest distance of a node from the continuum, by L; NaN: not estimated",
+    ),
     "radius": ("m", "radius of the rod; absent where it is not known"),
     "state/shape/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
     "state/shape/edges": ("1", "finite differences: differences of these nodes, free of the rounding of the positions"),

@@ -190,3 +190,22 @@ def test_peers(tmp_path, monkeypatch):
     with open(tmp_path / "peers.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == len(rows)
     assert (tmp_path / "peers.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_validation(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = ["--segments", "16", "--only", "cantilever", "column", "--out", str(tmp_path)]
+    *tips, weight = script("validation").main(options)
+    assert len(tips) == 30
+    # Fourth order: 4e-9 to 1e-8 on 64 elements.
+    assert max(row.error for row in tips) < 256 * 1e-8
+    assert {row.quantity: row.reference for row in tips if row.case == "P L²/EI = 4"} == pytest.approx(
+        {"tip, sideways": 0.66996, "tip, inward": 0.32894, "tip slope": 1.12124}, abs=5e-6
+    )
+    assert weight.reference == pytest.approx(7.837347, rel=1e-7)
+    assert weight.error < 1e-4
+    assert "Greenhill 1881" in capsys.readouterr().out
+    table = [line for line in (tmp_path / "validation.md").read_text().splitlines() if line.startswith("| ")]
+    assert len(table) == 2 + 31
+    assert (tmp_path / "validation.png").stat().st_size > 10_000

@@ -42,10 +42,9 @@ class HermiteElements(eqx.Module):
     s: Float[Array, "n+1"]
 
     @staticmethod
-    def of(scene: Scene, segments: int) -> "HermiteElements":
-        """Equal elements, but with a node at every point force: the moment has a kink there."""
+    def of(scene: Scene, s: Float[Array, "n+1"]) -> "HermiteElements":
+        """On these nodes, of which the nearest is moved to each point force: the moment has a kink there."""
         places = [load.at for load in scene.point_forces]
-        s = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)
         return HermiteElements(_with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
 
     @property
@@ -104,10 +103,9 @@ class HermiteElements(eqx.Module):
         def gradient(chords):
             return jax.grad(lambda chords: jnp.sum(_bending_energies(scene.rod, chords, self.h)))(chords)
 
-        ones = jnp.ones_like(self.h)
-        along = [jnp.zeros_like(chords).at[p].set(ones) for p in range(3)]
-        first = gradient(chords)
-        second = [jax.jvp(gradient, (chords,), (direction,))[1] for direction in along]
+        first, by_all = jax.linearize(gradient, chords)
+        along = jnp.eye(3, dtype=chords.dtype)[..., None] * jnp.ones_like(chords)[None]
+        second = jax.vmap(by_all)(along)  # each chord changed in all elements at once
         return jnp.sum(_bending_energies(scene.rod, chords, self.h)), _by_chords(
             first, second, tangents, self.basis(scene, bases)
         )
@@ -243,6 +241,16 @@ class Curve(Shape):
         tangents = self.tangents + ratio * (self.tangents - older.tangents)
         return Curve(self.nodes, tangents / jnp.sqrt(dot(tangents, tangents))[None], self.s)
 
+    def on(self, s: Float[Array, "n+1"]) -> "Curve":
+        """The same on other nodes, to begin a solve with."""
+        places = _interleaved(s, (s[:-1] + s[1:]) / 2)
+        cell = jnp.clip(jnp.searchsorted(self.s, places, side="right") - 1, 0, len(self.s) - 2)
+        x = ((places - self.s[cell]) / (self.s[cell + 1] - self.s[cell]))[None]
+        a, b, c = (part[:, cell] for part in _of_elements(self.tangents))
+        tangents = (1 - x) * (1 - 2 * x) * a + 4 * x * (1 - x) * b + x * (2 * x - 1) * c
+        nodes = jax.vmap(lambda coordinate: jnp.interp(s, self.s, coordinate), 1, 1)(self.nodes)
+        return Curve(nodes, tangents / jnp.sqrt(dot(tangents, tangents))[None], s)
+
     def turned_to_ends(self, scene: Scene, places: Float[Array, "m"]) -> Float[Array, "3 m"]:
         """The tangents turned to those that the supports hold, by less and less away from them."""
         tangents = self.tangents
@@ -326,7 +334,7 @@ def _half_squared_chords_of(points: tuple[Array, Array, Array]) -> Float[Array, 
 
 
 def _by_chords(
-    first: Float[Array, "3 n"], second: list[Float[Array, "3 n"]], tangents: Float[Array, "3 m"], bases: Array
+    first: Float[Array, "3 n"], second: Float[Array, "3 3 n"], tangents: Float[Array, "3 m"], bases: Array
 ) -> Blocks:
     """Derivatives by rotations from those by the three chords of each element."""
     points, point_bases = _of_elements(tangents), _of_elements(bases)

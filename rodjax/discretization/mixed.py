@@ -262,6 +262,12 @@ class MixedForm(eqx.Module):
         """The part for the end force, of what is given for all multipliers."""
         return multipliers[len(multipliers) - self._closures :]
 
+    def of_force(self, vector: Float[Array, "3"]) -> Float[Array, "c"]:
+        """The components of a vector that belong to the end force."""
+        if not self._closures:
+            return jnp.zeros(0, vector.dtype)
+        return vector if self.axes is None else vector @ self.axes
+
     def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3"]:
         """A change of the end force from its components."""
         if not self._closures:

@@ -1,0 +1,140 @@
+"""How far an equilibrium on Hermite elements is from the continuum: an estimate from its own defects.
+
+Between two nodes the rod's differential equations are integrated from what the nodes say (tangent, moment, force). What
+they miss the next node by is the defect of the element, of fifth order. Put into the linearised discrete equations as
+rotations, couples and gaps that the elements lack, the defects give the error of the nodes to leading order: one more
+solution of the system of a Newton step. No second mesh is needed, and no neighbours, so that jumps of curvature or mesh
+do no harm.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.joints import cross, dot
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.energy import axial_strain_under
+from rodjax.linalg import factor_and_solve
+from rodjax.strain import swept_angle
+from rodjax.supports import Held
+
+# Steps of the integration of an element: an even number.
+STEPS = 4
+# A rotation that an element lacks displaces the rod by about a fourth of itself, times L; a couple bends it a third of
+# that.
+TURN_REACH = 4.0
+COUPLE_REACH = 12.0
+
+
+class Section(NamedTuple):
+    """What is integrated along each element: way from its first node, tangent, and moment without torque."""
+
+    way: Float[Array, "3 n"]
+    tangent: Float[Array, "3 n"]
+    moment: Float[Array, "3 n"]
+
+
+class Errors(NamedTuple):
+    """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
+    as the displacement that each alone might make.
+    """
+
+    nodes: Float[Array, "n+1 3"]
+    defects: Float[Array, "n"]
+
+
+def estimated_errors(form: MixedForm, point: MixedPoint) -> Errors:
+    field, scene, tangents = form.field, form.scene, point.tangents
+    assert isinstance(field, HermiteElements)
+    rod, h = scene.rod, field.h
+    torque = rod.GJ * point.total_twist
+    nodes, middles = tangents[:, ::2], tangents[:, 1::2]
+    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
+    first = Section(jnp.zeros_like(middles), nodes[:, :-1], moments[:, :-1])
+    last, passed = _integrated(form, field, point, torque, first)
+
+    # What the elements lack: a rotation, a couple, a gap, a twist.
+    turn = cross(nodes[:, 1:], last.tangent)
+    couple = last.moment - moments[:, 1:]
+    gap = last.way - field.ways(form.slopes(point)).T - h[None] / 2 * cross(turn, middles)
+
+    here = form.linearized(point)
+    stiffness = rod.EI / h
+    none = jnp.zeros_like(couple[:, :1])
+    couples = jnp.concatenate([none, couple - stiffness[None] * turn], axis=1)
+    couples += jnp.concatenate([stiffness[None] * turn, none], axis=1)
+    by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
+    gradient = (
+        jnp.zeros_like(here.gradient).at[:, ::2].set(jnp.sum(here.bases[..., ::2] * by_rotation[:, None], axis=0))
+    )
+    closure = -form.of_force(jnp.sum(gap, axis=1))
+    if form.has_torsion:
+        missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
+        closure = jnp.concatenate([missing[None], closure])
+    elif len(here.closure) > len(closure):
+        closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
+    _, rotation, multipliers = factor_and_solve(here.system, -gradient, -closure)
+
+    force_change = form.force_change(form.closure(multipliers))
+    turned = jnp.sum(here.bases * rotation[None], axis=1)
+    moved = MixedPoint(tangents, point.end_force + force_change, point.total_twist)
+    slopes, change = jax.jvp(
+        lambda tangents: form.slopes(MixedPoint(tangents, moved.end_force, point.total_twist)), (tangents,), (turned,)
+    )
+    ways = field.ways(change + slopes - form.slopes(point)).T + gap
+    sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
+    displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
+    sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
+    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH)
+
+
+def _integrated(
+    form: MixedForm, field: HermiteElements, point: MixedPoint, torque: Float[Array, ""], first: Section
+) -> tuple[Section, list[Float[Array, "3 n"]]]:
+    """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
+    scene, rod = form.scene, form.scene.rod
+    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 0]
+    weight = jnp.zeros(3, force.dtype) if scene.gravity is None else scene.gravity
+    step = field.h / STEPS
+
+    def slope(section: Section, s: Float[Array, "n"]) -> Section:
+        """Derivatives by arclength, at s from the first node."""
+        n = force - weight[:, None] * s[None]
+        tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
+        way = (1 + axial_strain_under(rod, dot(n, tangent)))[None] * tangent
+        turn = cross(section.moment, tangent) / rod.EI
+        return Section(way, turn, -cross(way, n) - torque * turn)
+
+    def ahead(section: Section, slope: Section, distance: Float[Array, "n"]) -> Section:
+        return jax.tree.map(lambda value, change: value + distance[None] * change, section, slope)
+
+    def advanced(section: Section, k: Float[Array, ""]) -> tuple[Section, Float[Array, "3 n"]]:
+        s = k * step
+        a = slope(section, s)
+        b = slope(ahead(section, a, step / 2), s + step / 2)
+        c = slope(ahead(section, b, step / 2), s + step / 2)
+        d = slope(ahead(section, c, step), s + step)
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, a, b, c, d)
+        section = ahead(section, mean, step)
+        return section, section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
+
+    last, passed = jax.lax.scan(advanced, first, jnp.arange(STEPS, dtype=step.dtype))
+    return last, [first.tangent, *passed]
+
+
+def _bulge(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
+    """By how much the twist of a curve through these tangents exceeds that of the arc from the first to the last."""
+    whole, half = _fan(tangents), _fan(tangents[::2])
+    return (4 * whole - half) / 3
+
+
+def _fan(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
+    swept = jax.vmap(swept_angle, in_axes=1)
+    first = tangents[0]
+    parts = [swept(b, c, first, c) for b, c in itertools.pairwise(tangents[1:])]
+    return sum(parts, jnp.zeros_like(first[0]))

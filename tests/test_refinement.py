@@ -1,0 +1,115 @@
+"""Estimated errors against true ones, meshes for a tolerance, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import rodjax as rj
+from rodjax import Clamp, Scene, frame, problems
+from rodjax.refinement import GRADING, LONGEST, SIZES, graded, next_size
+
+TWISTED = Scene(
+    problems.cable(),
+    Clamp((0, 0, 0), frame((1, 0.3, -0.5))),
+    Clamp((0.5, 0.2, 0.1), frame((1, 1, 1))),
+    (0.0, 1.0, -9.81),
+)
+SCENES = {"hanging cable": problems.hanging_cable(), "twisted": TWISTED}
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene_and_truth(request) -> tuple[Scene, CubicSpline]:
+    """An error of 2e-8 L or less, of fourth order from the meshes below."""
+    fine = rj.solve(SCENES[request.param], segments=96, discretization="hermite")
+    assert fine.error_estimate < 3e-8
+    return SCENES[request.param], CubicSpline(fine.s, fine.nodes)
+
+
+def true_error(result: rj.Equilibrium, truth: CubicSpline) -> float:
+    return float(np.max(np.linalg.norm(truth(np.asarray(result.s)) - result.nodes, axis=1)))
+
+
+def test_the_estimate_is_the_error(scene_and_truth):
+    scene, truth = scene_and_truth
+    result = rj.solve(scene, segments=16, discretization="hermite")
+    # To leading order in the mesh: 1 to 4 % seen.
+    np.testing.assert_allclose(result.error_estimate, true_error(result, truth), rtol=0.08)
+
+
+@pytest.mark.slow
+def test_a_tolerance_is_met_and_not_by_far(scene_and_truth):
+    scene, truth = scene_and_truth
+    for rtol in (1e-3, 1e-5):
+        result = rj.solve(scene, rtol=rtol)
+        assert result.converged
+        assert result.error_estimate <= rtol
+        assert rtol / 30 <= true_error(result, truth) <= rtol
+        # From the result on: nothing to do.
+        again = rj.solve(scene, rtol=rtol, guess=result)
+        assert again.iterations == 0
+        np.testing.assert_array_equal(again.nodes, result.nodes)
+
+
+def test_finite_differences_have_no_estimate():
+    assert np.isnan(rj.solve(problems.hanging_cable(), segments=16).error_estimate)
+
+
+@pytest.mark.slow
+def test_inside_jit_the_mesh_is_given():
+    result = jax.jit(lambda scene: rj.solve(scene, rtol=1e-8))(problems.hanging_cable())
+    assert result.s.shape == (33,)
+    assert result.error_estimate > 1e-8
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(rtol=1e-3, segments=10), "segments must be None where rtol is given, got segments=10"),
+        (dict(rtol=1e-3, discretization="finite_difference"), "discretization must be 'hermite' where rtol is given"),
+        (dict(rtol=0.0), "rtol must be positive, got 0"),
+        (dict(rtol=1e-12), "rtol must lie in 1e-10 to 1"),
+        (dict(rtol="small"), "rtol must be a number, got 'small'"),
+        (dict(discretization="spectral"), "discretization must be 'finite_difference' or 'hermite', got 'spectral'"),
+        (dict(discretization="hermite", solver=rj.NonlinearCG()), "solver must be a Newton where discretization is"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rj.solve(problems.hanging_cable(), **options)
+
+
+# --- meshes ----------------------------------------------------------------------------------------------------------
+
+
+def test_equal_defects_give_equal_elements():
+    s = graded(jnp.linspace(0, 1, 9), jnp.full(8, 1e-5), 12)
+    np.testing.assert_allclose(s, np.linspace(0, 1, 13), rtol=0, atol=1e-15)  # a few roundings
+
+
+def test_elements_gather_where_the_defects_are():
+    defects = jnp.array([1e-2, 1e-4, 1e-6, 1e-8, 1e-8, 0.0, 0.0, 0.0])
+    s = np.asarray(graded(jnp.linspace(0, 1, 9), defects, 32))
+    lengths = np.diff(s)
+    assert s[0] == 0.0
+    assert s[-1] == 1.0
+    assert np.all(lengths > 0)
+    np.testing.assert_allclose(lengths[0], np.min(lengths), rtol=1e-12)
+    assert np.max(lengths) <= LONGEST / 32 * 1.5  # where others need more, the longest ones may too
+    assert np.max(lengths[1:] / lengths[:-1]) <= GRADING * 1.01
+
+
+@pytest.mark.parametrize(
+    ("segments", "error", "rtol", "expected"),
+    [
+        (6, 1e-3, 1e-3, 8),  # just missed
+        (8, 1e-3, 1e-5, 32),  # (120)^(1/4) = 3.3 times as many
+        (8, 1.0, 1e-8, 32),  # no more than four times
+        (8, float("nan"), 1e-3, 16),  # no estimate: twice
+        (512, 1.0, 1e-8, 512),
+    ],
+)
+def test_next_size(segments, error, rtol, expected):
+    assert expected in SIZES
+    assert next_size(segments, error, rtol) == expected

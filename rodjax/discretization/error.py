@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.joints import cross, dot
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve
 from rodjax.strain import swept_angle
@@ -58,16 +59,22 @@ def estimated_errors(form: MixedForm, point: MixedPoint) -> Errors:
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], moments[:, :-1])
     last, passed = _integrated(form, field, point, torque, first)
 
-    # What the elements lack: a rotation, a couple, a gap, a twist.
+    # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
+    # a twist.
     turn = cross(nodes[:, 1:], last.tangent)
+    back = -cross(turn, middles)
+    passed = [tangent + k / STEPS * -cross(turn, tangent) for k, tangent in enumerate(passed)]
+    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 1]
     couple = last.moment - moments[:, 1:]
-    gap = last.way - field.ways(form.slopes(point)).T - h[None] / 2 * cross(turn, middles)
+    gap = last.way + h[None] / 2 * back - field.ways(form.slopes(point)).T
 
     here = form.linearized(point)
-    stiffness = rod.EI / h
+    # To turn it back takes moments at both ends, which differ as force and torque go with the tangent.
+    bending, shear = (rod.EI / h)[None], h[None] / 6 * cross(back, force)
+    at_start = bending * transport(turn, nodes[:, 1:], nodes[:, :-1]) - torque / 2 * back - shear
+    at_end = couple - bending * turn - torque / 2 * back - 2 * shear
     none = jnp.zeros_like(couple[:, :1])
-    couples = jnp.concatenate([none, couple - stiffness[None] * turn], axis=1)
-    couples += jnp.concatenate([stiffness[None] * turn, none], axis=1)
+    couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
     gradient = (
         jnp.zeros_like(here.gradient).at[:, ::2].set(jnp.sum(here.bases[..., ::2] * by_rotation[:, None], axis=0))

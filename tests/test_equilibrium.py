@@ -270,7 +270,7 @@ def test_derivatives_are_refused_until_they_are_right():
         (dict(segments=1), "segments must be a whole number from 2 to 100000, got 1"),
         (dict(segments=10.0), "segments must be a whole number"),
         (dict(segments=10**6), "segments must be a whole number from 2 to 100000"),
-        (dict(discretization="hermite"), "discretization must be 'finite_difference' in this version, got 'hermite'"),
+        (dict(discretization="spectral"), "discretization must be 'finite_difference' or 'hermite', got 'spectral'"),
         (dict(solver="cg"), "solver must be a Newton or NonlinearCG, got 'cg'"),
         (dict(guess=np.zeros((5, 3))), "guess must be a Guess or Equilibrium"),
     ],

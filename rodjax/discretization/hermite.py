@@ -279,7 +279,10 @@ def _turned(
 
 
 def _with_nodes_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Float[Array, "n+1"]:
-    """Nodes with one at each of the sorted places that lies a third of an element or more from the ends and others."""
+    """The nodes, of which the nearest to each of the sorted places is moved there, but for the ends.
+
+    Of places that are nearer to one another than an element some may get none.
+    """
     n = len(s) - 1
     index = jnp.arange(n + 1)
     for k in range(len(places)):

@@ -163,7 +163,7 @@ def solve(
       they are needed, until the estimated error is below it. Where the numbers of the scene are not known, as inside
       `jit`, the mesh has 32 equal elements whatever `rtol`, and `error_estimate` says what that gives.
     - `discretization`: `"finite_difference"`, of second order in 1/segments, or `"hermite"`, of fourth order. `None`:
-      `"hermite"` where `rtol` is given, else `"finite_difference"`.
+      `"hermite"` where `rtol` is given, that of the guess where its mesh is kept, else `"finite_difference"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
       supports and gravity.
@@ -180,7 +180,7 @@ def solve(
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
     if discretization is None:
-        discretization = "finite_difference" if rtol is None else "hermite"
+        discretization = "hermite" if rtol is not None else mesh_of(guess, segments, solver)
     if rtol is not None:
         _check_rtol(rtol, segments, discretization)
         segments = _first_size(guess) if is_known(scene, guess) else TRACED_SEGMENTS
@@ -190,6 +190,13 @@ def solve(
         result = _refined(scene, result, float(rtol), solver, planar)
     warn_if_not_converged(result)
     return result
+
+
+def mesh_of(guess: Guess | Equilibrium | None, segments: int | None, solver: Solver | None) -> Discretization:
+    """The discretization where none is asked for: that of a guess whose mesh is kept, if the solver knows it."""
+    has_elements = isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Curve)
+    keeps_mesh = segments is None and not isinstance(solver, NonlinearCG)
+    return "hermite" if has_elements and keeps_mesh else "finite_difference"
 
 
 def _check_rtol(rtol: float, segments: int | None, discretization: Discretization) -> None:

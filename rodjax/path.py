@@ -20,6 +20,7 @@ from rodjax.equilibrium import (
     checked_options,
     equilibrium,
     first_state,
+    mesh_of,
     solve_from,
     warn_if_not_converged,
 )
@@ -38,7 +39,7 @@ def solve_path(
     scenes: Sequence[Scene] | Scene,
     *,
     segments: int | None = None,
-    discretization: Discretization = "finite_difference",
+    discretization: Discretization | None = None,
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
@@ -61,6 +62,8 @@ def solve_path(
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
+    if discretization is None:
+        discretization = mesh_of(guess, segments, solver)
     segments, solver = checked_options(stacked, segments, discretization, solver, guess, planar)
     path = _solve_path(stacked, guess, segments, discretization, solver, planar, progress)
     warn_if_not_converged(path)

@@ -52,6 +52,17 @@ def test_a_tolerance_is_met_and_not_by_far(scene_and_truth):
         np.testing.assert_array_equal(again.nodes, result.nodes)
 
 
+def test_a_guess_whose_mesh_is_kept_brings_its_elements(scene_and_truth):
+    scene, _ = scene_and_truth
+    first = rj.solve(scene, segments=16, discretization="hermite")
+    for again in (
+        rj.solve(scene, guess=first),
+        jax.tree.map(lambda leaf: leaf[0], rj.solve_path([scene], guess=first)),
+    ):
+        assert again.iterations == 0
+        np.testing.assert_array_equal(again.nodes, first.nodes)
+
+
 def test_finite_differences_have_no_estimate():
     assert np.isnan(rj.solve(problems.hanging_cable(), segments=16).error_estimate)
 

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax
 from rodjax import problems
+from rodjax.equilibrium import Discretization
 
 PICTURE_MS = 1e3 / 90
 LARGEST_MOVE = 5e-3  # [m], of the end in one scene
@@ -40,6 +41,7 @@ class Row(NamedTuple):
     """Latencies [ms] of a stream of scenes: from the call to the nodes in an array of numpy."""
 
     scene: str
+    discretization: str
     segments: int
     called: str
     moves: int
@@ -121,10 +123,11 @@ def collection(mode: str) -> Iterator[None]:
         gc.unfreeze()
 
 
-def row(name: str, segments: int, called: str, stream: Stream) -> Row:
+def row(name: str, discretization: str, segments: int, called: str, stream: Stream) -> Row:
     median, percent_99, percent_99_9 = np.percentile(stream.solve_ms, [50, 99, 99.9])
     return Row(
         scene=name,
+        discretization=discretization,
         segments=segments,
         called=called,
         moves=len(stream.solve_ms),
@@ -156,16 +159,23 @@ def title(called: str, mode: str, moves: bool) -> str:
     return called + ("" if mode == "as it is" else f", gc {mode}") + ("" if moves else ", hand at rest")
 
 
-def streams(scene: rodjax.Scene, guess: rodjax.Guess | None, segments: int, count: int, seed: int) -> dict[str, Stream]:
+def streams(
+    scene: rodjax.Scene,
+    guess: rodjax.Guess | None,
+    segments: int,
+    discretization: Discretization,
+    count: int,
+    seed: int,
+) -> dict[str, Stream]:
     """Every way of calling, on the same hand."""
     assert isinstance(scene.end, rodjax.Clamp)
     assert isinstance(scene.start, rodjax.Clamp)
     positions, frames = hand(scene.end, np.asarray(scene.start.position), count + WARM_UP, seed)
 
     def eager(scene: rodjax.Scene, guess: rodjax.Equilibrium) -> rodjax.Equilibrium:
-        return rodjax.solve(scene, segments=segments, guess=guess)
+        return rodjax.solve(scene, segments=segments, discretization=discretization, guess=guess)
 
-    first = rodjax.solve(scene, segments=segments, guess=guess)
+    first = rodjax.solve(scene, segments=segments, discretization=discretization, guess=guess)
     solves: dict[str, Solve] = {"rodjax.solve": eager, "jax.jit of it": jax.jit(eager)}
     found = {}
     for called, mode, moves in CALLS:
@@ -192,7 +202,7 @@ def line(row: Row) -> str:
     )
 
 
-def picture(found: dict[tuple[str, int], dict[str, Stream]]) -> Figure:
+def picture(found: dict[tuple[str, int], dict[str, Stream]], discretization: str) -> Figure:
     """The share of moves that took longer than a time, one panel a scene; dashed through `jax.jit`."""
     names = list(dict.fromkeys(name for name, _ in found))
     figure = Figure(figsize=(7 * len(names), 4.8), layout="constrained")
@@ -209,13 +219,16 @@ def picture(found: dict[tuple[str, int], dict[str, Stream]]) -> Figure:
         axes.grid(color="0.92")
     panels[0].set_ylabel("share of moves")
     panels[0].legend(fontsize=8)
-    figure.suptitle(f"A hand moves the end of a cable; {machine()}, one thread, double precision", fontsize=10)
+    figure.suptitle(
+        f"A hand moves the end of a cable, {discretization}; {machine()}, one thread, double precision", fontsize=10
+    )
     return figure
 
 
 def main(argv: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--segments", type=int, nargs="+", default=[10, 50, 100])
+    parser.add_argument("--discretization", choices=["finite_difference", "hermite"], default="finite_difference")
     parser.add_argument("--scene", nargs="+", choices=["hanging", "Omega"], default=["hanging", "Omega"])
     parser.add_argument("--moves", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
@@ -226,7 +239,8 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
         "hanging": (problems.hanging_cable(span=problems.SPAN), None),
         "Omega": (problems.omega(math.pi / 6, 0.0), problems.figure_1_start()),
     }
-    print(f"{arguments.moves} moves, seed {arguments.seed}; {conditions()}")
+    discretization: Discretization = arguments.discretization
+    print(f"{arguments.moves} moves, seed {arguments.seed}, {discretization}; {conditions()}")
     print(HEADER)
     rows, found = [], {}
     with warnings.catch_warnings():
@@ -234,13 +248,14 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
         for name in arguments.scene:
             scene, guess = scenes[name]
             for segments in arguments.segments:
-                found[name, segments] = streams(scene, guess, segments, arguments.moves, arguments.seed)
-                some = [row(name, segments, called, stream) for called, stream in found[name, segments].items()]
+                here = streams(scene, guess, segments, discretization, arguments.moves, arguments.seed)
+                found[name, segments] = here
+                some = [row(name, discretization, segments, called, stream) for called, stream in here.items()]
                 print("\n".join(map(line, some)), flush=True)
                 rows += some
     if arguments.out is not None:
         save_rows(rows, arguments.out / "interactive.csv")
-        picture(found).savefig(arguments.out / "interactive.png", dpi=110)
+        picture(found, discretization).savefig(arguments.out / "interactive.png", dpi=110)
     return rows
 
 

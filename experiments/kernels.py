@@ -9,6 +9,7 @@ share the time of a step of Fig. 1 of Linn & Stephan (2008).
 """
 
 import argparse
+import functools
 import math
 import re
 import statistics
@@ -24,7 +25,7 @@ import numpy as np
 from measuring import Timed, compiled, conditions, number, save_rows, set_up
 
 import rodjax
-from rodjax import Scene, Swivel, problems
+from rodjax import Newton, Scene, Swivel, problems
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.joints import (
@@ -38,10 +39,11 @@ from rodjax.discretization.joints import (
 )
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
-from rodjax.equilibrium import Found, SolverState, equilibrium, first_state
+from rodjax.equilibrium import Found, Options, equilibrium, first_state
 from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
 from rodjax.path import stack_scenes
 from rodjax.plane import plane
+from rodjax.result import SolverState
 from rodjax.scene import nondimensional
 from rodjax.status import Outcome
 from rodjax.strain import swept_angle
@@ -111,7 +113,8 @@ def scenes() -> dict[str, Scene]:
 
 @eqx.filter_jit
 def discretized(scene: Scene, segments: int) -> Discretized:
-    state, twist = first_state(scene, problems.figure_1_start(), segments, "finite_difference")
+    options = Options(segments, "finite_difference", Newton(), planar=False)
+    state, twist = first_state(scene, problems.figure_1_start(), options)
     scaled, _ = nondimensional(scene)
     assert isinstance(state.shape, Polyline)
     problem, polyline = FiniteDifference.begin(scaled, state.shape, twist)
@@ -296,7 +299,8 @@ def limit_table(program: Path, times: dict[tuple[str, int], float]) -> str:
 
 def step_of_figure_1(segments: int, times: dict[tuple[str, int], float], repeats: int) -> Step:
     arguments = stack_scenes(problems.figure_1()), problems.figure_1_start()
-    program, _ = compiled(lambda scenes, guess: rodjax.solve_path(scenes, segments=segments, guess=guess), *arguments)
+    solve = functools.partial(rodjax.solve_path, segments=segments, discretization="finite_difference")
+    program, _ = compiled(lambda scenes, guess: solve(scenes, guess=guess), *arguments)
     path: rodjax.Equilibrium = program(*arguments)
     ms = least_ms(program, arguments, repeats) / len(path.residual)
     evaluations = float(np.mean(path.evaluations))

@@ -101,7 +101,8 @@ class Stage(NamedTuple):
 def stages(segments: int) -> dict[str, Stage]:
     """Both models at s = h/2, 3h/2, ..., L - h/2 [m] in the six stages of Fig. 1."""
     scenes = [problems.omega(problems.ARC_HALF_ANGLE, 0.0), *problems.figure_1()]
-    path = rodjax.solve_path(scenes, segments=segments, guess=problems.figure_1_start())
+    guess = problems.figure_1_start()
+    path = rodjax.solve_path(scenes, segments=segments, discretization="finite_difference", guess=guess)
     h = scenes[0].rod.length / segments
     rods = np.asarray(path.position_at(h * (jnp.arange(segments, dtype=h.dtype) + 0.5)))
     free = rods[0, 1:-1]

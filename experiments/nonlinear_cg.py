@@ -78,7 +78,9 @@ class OurRuns:
         scenes, guess = stack_scenes(problems.figure_1()), problems.figure_1_start()
 
         def path(scenes, guess):
-            return rodjax.solve_path(scenes, segments=segments, guess=guess, solver=method.solver)
+            return rodjax.solve_path(
+                scenes, segments=segments, discretization="finite_difference", guess=guess, solver=method.solver
+            )
 
         program, self.compile_s = compiled(path, scenes, guess)
         self.path: Timed[rodjax.Equilibrium] = Timed(lambda: program(scenes, guess))

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax
 from rodjax import Clamp, Free, Scene, problems
+from rodjax.equilibrium import Discretization
 from rodjax.path import stack_scenes
 from rodjax.supports import Support
 
@@ -101,20 +102,23 @@ def tip_force(scene: Scene) -> np.ndarray | None:
 
 
 class Rodjax:
-    """The default solver on finite differences: P1 and P3 cold, from the library's own first shape, P2 as a path."""
+    """The default solver: P1 and P3 cold, from the library's own first shape, P2 as a path."""
 
-    def __init__(self, problem: Problem, segments: int):
-        self.program, self.elements = f"rodjax {rodjax.__version__}", segments
+    def __init__(self, problem: Problem, segments: int, discretization: Discretization, *, planar: bool = False):
+        kind = "elements" if discretization == "hermite" else "differences"
+        self.program = f"rodjax {rodjax.__version__}, {kind}{', planar' * planar}"
+        self.elements = segments
+        options: dict[str, Any] = {"segments": segments, "discretization": discretization, "planar": planar}
         if len(problem.scenes) > 1:
             self._scenes, guess = stack_scenes(problem.scenes), problems.figure_1_start()
-            self._program, _ = compiled(
-                lambda scenes: rodjax.solve_path(scenes, segments=segments, guess=guess), self._scenes
-            )
+            self._program, _ = compiled(lambda scenes: rodjax.solve_path(scenes, guess=guess, **options), self._scenes)
         else:
             self._scenes = problem.scenes[0]
-            self._program, _ = compiled(lambda scene: rodjax.solve(scene, segments=segments), self._scenes)
+            self._program, _ = compiled(lambda scene: rodjax.solve(scene, **options), self._scenes)
         self.solve()
-        self.notes = f"3-D finite differences, {np.mean(self.result.iterations):.0f} iterations a scene"
+        words = "Hermite elements" if discretization == "hermite" else "finite differences"
+        iterations = np.mean(self.result.iterations)
+        self.notes = f"{'2-D' if planar else '3-D'} {words}, {iterations:.0f} iterations a scene"
         if not np.all(self.result.converged):
             self.notes += ", NOT CONVERGED"
 

@@ -1,7 +1,8 @@
 """How do other programs fare on three benchmark problems: the time of a solve beside its shape error?
 
 P1, a cantilever under a dead tip force, P2, the path of Fig. 1 of Linn & Stephan (2008), and P3, a hanging cable, by
-rodjax and by those of these programs that are installed (`pip install 'rodjax[peers]'`):
+rodjax (finite differences and Hermite elements, these for P1 and P3 also with the unknowns of their plane alone) and by
+those of these programs that are installed (`pip install 'rodjax[peers]'`):
 
 - Exudyn, multibody dynamics with beam elements and a static solver (full Newton steps, no line search);
 - PyElastica, explicit dynamics of Cosserat rods, damped to rest;
@@ -59,7 +60,7 @@ def continuum(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
 
     Within 2e-8 L of a shooting solution of the rod's differential equations.
     """
-    coarse, fine = (Rodjax(problem, segments).result for segments in FINE)
+    coarse, fine = (Rodjax(problem, segments, "finite_difference").result for segments in FINE)
 
     def positions(s: np.ndarray) -> np.ndarray:
         at = [np.asarray(result.position_at(s)).reshape(-1, len(s), 3)[-1] for result in (coarse, fine)]
@@ -75,7 +76,10 @@ def contenders(problem: Problem, arguments: argparse.Namespace) -> list[Contende
     marched = [n for n in arguments.elements if n <= arguments.marched_up_to]
     # On finer meshes the welds need time steps that are too small to come to rest in minutes.
     jointed = [n for n in marched if n <= 20]
-    found: list[Contender] = [Rodjax(problem, n) for n in arguments.segments]
+    found: list[Contender] = [Rodjax(problem, n, "finite_difference") for n in arguments.segments]
+    found += [Rodjax(problem, n, "hermite") for n in arguments.hermite]
+    if len(problem.scenes) == 1:  # P1 and P3 lie in a plane; the end frame of P2 turns out of it
+        found += [Rodjax(problem, n, "hermite", planar=True) for n in arguments.hermite]
     for module, model, meshes in (
         ("exudyn", exudyn, arguments.elements),
         ("elastica", PyElastica, marched),
@@ -112,13 +116,13 @@ def measured(problem: Problem, arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
-HEADER = f"{'':3} {'program':18}{'elements':>8}{'ms median':>11}{'min':>9}{'runs':>6}{'error/L':>10}  notes"
+HEADER = f"{'':3} {'program':32}{'elements':>8}{'ms median':>11}{'min':>9}{'runs':>6}{'error/L':>10}  notes"
 
 
 def line(row: Row) -> str:
     error = "failed" if math.isnan(row.error) else f"{row.error:.1e}"
     return (
-        f"{row.problem:3} {row.program:18}{row.elements:8}{row.ms_median:11.3f}{row.ms_min:9.3f}{row.runs:6}"
+        f"{row.problem:3} {row.program:32}{row.elements:8}{row.ms_median:11.3f}{row.ms_min:9.3f}{row.runs:6}"
         f"{error:>10}  {row.notes}"
     )
 
@@ -154,7 +158,10 @@ def picture(rows: Sequence[Row]) -> Figure:
 def main(argv: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", nargs="+", choices=["P1", "P2", "P3"], default=["P1", "P2", "P3"])
-    parser.add_argument("--segments", type=int, nargs="+", default=[10, 20, 50, 100, 200, 500, 1000], help="of rodjax")
+    parser.add_argument(
+        "--segments", type=int, nargs="+", default=[10, 20, 50, 100, 200, 500, 1000], help="of rodjax's differences"
+    )
+    parser.add_argument("--hermite", type=int, nargs="+", default=[4, 6, 8, 12, 16, 24], help="of rodjax's elements")
     parser.add_argument("--elements", type=int, nargs="+", default=[10, 20, 40, 80], help="of the others")
     parser.add_argument(
         "--marched-up-to", type=int, default=40, help="largest mesh for PyElastica, and for MuJoCo up to 20"

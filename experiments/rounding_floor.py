@@ -43,7 +43,9 @@ def table(segments: Sequence[int], slendernesses: Sequence[float]) -> dict[tuple
         stretch = float(scene.rod.EA / scene.rod.EI)
         for n in segments:
             solver = rodjax.NonlinearCG(tolerance=0.0, max_iterations=400)
-            result = rodjax.solve(scene, segments=n, guess=problems.figure_1_start(), solver=solver)
+            result = rodjax.solve(
+                scene, segments=n, discretization="finite_difference", guess=problems.figure_1_start(), solver=solver
+            )
             ratio = float(result.residual) / (eps * (stretch + 4 * n**2))
             ratios[n, slenderness] = ratio
             print(f"{n:6}{slenderness:8g}{float(result.residual):12.1e}{ratio:22.2f}{eps * n**3:32.1e}", flush=True)

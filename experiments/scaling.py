@@ -1,8 +1,8 @@
 """Do time and iterations depend on mesh and slenderness?
 
-Fig. 1 of Linn & Stephan (2008), the path of 25 steps: from 10 to 10000 segments at L/R = 200, and from L/R = 10 to a
-million at 50 segments: time, iterations and evaluations a step, residual reached, memory. Then both end tangents turned
-by a whole radian at once, at every slenderness, beside the same in ten steps.
+Fig. 1 of Linn & Stephan (2008), the path of 25 steps by finite differences: from 10 to 10000 segments at L/R = 200, and
+from L/R = 10 to a million at 50 segments: time, iterations and evaluations a step, residual reached, memory. Then both
+end tangents turned by a whole radian at once, at every slenderness, beside the same in ten steps.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import rodjax
 from rodjax import problems
 from rodjax.path import stack_scenes
 
+DISCRETIZATION = "finite_difference"
 SOLVERS = {"default": None, "newton": rodjax.Newton(), "ncg": rodjax.NonlinearCG()}
 STEPS = 25
 SLENDERNESS, SEGMENTS = 200.0, 50  # of the sweep over the other
@@ -69,7 +70,9 @@ def fig_1_row(name: str, segments: int, slenderness: float, repeats: int) -> Row
     arguments = stack_scenes(problems.figure_1(rod)), problems.figure_1_start()
 
     def path(scenes, guess):
-        return rodjax.solve_path(scenes, segments=segments, guess=guess, solver=SOLVERS[name])
+        return rodjax.solve_path(
+            scenes, segments=segments, discretization=DISCRETIZATION, guess=guess, solver=SOLVERS[name]
+        )
 
     program, seconds = compiled(path, *arguments)
     runs: Timed[rodjax.Equilibrium] = Timed(lambda: program(*arguments))
@@ -113,12 +116,14 @@ def radian_row(name: str, slenderness: float, repeats: int) -> Radian:
     small = stack_scenes([problems.omega(tilt, 0.0, rod) for tilt in tilts])
     after = problems.omega(tilts[-1], 0.0, rod)
 
+    options: dict[str, Any] = {"segments": SEGMENTS, "discretization": DISCRETIZATION, "solver": SOLVERS[name]}
+
     # Compiled by us and not called as is, a solve that does not converge gives no warning: the table says it.
     def solve(scene, guess):
-        return rodjax.solve(scene, segments=SEGMENTS, guess=guess, solver=SOLVERS[name])
+        return rodjax.solve(scene, guess=guess, **options)
 
     def solve_small(scenes, guess):
-        return rodjax.solve_path(scenes, segments=SEGMENTS, guess=guess, solver=SOLVERS[name])
+        return rodjax.solve_path(scenes, guess=guess, **options)
 
     first = compiled(solve, before, problems.figure_1_start())[0](before, problems.figure_1_start())
     program, _ = compiled(solve, after, first)

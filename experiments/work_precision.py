@@ -27,7 +27,7 @@ from scipy.interpolate import CubicSpline
 import rodjax
 from rodjax import problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
-from rodjax.equilibrium import Discretization, first_state
+from rodjax.equilibrium import Discretization, Options, first_state
 from rodjax.path import stack_scenes
 from rodjax.scene import nondimensional
 
@@ -177,7 +177,8 @@ class Minimizer:
         raise NotImplementedError
 
     def prepared(self, problem: Problem, segments: int) -> Prepared:
-        state, twist = first_state(problem.scenes[0], problem.guess, segments, "finite_difference")
+        options = Options(segments, "finite_difference", rodjax.Newton(), planar=False)
+        state, twist = first_state(problem.scenes[0], problem.guess, options)
         assert isinstance(state.shape, Polyline)
         first = state.shape
         begin, begin_s = compiled(begun, problem.scenes[0], first, twist)

@@ -4,11 +4,12 @@ from typing import TYPE_CHECKING
 
 from rodjax import problems
 from rodjax.compilation_cache import enable_compilation_cache
-from rodjax.equilibrium import Equilibrium, NotConvergedWarning, describe, solve
+from rodjax.equilibrium import solve
 from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import PointForce
 from rodjax.path import solve_path
+from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene, write_scene
@@ -16,7 +17,7 @@ from rodjax.solvers.line_search import LineSearch
 from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
-from rodjax.supports import Clamp, Free, Pin, Swivel, frame
+from rodjax.supports import Clamp, Free, Pin, Swivel, frame, rotate
 
 if TYPE_CHECKING:
     from rodjax.continuum import solve_continuum
@@ -45,6 +46,7 @@ __all__ = [
     "load",
     "problems",
     "read_scene",
+    "rotate",
     "save",
     "solve",
     "solve_continuum",

@@ -10,14 +10,15 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
 
 import rodjax
-from rodjax.equilibrium import MAX_SEGMENTS, Equilibrium, NotConvergedWarning
+from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, save
+from rodjax.result import Equilibrium, NotConvergedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
 
@@ -88,13 +89,14 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SUFFIX,))
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
     file = read_scene_file(arguments.scene)
+    settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
     with warnings.catch_warnings():
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
         if file.is_path:
-            result = rodjax.solve_path(file.scenes, segments=file.segments, progress=sys.stderr.isatty())
+            result = rodjax.solve_path(file.scenes, **settings, progress=sys.stderr.isatty())
         else:
-            result = rodjax.solve(file.scenes[0], segments=file.segments)
+            result = rodjax.solve(file.scenes[0], **settings)
     print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
     if arguments.output:
         save(result, arguments.output)
@@ -133,7 +135,11 @@ def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:
     scene = file.scenes[0]
     supports = f"{type(scene.start).__name__} to {type(scene.end).__name__}".lower()
     scenes = f", {len(file.scenes)} scenes" if file.is_path else ""
-    return f"{path}: {supports}, {float(scene.rod.length):g} m, {result.s.shape[-1] - 1} segments{scenes}"
+    mesh = f"{result.s.shape[-1] - 1} segments"
+    if file.segments is None:  # otherwise the estimate would be a program more to compile
+        error = np.max(np.asarray(result.error_estimate)[np.asarray(result.converged)], initial=0.0)
+        mesh += f", error of the shape about {error:.0e} of the length"
+    return f"{path}: {supports}, {float(scene.rod.length):g} m{scenes}, {mesh}"
 
 
 def _table(result: Equilibrium) -> list[str]:

@@ -24,17 +24,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, positive, whole_number
-from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.joints import root
 from rodjax.energy import axial_strain_under, dead_load_energy, density
-from rodjax.equilibrium import (
-    DEFAULT_SEGMENTS,
-    MAX_SEGMENTS,
-    Equilibrium,
-    NotConvergedWarning,
-    SolverState,
-    solve,
-    warn_if_not_converged,
-)
+from rodjax.equilibrium import MAX_SEGMENTS, solve
+from rodjax.result import Equilibrium, NotConvergedWarning, SolverState, warn_if_not_converged
 from rodjax.rod import Rod
 from rodjax.scene import Scene, nondimensional
 from rodjax.status import Status, is_converged
@@ -53,8 +47,10 @@ MAX_STEPS = 1000
 FIRST_STEP = 0.25
 # Singular values below this part of the largest belong to motions that nothing resists.
 RANK_TOLERANCE = 1e-9
-# Mesh of the discrete equilibrium that a solve without a guess begins with.
-GUESS_SEGMENTS = 200
+# Of the discrete equilibrium that a solve without a guess begins with.
+GUESS_RTOL = 1e-4
+# Of the mesh on which a result without a guess is given.
+DEFAULT_SEGMENTS = 50
 # Errors grow like exp(sqrt(|n|/EI) h) over an interval h: the exponent aimed at.
 GROWTH = 5.0
 # A few sizes, powers of two, so that few programs are compiled. Newton's matrix is dense: beyond 32 intervals its
@@ -85,7 +81,8 @@ def solve_continuum(
     - `rtol`: tolerance of the integration in s, relative to L, EI/L and EI.
     - `intervals`: of multiple shooting, besides those that point forces add; `None`: as many as keep the growth of
       errors in each modest, or 16 inside `jax.jit`.
-    - `segments`: the result is given at `segments` + 1 equally spaced arclengths; `None`: those of the guess, else 50.
+    - `segments`: the result is given at `segments` + 1 equally spaced arclengths, of which the nearest is moved to each
+        point force; `None`: as many as those of the guess, else 50.
 
     At a point force the tension is that beyond it. `stable` is not examined and False; `residual` is the largest miss
     of a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest force and moment in the
@@ -116,7 +113,7 @@ def solve_continuum(
         segments = DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
-    guess = _near(fixed_scene, guess, segments)
+    guess = _near(fixed_scene, guess)
     if intervals is None:
         intervals = _chosen_intervals(fixed_scene, guess)
     result = _solve(scene, guess, rtol, intervals, segments)
@@ -124,15 +121,14 @@ def solve_continuum(
     return result
 
 
-def _near(scene: Scene, guess: Equilibrium | None, segments: int) -> Equilibrium:
+def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
     """A guess with the turns that the scene states."""
     if guess is not None and scene.turns is None:
         return guess
-    mesh = max(GUESS_SEGMENTS, segments) if guess is None else None
     with warnings.catch_warnings():
         # Whether the continuum converges from there is what the caller is told.
         warnings.simplefilter("ignore", NotConvergedWarning)
-        return solve(scene, segments=mesh, guess=guess)
+        return solve(scene, rtol=GUESS_RTOL, discretization="hermite", guess=guess)
 
 
 class Section(eqx.Module):
@@ -450,7 +446,9 @@ def _equilibrium(
     scaled, units = nondimensional(scene)
     rod = scaled.rod
     sections = start.sections(stations)
-    s = jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)
+    # Nodes, and the middles between them for what a discrete solve begins with.
+    equal = jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)
+    s = HermiteElements.of(scaled, equal).places
     station = jnp.searchsorted(start.s, s, side="right") - 1
     before = jax.tree.map(lambda leaf: leaf[station], sections)
     length = s - start.s[station]
@@ -462,7 +460,8 @@ def _equilibrium(
         jax.tree.map(lambda leaf, cut=cut: leaf[cut], reached)
         for cut in (slice(len(start.s) - 1), slice(len(start.s) - 1, None))
     )
-    nodes = jax.vmap(functools.partial(_beyond, scaled))(before, length, node_ends)
+    points = jax.vmap(functools.partial(_beyond, scaled))(before, length, node_ends)
+    s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
 
     residual = jnp.max(jnp.abs(ravel_pytree(_residual(scaled, start, stations, ends))[0]))
@@ -509,24 +508,21 @@ def _equilibrium(
         evaluations=jnp.asarray(iterations) + 1,
         substeps=none + 1,
         residual=residual,
-        error_estimate=jnp.full_like(scene.rod.length, jnp.nan),
-        radius=scene.rod.radius,
-        state=_warm_start(scaled, nodes, last, units),
+        scene=scene,
+        state=_warm_start(scaled, s, points, last, units),
+        discretization="continuum",
     )
 
 
-def _warm_start(scene: Scene, nodes: Section, last: Section, units: Units) -> SolverState:
+def _warm_start(scene: Scene, s: Float[Array, "n+1"], points: Section, last: Section, units: Units) -> SolverState:
     """What a discrete solve from here begins with."""
     is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
     end_force = last.force if is_held else jnp.zeros_like(last.force)
-    return SolverState(Polyline.through(nodes.position), end_force, units)
+    return SolverState(Curve(points.position[::2], points.frame[..., 2].T, s), end_force, units)
 
 
 def _norm(vector: Float[Array, "3"]) -> Float[Array, ""]:
-    """Length of a vector, with the derivative 0 at 0."""
-    squared = jnp.sum(vector**2)
-    is_zero = squared == 0
-    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
+    return root(jnp.sum(vector**2))
 
 
 def _rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 from rodjax import problems
-from rodjax.equilibrium import Equilibrium, NotConvergedWarning, describe
 from rodjax.files import save
 from rodjax.path import solve_path
 from rodjax.plot import plot_figure_1
+from rodjax.result import Equilibrium, NotConvergedWarning, describe
 
 REPORT_MILLISECONDS = 6.0  # a step, with 10 segments, on a 2.2 GHz AMD of 2008
 REPEATS = 9
@@ -29,7 +29,13 @@ def run(out: Path, segments: int) -> int:
 
     def solve(progress: bool) -> tuple[Equilibrium, float]:
         begin = time.perf_counter()
-        path = solve_path(scenes, segments=segments, guess=problems.figure_1_start(), progress=progress)
+        path = solve_path(
+            scenes,
+            segments=segments,
+            discretization="finite_difference",
+            guess=problems.figure_1_start(),
+            progress=progress,
+        )
         return jax.block_until_ready(path), time.perf_counter() - begin
 
     with warnings.catch_warnings():

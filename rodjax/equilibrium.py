@@ -1,10 +1,9 @@
 """solve(): the equilibrium of a scene."""
 
 import functools
-import math
 import typing
 import warnings
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,24 +13,28 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.discretization.dead_loads import energy_of_origin
-from rodjax.discretization.edges import EdgeTangents
-from rodjax.discretization.error import estimated_errors
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under
-from rodjax.guess import Guess, cubic, first_shape, resampled
+from rodjax.guess import Guess, first_shape
+from rodjax.implicit import change
 from rodjax.plane import check_planar, is_planar, plane
-from rodjax.refinement import SAFETY, SIZES, graded, next_size
+from rodjax.refinement import SAFETY, SIZES, first_size, graded, next_size
+from rodjax.result import (
+    Equilibrium,
+    NotConvergedWarning,
+    SolverState,
+    estimated_errors,
+    field_of,
+    warn_if_not_converged,
+)
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
 from rodjax.solvers.newton import Newton, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Outcome, Status, is_converged
-from rodjax.supports import Clamp
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -40,105 +43,23 @@ Discretization = Literal["finite_difference", "hermite"]
 # Shapes that differ by so many roundings are the same.
 SAME_SHAPE = 64
 
-DEFAULT_SEGMENTS = 50
-# Elements of the first mesh on the way to a tolerance, and of the only one inside jit.
-FIRST_SIZE = 6
-TRACED_SEGMENTS = 32
+DEFAULT_SOLVER = Newton()
+DEFAULT_RTOL = 1e-3
 # A smaller error than this drowns in the residual of 1e-8 EI/L^2 at which a solve stops.
 LEAST_RTOL = 1e-10
-DEFAULT_SOLVER = Newton()
+# Of the only mesh inside jit, where no error can be looked at.
+TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
 
-class NotConvergedWarning(UserWarning):
-    """A solve ended without an equilibrium; the message says why."""
+class Options(NamedTuple):
+    """How a scene is solved, and on what mesh: all that a compiled program depends on besides the scene's structure."""
 
-
-class SolverState(eqx.Module):
-    """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
-
-    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements; `end_force`: the force at s = L between
-    held ends, else zero.
-    """
-
-    shape: Shape
-    end_force: Float[Array, "... 3"]
-    units: Units
-
-
-class Equilibrium(eqx.Module):
-    """The equilibrium of a scene, or several of them along a leading axis `...` of every field.
-
-    Forces and moments are what the part of the rod beyond s exerts on the part before it, global axes, moments about
-    the centerline: at s = L what the support applies to the rod, at s = 0 the reverse of it.
-
-    - `s` [..., n+1] arclength of the nodes, m
-    - `nodes` [..., n+1, 3] centerline, m
-    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
-    - `curvature` [..., n+1] |t x t'|, 1/m
-    - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
-    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
-    - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of a dead
-      moment depends on the way and is left out; `elastic_energy` [...] J
-    - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
-    - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
-    - `stable` [...] bool: converged, and the energy has no negative curvature there; with a dead moment, which has no
-      potential, this is not examined and False
-    - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
-      a step of a path took: 1, or more where it was split
-    - `residual` [...] largest component of the gradient, in EI/L^2
-    - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; Hermite elements
-      only, else NaN
-    - `radius` [...] of the rod, m, or `None`: for pictures
-    """
-
-    s: Float[Array, "... n+1"]
-    nodes: Float[Array, "... n+1 3"]
-    frames: Float[Array, "... n+1 3 3"]
-    curvature: Float[Array, "... n+1"]
-    twist: Float[Array, "... n+1"]
-    total_twist: Float[Array, "..."]
-    tension: Float[Array, "... n+1"]
-    axial_strain: Float[Array, "... n+1"]
-    energy: Float[Array, "..."]
-    elastic_energy: Float[Array, "..."]
-    start_force: Float[Array, "... 3"]
-    start_moment: Float[Array, "... 3"]
-    end_force: Float[Array, "... 3"]
-    end_moment: Float[Array, "... 3"]
-    converged: Bool[Array, "..."]
-    stable: Bool[Array, "..."]
-    status: Int[Array, "..."]
-    iterations: Int[Array, "..."]
-    evaluations: Int[Array, "..."]
-    substeps: Int[Array, "..."]
-    residual: Float[Array, "..."]
-    error_estimate: Float[Array, "..."]
-    radius: Float[Array, "..."] | None
-    state: SolverState
-
-    @property
-    def tangents(self) -> Float[Array, "... n+1 3"]:
-        return self.frames[..., 2]
-
-    def position_at(self, s: Any) -> Float[Array, "... k 3"]:
-        """Centerline at arclengths `s` (k,) [m] from 0 to L: cubic between the nodes, [..., k, 3].
-
-        Raises `ValueError` where an arclength lies beyond the rod.
-        """
-        s = jnp.atleast_1d(jnp.asarray(s, self.s.dtype))
-        if is_known(s, self.s):
-            length = float(np.min(self.s[..., -1]))
-            if np.any(s < 0) or np.any(s > length):
-                raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
-
-        slopes = (1 + self.axial_strain)[..., None] * self.tangents
-
-        def on_one(places, nodes, slopes):
-            return cubic(places, nodes, slopes, s)
-
-        return jnp.vectorize(on_one, signature="(n),(n,3),(n,3)->(k,3)")(self.s, self.nodes, slopes)
+    segments: int
+    discretization: Discretization
+    solver: Solver
+    planar: bool
 
 
 def solve(
@@ -158,17 +79,18 @@ def solve(
     **Arguments:**
 
     - `scene`: `Scene`.
-    - `segments`: of the mesh; `None`: those of a guess that is an `Equilibrium`, else 50.
-    - `rtol`: the relative error of the shape that is wanted, instead of `segments`: Hermite elements are added, where
-      they are needed, until the estimated error is below it. Where the numbers of the scene are not known, as inside
-      `jit`, the mesh has 32 equal elements whatever `rtol`, and `error_estimate` says what that gives.
-    - `discretization`: `"finite_difference"`, of second order in 1/segments, or `"hermite"`, of fourth order. `None`:
-      `"hermite"` where `rtol` is given, that of the guess where its mesh is kept, else `"finite_difference"`.
+    - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs.
+    - `rtol`: the relative error of the shape that is wanted; `None` for 1e-3. Segments are added, elements where they
+        are needed, until the estimated error is below it. The mesh of a guess that is an `Equilibrium` comes first.
+        Where the numbers of the scene are not known, as inside `jit`, it is that of the guess or one of 32 elements
+        whatever `rtol`, and `error_estimate` says what that gives.
+    - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order.
+        `None`: that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
-      supports and gravity.
+        supports and gravity.
     - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
-      motions out of the plane too.
+        motions out of the plane too.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
@@ -179,139 +101,160 @@ def solve(
             f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
-    if discretization is None:
-        discretization = "hermite" if rtol is not None else mesh_of(guess, segments, solver)
-    if rtol is not None:
-        _check_rtol(rtol, segments, discretization)
-        segments = _first_size(guess) if is_known(scene, guess) else TRACED_SEGMENTS
-    segments, solver = checked_options(scene, segments, discretization, solver, guess, planar)
-    result = _solve(scene, guess, segments, discretization, solver, planar)
+    options, rtol = checked_options(scene, segments, rtol, discretization, solver, guess, planar)
+    result = _solve(scene, *first_state(scene, guess, options), options)
     if rtol is not None and is_known(result):
-        result = _refined(scene, result, float(rtol), solver, planar)
+        result = _refined(result, options, rtol)
     warn_if_not_converged(result)
     return result
 
 
-def mesh_of(guess: Guess | Equilibrium | None, segments: int | None, solver: Solver | None) -> Discretization:
-    """The discretization where none is asked for: that of a guess whose mesh is kept, if the solver knows it."""
-    has_elements = isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Curve)
-    keeps_mesh = segments is None and not isinstance(solver, NonlinearCG)
-    return "hermite" if has_elements and keeps_mesh else "finite_difference"
-
-
-def _check_rtol(rtol: float, segments: int | None, discretization: Discretization) -> None:
-    if segments is not None:
-        raise ValueError(f"segments must be None where rtol is given, got segments={segments!r} and rtol={rtol!r}")
-    if discretization != "hermite":
-        raise ValueError(f"discretization must be 'hermite' where rtol is given, got {discretization!r}")
-    if not LEAST_RTOL <= float(positive(rtol, "rtol")) <= 1.0:
-        raise ValueError(f"rtol must lie in {LEAST_RTOL:g} to 1, got {rtol!r}")
-
-
-def _first_size(guess: Guess | Equilibrium | None) -> int:
-    if isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Curve):
-        return guess.s.shape[-1] - 1
-    return FIRST_SIZE
-
-
-def _refined(scene: Scene, result: Equilibrium, rtol: float, solver: Solver, planar: bool) -> Equilibrium:
-    """Solved again, each time from the last, on meshes of more elements until the estimated error is below `rtol`."""
+def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
+    """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`."""
     while True:
-        segments, error = result.s.shape[-1] - 1, float(result.error_estimate)
-        if (bool(result.converged) and SAFETY * error <= rtol) or segments >= SIZES[-1]:
+        errors = estimated_errors(result)
+        error = float(np.max(np.linalg.norm(errors.nodes, axis=1)))
+        if (bool(result.converged) and SAFETY * error <= rtol) or is_finest(options):
             break
-        if not result.converged:
-            error = math.nan
-        iterations, evaluations = result.iterations, result.evaluations
-        result = _solve_finer(scene, result, next_size(segments, error, rtol), solver, planar)
+        options = options._replace(
+            segments=next_size(options.segments, error if result.converged else np.nan, rtol, options.discretization)
+        )
+        finer = _solve(result.scene, _finer(result, errors.defects, options), result.total_twist, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
-            result,
-            (result.iterations + iterations, result.evaluations + evaluations),
+            finer,
+            (finer.iterations + result.iterations, finer.evaluations + result.evaluations),
         )
-    if result.converged and not error <= rtol:
-        warnings.warn(
-            f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh of {segments} elements",
-            NotConvergedWarning,
-            stacklevel=3,
-        )
+    if result.converged:
+        warn_if_inaccurate(error, rtol, options)
     return result
 
 
-@functools.partial(jax.jit, static_argnames=("segments", "solver", "planar"))
-def _solve_finer(scene: Scene, coarse: Equilibrium, segments: int, solver: Solver, planar: bool) -> Equilibrium:
-    """On elements where the coarse solution, if it is one, shows defects."""
-    scaled, _ = nondimensional(scene)
+def is_finest(options: Options) -> bool:
+    return options.segments >= SIZES[options.discretization][-1]
+
+
+def warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
+    if not error <= rtol:
+        warnings.warn(
+            f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh, of {options.segments} "
+            "segments",
+            NotConvergedWarning,
+            stacklevel=4,
+        )
+
+
+@functools.partial(jax.jit, static_argnames=("options",))
+def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Options) -> SolverState:
+    """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
     state = coarse.state
     shape = state.shape
-    assert isinstance(shape, Curve)
-    form = MixedForm.of(scaled, _field(scaled, shape))
-    errors = estimated_errors(form, MixedPoint(shape.tangents, state.end_force, coarse.total_twist))
-    is_usable = coarse.converged & jnp.all(jnp.isfinite(errors.defects))
-    s = graded(shape.s, jnp.where(is_usable, errors.defects, 1.0), segments)
-    state = SolverState(shape.on(s), state.end_force, state.units)
-    return equilibrium(scene, solve_from(scene, state, coarse.total_twist, solver, planar), jnp.ones((), int))
-
-
-def describe(equilibrium: Equilibrium) -> str:
-    """How a solve ended, in words; for several, each outcome with its count."""
-    codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
-    if equilibrium.status.ndim == 0:
-        return (
-            f"{Status(codes[0]).message}; residual {float(equilibrium.residual):.1e} EI/L^2 "
-            f"after {int(equilibrium.iterations)} iterations"
-        )
-    return "\n".join(f"{count} {Status(code).message}" for code, count in zip(codes, counts, strict=True))
+    if isinstance(shape, Curve) and defects is not None:
+        is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
+        shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
+    else:
+        shape = Polyline.through(shape.points(options.segments))
+    return SolverState(shape, state.end_force, state.units)
 
 
 def checked_options(
     scene: Scene,
     segments: int | None,
-    discretization: Discretization,
+    rtol: float | None,
+    discretization: Discretization | None,
     solver: Solver | None,
     guess: Guess | Equilibrium | None,
     planar: bool,
-) -> tuple[int, Solver]:
-    """Segments and solver with the library's choice for `None`."""
-    if discretization not in typing.get_args(Discretization):
-        allowed = " or ".join(map(repr, typing.get_args(Discretization)))
-        raise ValueError(f"discretization must be {allowed}, got {discretization!r}")
+) -> tuple[Options, float | None]:
+    """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
-    if segments is None:
-        segments = guess.s.shape[-1] - 1 if isinstance(guess, Equilibrium) else DEFAULT_SEGMENTS
-    segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
     if solver is None:
         solver = DEFAULT_SOLVER
     instance(solver, "solver", typing.get_args(Solver))
+    if discretization is None:
+        discretization = _discretization(guess, segments, solver)
+    if discretization not in typing.get_args(Discretization):
+        allowed = " or ".join(map(repr, typing.get_args(Discretization)))
+        raise ValueError(f"discretization must be {allowed}, got {discretization!r}")
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
+    if rtol is not None:
+        if segments is not None:
+            raise ValueError(f"segments must be None where rtol is given, got segments={segments!r} and rtol={rtol!r}")
+        rtol = checked_rtol(rtol)
+    elif segments is None:
+        rtol = DEFAULT_RTOL
+    if segments is not None:
+        segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
+    elif isinstance(guess, Equilibrium):
+        segments = guess.s.shape[-1] - 1
+    elif rtol is not None and is_known(scene, guess):
+        segments = first_size(rtol, discretization)
+    else:
+        segments = TRACED_SEGMENTS[discretization]
     instance(planar, "planar", bool)
     if planar:
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton where planar is True")
         check_planar(scene, 0.0 if guess is None else guess.total_twist)
-    return segments, solver
+    return Options(segments, discretization, solver, planar), rtol
+
+
+def checked_rtol(rtol: Any) -> float:
+    value = float(positive(rtol, "rtol"))
+    if not LEAST_RTOL <= value <= 1.0:
+        raise ValueError(f"rtol must lie in {LEAST_RTOL:g} to 1, got {rtol!r}")
+    return value
+
+
+def _discretization(guess: Guess | Equilibrium | None, segments: int | None, solver: Solver) -> Discretization:
+    """The one to take where none is asked for."""
+    if isinstance(solver, NonlinearCG):
+        return "finite_difference"
+    if segments is None and isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Polyline):
+        return "finite_difference"
+    return "hermite"
 
 
 def first_state(
-    scene: Scene, guess: Guess | Equilibrium | None, segments: int, discretization: Discretization
+    scene: Scene, guess: Guess | Equilibrium | None, options: Options
 ) -> tuple[SolverState, Float[Array, ""]]:
-    """Where to begin, and the total twist to stay near to [rad]."""
+    """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
+    kind = _kind(options)
+    if (
+        isinstance(guess, Equilibrium)
+        and isinstance(guess.state.shape, kind)
+        and guess.s.shape[-1] - 1 == options.segments
+    ):
+        return guess.state, guess.total_twist
+    return _first_state(scene, guess, options)
+
+
+def _kind(options: Options) -> type[Polyline] | type[Curve]:
+    return Polyline if options.discretization == "finite_difference" else Curve
+
+
+@functools.partial(jax.jit, static_argnames=("options",))
+def _first_state(
+    scene: Scene, guess: Guess | Equilibrium | None, options: Options
+) -> tuple[SolverState, Float[Array, ""]]:
     scaled, units = nondimensional(scene)
-    kind, pieces = (Polyline, segments) if discretization == "finite_difference" else (Curve, 2 * segments)
+    kind = _kind(options)
+    pieces = options.segments if kind is Polyline else 2 * options.segments
     no_force = jnp.zeros(3, scene.rod.length.dtype)
     if guess is None:
         return SolverState(kind.through(first_shape(scaled, pieces)), no_force, units), jnp.zeros_like(no_force[0])
     if isinstance(guess, Guess):
         return SolverState(kind.through(guess.nodes(units, pieces)), no_force, units), guess.total_twist
     state = guess.state
-    if not isinstance(state.shape, kind) or guess.s.shape[-1] - 1 != segments:
-        shape = kind.through(resampled(state.shape.nodes, pieces))
-        state = SolverState(shape, state.end_force, state.units)
-    return state, guess.total_twist
+    if isinstance(state.shape, Curve) and kind is Curve:
+        shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
+    else:
+        shape = kind.through(state.shape.points(pieces))
+    return SolverState(shape, state.end_force, state.units), guess.total_twist
 
 
 class Found(eqx.Module):
@@ -323,10 +266,10 @@ class Found(eqx.Module):
     is_stable: Bool[Array, ""]
 
 
-def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], solver: Solver, planar: bool) -> Found:
+def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     scaled, units = nondimensional(scene)
-    return _found(scaled, _in_units(state, units), twist, solver=solver, planar=planar)
+    return _found(scaled, _in_units(state, units), twist, solver=options.solver, planar=options.planar)
 
 
 def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
@@ -334,7 +277,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
     scaled, _ = nondimensional(scene)
     point, outcome, units = found.point, found.outcome, found.state.units
     nodes = found.state.shape.nodes
-    form = MixedForm.of(scaled, _field(scaled, found.state.shape))
+    form = MixedForm.of(scaled, field_of(scaled, found.state.shape))
     results = resultants(form, point)
     elastic_energy = form.elastic_energy(point)
     potential = elastic_energy + form.load_energy(point)
@@ -361,21 +304,15 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         evaluations=outcome.evaluations,
         substeps=substeps,
         residual=outcome.residual,
-        error_estimate=_error_estimate(form, point),
-        radius=scene.rod.radius,
+        scene=scene,
         state=found.state,
+        discretization="hermite" if isinstance(form.field, HermiteElements) else "finite_difference",
     )
-
-
-def _error_estimate(form: MixedForm, point: MixedPoint) -> Float[Array, ""]:
-    if not isinstance(form.field, HermiteElements):
-        return jnp.full((), jnp.nan, point.tangents.dtype)
-    return jnp.sqrt(jnp.max(jnp.sum(estimated_errors(form, point).nodes ** 2, axis=1)))
 
 
 @eqx.filter_custom_jvp
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver: Solver, planar: bool) -> Found:
-    form = MixedForm.of(scene, _field(scene, guess.shape))
+    form = MixedForm.of(scene, field_of(scene, guess.shape))
     if isinstance(solver, NonlinearCG):
         assert isinstance(guess.shape, Polyline)
         problem, start = FiniteDifference.begin(scene, guess.shape, twist)
@@ -403,12 +340,6 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver:
     return Found(SolverState(shape, point.end_force, guess.units), point, outcome, stable)
 
 
-def _field(scene: Scene, shape: Shape) -> TangentField:
-    if isinstance(shape, Curve):
-        return HermiteElements.of(scene, shape.s)
-    return EdgeTangents.of(scene, len(shape.nodes) - 1)
-
-
 def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, MixedPoint]:
     """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
     scene, shape, field = form.scene, guess.shape, form.field
@@ -417,46 +348,38 @@ def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -
         return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
     assert isinstance(field, HermiteElements)
     assert isinstance(shape, Curve)
-    tangents = shape.turned_to_ends(scene, field.places)
-    total_twist = jnp.zeros_like(twist)
-    if dead_end_moment(scene) is not None:
-        total_twist = twist_under_moment(scene, tangents)
-    elif isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp):
-        principal = field.total_twist(tangents, scene.start.frame[:, 0], scene.end.frame[:, 0])
-        total_twist = nearest_twist(principal, twist, scene.turns)
+    tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
+    total_twist = form.twist_near(tangents, twist, scene.turns)
     end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
     return shape, MixedPoint(tangents, end_force, total_twist)
 
 
 @_found.def_jvp
-def _no_derivative(primals, tangents, *, solver: Solver, planar: bool):
-    # Differentiating the iterations would give numbers that look right and are not.
-    raise NotImplementedError(
-        "the derivative of a solve is not part of this version; "
-        "take central differences of solves with a tight tolerance"
+def _found_jvp(primals, tangents, *, solver: Solver, planar: bool):
+    """Differentiating the iterations would give numbers that look right and are not."""
+    scene, *_ = primals
+    scene_change, guess_change, _ = tangents
+    found = _found(*primals, solver=solver, planar=planar)
+    scene_change = jax.tree.map(
+        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
+        scene_change,
+        scene,
+        is_leaf=lambda change: change is None,
     )
+    outcome = found.outcome
+    shape, point = change(scene, scene_change, found.state.shape, found.point, is_converged(outcome.status))
+    state = SolverState(shape, point.end_force, guess_change.units)
+    nothing = jax.tree.map(lambda leaf: None, (outcome, found.is_stable))
+    return found, Found(state, point, *nothing)
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
-@functools.partial(jax.jit, static_argnames=("segments", "discretization", "solver", "planar"))
-def _solve(
-    scene: Scene,
-    guess: Guess | Equilibrium | None,
-    segments: int,
-    discretization: Discretization,
-    solver: Solver,
-    planar: bool,
-) -> Equilibrium:
-    state, twist = first_state(scene, guess, segments, discretization)
-    return equilibrium(scene, solve_from(scene, state, twist, solver, planar), jnp.ones((), int))
+@functools.partial(jax.jit, static_argnames=("options",))
+def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Equilibrium:
+    return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int))
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
     return SolverState(shape, state.end_force * (state.units.force / units.force), units)
-
-
-def warn_if_not_converged(equilibrium: Equilibrium) -> None:
-    if is_known(equilibrium.converged) and not np.all(equilibrium.converged):
-        warnings.warn(describe(equilibrium), NotConvergedWarning, stacklevel=3)

@@ -25,12 +25,13 @@ from rodjax.checks import instance, is_known
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
-from rodjax.equilibrium import Equilibrium
+from rodjax.result import Equilibrium
 from rodjax.status import Status
+from rodjax.supports import Clamp, Free, Pin, Support, Swivel
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 3
+FORMAT = 4
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -55,11 +56,6 @@ FIELDS = {
     "evaluations": ("1", "evaluations of the energy and its gradient"),
     "substeps": ("1", "solves that a step of a path took"),
     "residual": ("1", "largest component of the gradient, in EI/L^2"),
-    "error_estimate": (
-        "1",
-        "estimated largest distance of a node from the continuum, by L; NaN: not estimated",
-    ),
-    "radius": ("m", "radius of the rod; absent where it is not known"),
     "state/shape/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
     "state/shape/edges": ("1", "finite differences: differences of these nodes, free of the rounding of the positions"),
     "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
@@ -68,7 +64,30 @@ FIELDS = {
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
+    "scene/gravity": ("m/s^2", "gravity"),
+    "scene/turns": ("1", "whole turns of the end frame beyond the total twist of the initial shape"),
+    "scene/rod/length": ("m", "length of the rod"),
+    "scene/rod/EI": ("N m^2", "bending stiffness"),
+    "scene/rod/GJ": ("N m^2", "torsional stiffness"),
+    "scene/rod/EA": ("N", "axial stiffness"),
+    "scene/rod/mass_per_length": ("kg/m", "mass per length"),
+    "scene/rod/radius": ("m", "radius of the rod, for pictures"),
+    "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
+    "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    **{
+        f"scene/{end}/{name}": (unit, f"{description} at s = {place}, global axes")
+        for end, place in (("start", "0"), ("end", "L"))
+        for name, unit, description in (
+            ("position", "m", "position that the support holds"),
+            ("frame", "1", "frame that the support holds, columns d1, d2, t,"),
+            ("tangent", "1", "tangent that the support holds"),
+            ("force", "N", "dead force on the rod"),
+            ("moment", "N m", "dead moment on the rod"),
+        )
+    },
 }
+# What stands in the attribute `kind` of a group: which of several classes the values are of.
+KINDS = {kind.__name__: kind for kind in (Clamp, Swivel, Pin, Free, Polyline, Curve)}
 
 
 def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
@@ -141,7 +160,7 @@ def _checked(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _group(file: h5py.File, name: str, path: Path) -> h5py.Group:
+def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         raise ValueError(f"{path} has no group /{name}: load reads files that rodjax.save wrote")
@@ -165,32 +184,49 @@ def _check_format(group: h5py.Group, path: Path) -> None:
 
 
 def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
+    if type(module).__name__ in KINDS:
+        group.attrs["kind"] = type(module).__name__
     for field in dataclasses.fields(module):
         name, value = field.name, getattr(module, field.name)
-        if isinstance(value, eqx.Module):
+        if field.metadata.get("static"):
+            group.attrs[name] = value
+        elif isinstance(value, eqx.Module):
             _write(group.create_group(name), value, f"{place}{name}/")
+        elif isinstance(value, tuple):
+            modules = group.create_group(name)
+            for k, module_k in enumerate(value):
+                _write(modules.create_group(str(k)), module_k, f"{place}{name}/*/")
         elif value is not None:
             dataset = group.create_dataset(name, data=value)
             dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place + name]
 
 
 def _read(group: h5py.Group, kind: Any, path: Path) -> Any:
-    """A module of class `kind` with NumPy arrays for leaves."""
-    values = {}
+    """A module of class `kind`, or of the one that the group names, with NumPy arrays for leaves."""
+    if kind in (Shape, Support):
+        name = group.attrs.get("kind")
+        if name not in KINDS:
+            raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(KINDS)}")
+        kind = KINDS[name]
+    # As it was written, without the checks of its constructor, which take a single scene of sensible numbers.
+    module = object.__new__(kind)
     for field in dataclasses.fields(kind):
         entry = group.get(field.name)
-        if isinstance(entry, h5py.Group):
-            kind_of_field = field.type
-            if kind_of_field is Shape:
-                kind_of_field = Polyline if "edges" in entry else Curve
-            values[field.name] = _read(entry, kind_of_field, path)
+        if field.metadata.get("static"):
+            value = group.attrs[field.name]
+        elif isinstance(entry, h5py.Group) and typing.get_origin(field.type) is tuple:
+            item = typing.get_args(field.type)[0]
+            value = tuple(_read(_group(entry, str(k), path), item, path) for k in range(len(entry)))
+        elif isinstance(entry, h5py.Group):
+            value = _read(entry, field.type, path)
         elif isinstance(entry, h5py.Dataset):
-            values[field.name] = entry[()]
+            value = entry[()]
         elif types.NoneType in typing.get_args(field.type):
-            values[field.name] = None
+            value = None
         else:
             raise ValueError(f"{path} lacks {group.name}/{field.name}: it is damaged, or rodjax.save did not write it")
-    return kind(**values)
+        object.__setattr__(module, field.name, value)
+    return module
 
 
 def _as_jax(values: Any, path: Path) -> Array:

@@ -47,6 +47,19 @@ class SaddlePointSystem(eqx.Module):
                 f"with b = 1 or 2, got {', '.join(map(str, given))}"
             )
 
+    def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        """The matrix times (x, y): the right sides f and c."""
+        columns = x[:, None]
+        below = _product(self.lower, columns[..., :-1])[:, 0]
+        above = _transpose_product(self.lower, columns[..., 1:])[:, 0]
+        f = _product(self.diagonal, columns)[:, 0] + jnp.sum(self.border * y[None, :, None], axis=1)
+        f = f.at[:, 1:].add(below).at[:, :-1].add(above)
+        if self.across is not None:
+            f = f.at[:, 2::2].add(_product(self.across, columns[..., 0:-1:2])[:, 0])
+            f = f.at[:, 0:-1:2].add(_transpose_product(self.across, columns[..., 2::2])[:, 0])
+        rows = self.border if self.rows is None else self.rows
+        return f, jnp.sum(rows * x[:, None], axis=(0, 2)) - self.compliance @ y
+
     def shifted(self, shift: Float[Array, ""]) -> "SaddlePointSystem":
         """H + shift I in the place of H."""
         identity = jnp.eye(self.diagonal.shape[0], dtype=shift.dtype)[..., None]
@@ -77,8 +90,13 @@ class Factors(eqx.Module):
 
     def _bordered(self, x: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
         """The solution, from that without border."""
-        y = jnp.sum(self.complement * (c - _dots(self.rows, x))[None], axis=1)
-        return x - jnp.sum(self.border_solution * y[None, :, None], axis=1), y
+        y = short_sum(self.complement * (c - _dots(self.rows, x))[None], axis=1)
+        return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
+
+
+def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
+    """Sum over an axis of few entries, written out: XLA makes a sum over an axis a loop at each place along the rod."""
+    return functools.reduce(jnp.add, jnp.unstack(x, axis=axis)) if x.shape[axis] else jnp.sum(x, axis=axis)
 
 
 def factor(system: SaddlePointSystem) -> Factors:

@@ -6,25 +6,27 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import instance, leaf, namespace
+from rodjax.checks import instance, is_known, leaf, namespace
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Discretization,
-    Equilibrium,
     Found,
+    Options,
     Solver,
-    SolverState,
     checked_options,
     equilibrium,
     first_state,
-    mesh_of,
+    is_finest,
     solve_from,
-    warn_if_not_converged,
+    warn_if_inaccurate,
 )
 from rodjax.guess import Guess
+from rodjax.refinement import SAFETY, next_size
+from rodjax.result import Equilibrium, SolverState, warn_if_not_converged
 from rodjax.scene import Scene, between, nondimensional
 from rodjax.status import Outcome, is_converged
 
@@ -39,6 +41,7 @@ def solve_path(
     scenes: Sequence[Scene] | Scene,
     *,
     segments: int | None = None,
+    rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
@@ -56,16 +59,25 @@ def solve_path(
     A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
     step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
 
-    - `segments`, `discretization`, `solver`, `guess`, `planar`: as for `rodjax.solve`; the guess is for the first
-      scene.
+    - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`: as for `rodjax.solve`. The guess is for the
+        first scene; where the estimated error of any step is above `rtol`, the whole path is solved on a finer mesh of
+        equal segments.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
-    if discretization is None:
-        discretization = mesh_of(guess, segments, solver)
-    segments, solver = checked_options(stacked, segments, discretization, solver, guess, planar)
-    path = _solve_path(stacked, guess, segments, discretization, solver, planar, progress)
+    options, rtol = checked_options(stacked, segments, rtol, discretization, solver, guess, planar)
+    first = jax.tree.map(lambda leaf: leaf[0], stacked)
+    while True:
+        path = _solve_path(stacked, *first_state(first, guess, options), options, progress)
+        if rtol is None or not is_known(path):
+            break
+        errors = np.asarray(path.error_estimate)[np.asarray(path.converged)]
+        error = float(np.max(errors, initial=0.0))
+        if SAFETY * error <= rtol or is_finest(options):
+            warn_if_inaccurate(error, rtol, options)
+            break
+        options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
     warn_if_not_converged(path)
     return path
 
@@ -99,26 +111,18 @@ def _structure(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-@functools.partial(jax.jit, static_argnames=("segments", "discretization", "solver", "planar", "progress"))
+@functools.partial(jax.jit, static_argnames=("options", "progress"))
 def _solve_path(
-    scenes: Scene,
-    guess: Guess | Equilibrium | None,
-    segments: int,
-    discretization: Discretization,
-    solver: Solver,
-    planar: bool,
-    progress: bool,
+    scenes: Scene, state: SolverState, twist: Float[Array, ""], options: Options, progress: bool
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
-
     first = jax.tree.map(lambda leaf: leaf[0], scenes)
-    state, twist = first_state(first, guess, segments, discretization)
 
     def step(carry, numbered):
         last, before, bar = carry
         number, scene = numbered
-        found, substeps = _step(last, before, scene, solver, planar, may_split=number > 0)
+        found, substeps = _step(last, before, scene, options, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
         return (_Station(scene, found.state, found.point.total_twist), last, bar), (found, substeps)
@@ -154,14 +158,14 @@ class _Progress(eqx.Module):
 
 
 def _step(
-    last: _Station, before: _Station, scene: Scene, solver: Solver, planar: bool, *, may_split: Bool[Array, ""]
+    last: _Station, before: _Station, scene: Scene, options: Options, *, may_split: Bool[Array, ""]
 ) -> tuple[Found, Int[Array, ""]]:
     """The equilibrium of a scene from the last one, at once or by way of scenes between the two; solves it took."""
 
     def attempt(progress: _Progress) -> _Progress:
         target = jnp.minimum(progress.fraction + progress.share, 1.0)
         here = jax.lax.cond(target < 1.0, lambda: between(last.scene, scene, target), lambda: scene)
-        found = solve_from(here, progress.begin, progress.total_twist, solver, planar)
+        found = solve_from(here, progress.begin, progress.total_twist, options)
         converged = is_converged(found.outcome.status)
         reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
         is_smallest = progress.share <= 0.5**MAX_SPLITS

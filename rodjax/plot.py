@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import instance, positive
 from rodjax.discretization.twist import angle_about, transport
-from rodjax.equilibrium import Equilibrium
+from rodjax.result import Equilibrium
 
 Field = Literal["curvature", "twist", "tension"]
 LABELS = {"curvature": "curvature [1/m]", "twist": "twist rate [rad/m]", "tension": "tension [N]"}
@@ -246,7 +246,8 @@ def _limits(values: Float[np.ndarray, "p"]) -> tuple[float, float]:
 
 def _thickness(equilibria: Sequence[Equilibrium], radius: float | None = None) -> tuple[float, str]:
     """Radius of the tubes [m], the one asked for or one that can be seen, and what to say of it in the picture."""
-    true = 0.0 if equilibria[0].radius is None else float(equilibria[0].radius)
+    rod = equilibria[0].scene.rod
+    true = 0.0 if rod.radius is None else float(rod.radius)
     if radius is None:
         nodes = np.concatenate([equilibrium.nodes for equilibrium in equilibria])
         radius = max(LEAST_RADIUS * float(np.max(np.ptp(nodes, axis=0))), true)

@@ -40,6 +40,7 @@ _QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
     "at": ("m", (), '"0.5 m"'),
     "segments": ("", (), "50"),
+    "rtol": ("", (), "1e-3"),
     "steps": ("", (), "10"),
 }
 _NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)

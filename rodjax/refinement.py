@@ -4,11 +4,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Numbers of elements: few, as each is a program to compile.
-SIZES = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
+# The order of the shape error in 1/segments, and the numbers of segments: few, as each is a program to compile.
+ORDERS = {"finite_difference": 2, "hermite": 4}
+SIZES = {
+    "finite_difference": (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096),
+    "hermite": (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512),
+}
 # The estimated error may be off by a few percent, and a mesh that just misses costs another solve.
 SAFETY = 1.2
-ORDER = 4
+# By segments^order: a cable bent by a turn under its weight has 1 to 5.
+TYPICAL_ERROR = 2.0
 # The mesh grows by this much at least, and at most: an estimate on a mesh too coarse is not to be believed that far.
 LEAST_GROWTH, MOST_GROWTH = 1.2, 4.0
 # The longest element is at most so many times as long as one of equal elements, and neighbours differ by this factor.
@@ -16,17 +21,26 @@ LONGEST = 2.0
 GRADING = 2.0
 
 
-def next_size(segments: int, error: float, rtol: float) -> int:
-    """The number of elements for a relative error `rtol`, after `segments` had an estimated `error` (NaN: unknown)."""
-    growth = (SAFETY * error / rtol) ** (1 / ORDER) if error == error else 2.0
-    wanted = segments * min(max(growth, LEAST_GROWTH), MOST_GROWTH)
-    return next((size for size in SIZES if size >= wanted), SIZES[-1])
+def first_size(rtol: float, discretization: str) -> int:
+    """The number of segments to begin with: mostly enough, as each number of them is a program to compile."""
+    return _at_least((TYPICAL_ERROR / rtol) ** (1 / ORDERS[discretization]), discretization)
+
+
+def next_size(segments: int, error: float, rtol: float, discretization: str) -> int:
+    """The number of segments for a relative error `rtol`, after `segments` had an estimated `error` (NaN: unknown)."""
+    growth = (SAFETY * error / rtol) ** (1 / ORDERS[discretization]) if error == error else 2.0
+    return _at_least(segments * min(max(growth, LEAST_GROWTH), MOST_GROWTH), discretization)
+
+
+def _at_least(wanted: float, discretization: str) -> int:
+    sizes = SIZES[discretization]
+    return next((size for size in sizes if size >= wanted), sizes[-1])
 
 
 def graded(s: Float[Array, "n+1"], defects: Float[Array, "n"], segments: int) -> Float[Array, "k+1"]:
     """Nodes of a mesh on which all elements would have the same defect, of fifth order in their length."""
     h = jnp.diff(s)
-    density = (defects + jnp.finfo(h.dtype).tiny) ** (1 / (ORDER + 1)) / h
+    density = (defects + jnp.finfo(h.dtype).tiny) ** (1 / (ORDERS["hermite"] + 1)) / h
     density /= jnp.sum(density * h)
     density = jnp.maximum(density, 1 / LONGEST)
 

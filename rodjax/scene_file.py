@@ -33,7 +33,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     force = "[0, 0, -0.2] N"
 
     [solve]                        # optional
-    segments = 50
+    rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
+    discretization = "hermite"     # or "finite_difference"
 
     [[path]]                       # any number of these, one after another
     steps = 10                     # from what came before to these values in equal steps; 1 where it is not given
@@ -53,7 +54,7 @@ import os
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ from jaxtyping import Float
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import instance, is_known, whole_number
-from rodjax.equilibrium import MAX_SEGMENTS
+from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.loads import PointForce
 from rodjax.quantities import SceneFileError, assignment, check_keys, choice, named, si_values, table_list
 from rodjax.rod import Rod
@@ -99,11 +100,13 @@ Values = dict[str, dict[str, Float[np.ndarray, "..."]]]
 
 
 class SceneFile(NamedTuple):
-    """What a file holds: `scenes`, one or those of a path; whether it `is_path`; `segments` of the mesh or `None`."""
+    """What a file holds: `scenes`, one or those of a path; whether it `is_path`; settings of the solve or `None`."""
 
     scenes: list[Scene]
     is_path: bool
     segments: int | None
+    rtol: float | None
+    discretization: Discretization | None
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
@@ -173,9 +176,15 @@ def _scene_file(content: dict[str, Any]) -> SceneFile:
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: _end_values(content[name], name, kind) for name, kind in kinds.items()}
     values["loads"], point_forces = _loads(content.get("loads", {}))
-    solve = check_keys(content.get("solve", {}), "solve", (), ("segments",))
+    solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
+    discretization = cast(
+        Discretization | None, choice(solve, "solve", "discretization", list(get_args(Discretization)))
+    )
     with named("solve"):
-        segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if solve else None
+        segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if "segments" in solve else None
+        rtol = checked_rtol(solve["rtol"]) if "rtol" in solve else None
+    if segments is not None and rtol is not None:
+        raise SceneFileError("solve.rtol is not allowed together with solve.segments: it chooses the segments")
     turns = values["end"].pop("turns", None)
     changes = _changes(content["path"], kinds, values) if "path" in content else []
     if changes and turns is not None:
@@ -196,7 +205,7 @@ def _scene_file(content: dict[str, Any]) -> SceneFile:
             scenes.append(scene(_between(values, target, step / steps, where), where))
             _check_frames(scenes[-2], scenes[-1], f"{where}steps: step {step} of {steps}")
         values = _between(values, target, 1.0, where)
-    return SceneFile(scenes, bool(changes), segments)
+    return SceneFile(scenes, bool(changes), segments, rtol, discretization)
 
 
 def _rod(table: Any) -> Rod:

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.checks import direction, is_known, leaf, namespace, rotation, vector
@@ -92,6 +93,24 @@ class Free(Support):
 # The supports that hold the position, and those that also hold the tangent; a `Clamp` alone holds the twist.
 Held = Clamp | Swivel | Pin
 Directed = Clamp | Swivel
+
+
+def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
+    """A frame (3, 3) turned about the axis of a rotation vector (3,) by its length [rad], global axes.
+
+    The derivative of a solve by a frame is meant for rotations: take it by this vector, at zero.
+    """
+    x, y, z = vector(rotation_vector, "rotation_vector")
+    squared = x * x + y * y + z * z
+    # Series near zero, where the derivatives of the length are infinite.
+    is_small = squared < 1e-4
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    a = jnp.where(is_small, 1 - squared / 6 + squared**2 / 120 - squared**3 / 5040, jnp.sin(angle) / angle)
+    b = jnp.where(is_small, 0.5 - squared / 24 + squared**2 / 720 - squared**3 / 40320, (1 - jnp.cos(angle)) / angle**2)
+    zero = jnp.zeros_like(squared)
+    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    turned = jnp.asarray(rotation(frame, "frame"))
+    return turned + a * (cross @ turned) + b * (cross @ (cross @ turned))
 
 
 def frame(tangent: Any, d2: Any = (0.0, 1.0, 0.0)) -> Float[Array, "3 3"]:

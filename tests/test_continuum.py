@@ -37,7 +37,7 @@ def sections_close(result: rj.Equilibrium, expected: rj.Equilibrium, atol: float
 def figure_1() -> tuple[Scene, rj.Equilibrium]:
     """Stage f of Fig. 1 and a discrete equilibrium there, after a full turn."""
     scenes = problems.figure_1()
-    path = rj.solve_path(scenes, segments=50, guess=problems.figure_1_start())
+    path = rj.solve_path(scenes, segments=50, discretization="finite_difference", guess=problems.figure_1_start())
     return scenes[-1], jax.tree.map(lambda leaf: leaf[-1], path)
 
 
@@ -48,6 +48,7 @@ def test_figure_1(figure_1):
     assert result.converged
     assert result.residual < RESIDUAL
     assert result.nodes.shape == guess.nodes.shape
+    assert np.isnan(result.error_estimate)
     # Five digits from shooting with scipy; the others are those that rtol and intervals do not change.
     np.testing.assert_allclose(result.elastic_energy / EI, 19.969576807, rtol=1e-10)
     np.testing.assert_allclose(result.total_twist, 4.98757, atol=5e-6)
@@ -142,7 +143,7 @@ def test_a_column_between_pins_is_the_elastica():
     scene = Scene(rod, Pin(ORIGIN), Pin((span, 0, 0)))
     x = np.linspace(0, 1, 51)
     bow = rj.Guess(np.stack([span * x, 0.2 * np.sin(math.pi * x), 0.1 * np.sin(math.pi * x)], axis=1))
-    guess = rj.solve(scene, segments=50, guess=bow)
+    guess = rj.solve(scene, segments=50, discretization="finite_difference", guess=bow)
     result = solve_continuum(scene, guess)
     assert result.converged
     assert result.residual < RESIDUAL
@@ -166,7 +167,7 @@ def between_pins() -> tuple[Scene, rj.Equilibrium, rj.Equilibrium]:
     EI = float(rod.EI)
     force = PointForce(0.3, np.array([0.3, 3.0, -1.0]) * EI)
     scene = Scene(rod, Pin(ORIGIN), Pin((0.7, 0.1, 0.05)), gravity=(0, 0, -9.81), point_forces=[force])
-    guess = rj.solve(scene, segments=50)
+    guess = rj.solve(scene, segments=50, discretization="finite_difference")
     return scene, guess, solve_continuum(scene, guess)
 
 
@@ -204,7 +205,7 @@ def test_the_discrete_rod_converges_to_it(cable, end):
     end = end or Free(force=np.array([0.5, 1.0, 2.0]) * EI, moment=np.array([1.0, 2.0, -1.0]) * EI)
     force = PointForce(0.3, np.array([0.3, 3.0, -1.0]) * EI)
     scene = Scene(cable, Clamp(ORIGIN, frame((1, 0.2, -0.6))), end, gravity=(0, 0, -9.81), point_forces=[force])
-    results = [rj.solve(scene, segments=n) for n in (100, 200, 400)]
+    results = [rj.solve(scene, segments=n, discretization="finite_difference") for n in (100, 200, 400)]
     truth = solve_continuum(scene, results[-1], segments=100)
     assert truth.residual < RESIDUAL
 
@@ -232,7 +233,7 @@ def test_a_heavy_cable_converges():
     EI = float(rod.EI)
     rod = Rod(1.0, EI, rod.GJ, rod.EA, mass_per_length=1e4 * EI / 9.81)
     scene = Scene(rod, Clamp(ORIGIN, LEVEL), Clamp((0.8, 0, 0), LEVEL), gravity=(0, 0, -9.81))
-    guess = rj.solve(scene, segments=100)
+    guess = rj.solve(scene, segments=100, discretization="finite_difference")
     results = [solve_continuum(scene, guess, intervals=k) for k in (None, 64)]
     for result in results:
         assert result.converged
@@ -296,7 +297,9 @@ def test_without_a_guess_it_begins_with_the_discrete_one(cable):
         return solve_continuum(eqx.tree_at(lambda scene: scene.rod, scene, rod), segments=20).total_twist
 
     value, derivative = jax.value_and_grad(twist)(scene.rod.GJ)
-    np.testing.assert_allclose(value, rj.solve(scene, segments=200).total_twist, atol=1e-3)
+    np.testing.assert_allclose(
+        value, rj.solve(scene, segments=200, discretization="finite_difference").total_twist, atol=1e-3
+    )
     assert abs(float(derivative)) > 0
 
 

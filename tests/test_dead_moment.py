@@ -19,7 +19,7 @@ def test_a_dead_moment_bends_a_cantilever_into_a_helix(size):
     scene = Scene(rod, CLAMP, Free(moment=moment * rod.EI))
     errors = []
     for segments in (20, 40):
-        result = rj.solve(scene, segments=segments)
+        result = rj.solve(scene, segments=segments, discretization="finite_difference")
         assert result.converged
         np.testing.assert_allclose(result.start_moment / rod.EI, moment, atol=1e-6)  # the residual, summed over the rod
         # The torque is that about the last edge: half an edge before the end, where the tangent has turned by size/40.
@@ -36,7 +36,7 @@ def test_a_moment_and_a_force_together_balance():
     rod = problems.cable(20.0)
     force, moment = rod.EI * jnp.array([0.0, 2.0, -3.0]), rod.EI * jnp.array([2.0, 1.0, -2.0])
     scene = Scene(rod, CLAMP, Free(force, moment), gravity=(0, 0, -1.0))
-    result = rj.solve(scene, segments=20)
+    result = rj.solve(scene, segments=20, discretization="finite_difference")
     assert result.converged
     # The tolerance of the residual, 1e-8 EI/L^2, on ten of the 20 nodes.
     atol = 1e-7 * float(rod.EI)
@@ -47,14 +47,16 @@ def test_a_moment_and_a_force_together_balance():
     weights[[0, -1]] /= 2
     at_start += np.cross(weights @ result.nodes, weight)
     np.testing.assert_allclose(result.start_moment, at_start, atol=atol)
-    assert rj.solve(scene, guess=result).iterations == 0
+    assert rj.solve(scene, segments=20, discretization="finite_difference", guess=result).iterations == 0
 
 
 def test_a_moment_rolls_a_cantilever_up():
     """M L/EI = 8 pi bends it into a circle four times over, from a straight guess."""
     rod = problems.cable()
     segments, angle = 80, 8 * np.pi
-    result = rj.solve(Scene(rod, CLAMP, Free(moment=(0, angle * rod.EI, 0))), segments=segments)
+    result = rj.solve(
+        Scene(rod, CLAMP, Free(moment=(0, angle * rod.EI, 0))), segments=segments, discretization="finite_difference"
+    )
     assert result.converged
     assert result.iterations <= 5  # bending is nearly quadratic in the rotations: 3 seen
     # The energy 2 tan(a/2)^2/h of a joint of the angle a gives M h/2 = t (1 + t^2) with t = tan(a/2); the joint at the
@@ -82,7 +84,9 @@ def random_moments() -> list[tuple[np.ndarray, np.ndarray]]:
 def test_large_moments_with_forces_converge():
     rod = problems.cable()
     for force, moment in random_moments():
-        result = rj.solve(Scene(rod, CLAMP, Free(force * rod.EI, moment * rod.EI)), segments=30)
+        result = rj.solve(
+            Scene(rod, CLAMP, Free(force * rod.EI, moment * rod.EI)), segments=30, discretization="finite_difference"
+        )
         assert result.converged
         assert result.iterations <= 12  # 9 seen
         assert not result.stable  # without a potential it is not examined
@@ -93,9 +97,11 @@ def test_a_moment_on_the_start_is_that_on_the_end_of_the_reversed_rod():
     rod = problems.cable(20.0)
     force, moment = random_moments()[0]
     free = Free(force * rod.EI, moment / 4 * rod.EI)
-    forward = rj.solve(Scene(rod, CLAMP, free), segments=30)
+    forward = rj.solve(Scene(rod, CLAMP, free), segments=30, discretization="finite_difference")
     flip = jnp.diag(jnp.array([-1.0, 1.0, -1.0]))  # t and d1 change sign, d2 stays: right-handed
-    backward = rj.solve(Scene(rod, free, Clamp((0, 0, 0), CLAMP.frame @ flip)), segments=30)
+    backward = rj.solve(
+        Scene(rod, free, Clamp((0, 0, 0), CLAMP.frame @ flip)), segments=30, discretization="finite_difference"
+    )
     assert forward.converged
     assert backward.converged
     # Residuals of 1e-8 EI/L^2 at most, in a rod that turns by 5 rad.

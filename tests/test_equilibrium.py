@@ -17,6 +17,11 @@ SEGMENTS = 12
 TIGHT = rj.NonlinearCG(tolerance=1e-11)
 
 
+def solve(scene: Scene, segments: int = SEGMENTS, **options) -> rj.Equilibrium:
+    """By finite differences: what is tested here is quick to compile so; test_hermite.py has the like for elements."""
+    return rj.solve(scene, segments=segments, discretization="finite_difference", **options)
+
+
 def twisted_scene(rod: Rod | None = None) -> Scene:
     """Two clamps in general position, gravity, a point force and torsion."""
     rod = rod or problems.cable(20.0)
@@ -28,7 +33,7 @@ def twisted_scene(rod: Rod | None = None) -> Scene:
 
 @pytest.fixture(scope="module")
 def twisted() -> rj.Equilibrium:
-    return rj.solve(twisted_scene(), segments=SEGMENTS, solver=TIGHT)
+    return solve(twisted_scene(), solver=TIGHT)
 
 
 def moved_end(scene: Scene, which: str, shift, turn) -> Scene:
@@ -51,7 +56,7 @@ def test_end_loads_are_derivatives_of_the_energy(twisted, which, sign):
                 small = multiple * step * axis * unit
                 shift, turn = (small, np.zeros(3)) if name == "force" else (np.zeros(3), small)
                 moved = moved_end(scene, which, shift, turn)
-                values.append(float(rj.solve(moved, guess=twisted, solver=TIGHT).energy))
+                values.append(float(solve(moved, guess=twisted, solver=TIGHT).energy))
             measured.append((values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step * unit))
         ours = getattr(twisted, f"{which}_{name}")
         np.testing.assert_allclose(sign * np.array(measured), ours, rtol=0, atol=1e-6 * float(jnp.linalg.norm(ours)))
@@ -82,7 +87,7 @@ def test_the_reversed_rod_gives_the_mirror_result(twisted):
     ends = [Clamp(end.position, end.frame @ flip) for end in (scene.end, scene.start)]
     load = scene.point_forces[0]
     load = PointForce(scene.rod.length - load.at, load.force)
-    other = rj.solve(Scene(scene.rod, *ends, scene.gravity, [load]), segments=SEGMENTS, solver=TIGHT)
+    other = solve(Scene(scene.rod, *ends, scene.gravity, [load]), solver=TIGHT)
     np.testing.assert_allclose(other.nodes[::-1], twisted.nodes, atol=1e-10)
     np.testing.assert_allclose(other.total_twist, twisted.total_twist, atol=1e-9)
     np.testing.assert_allclose(other.start_force, -twisted.end_force, atol=1e-9 * 20)
@@ -95,7 +100,7 @@ def test_the_result_moves_and_turns_with_the_scene(twisted):
     scene = twisted_scene()
     ends = [Clamp(turn @ end.position + shift, turn @ end.frame) for end in (scene.start, scene.end)]
     loads = [PointForce(load.at, turn @ load.force) for load in scene.point_forces]
-    moved = rj.solve(Scene(scene.rod, *ends, turn @ scene.gravity, loads), segments=SEGMENTS, solver=TIGHT)
+    moved = solve(Scene(scene.rod, *ends, turn @ scene.gravity, loads), solver=TIGHT)
     np.testing.assert_allclose(moved.nodes, np.asarray(twisted.nodes) @ turn.T + shift, atol=1e-10)
     np.testing.assert_allclose(moved.frames, turn @ twisted.frames, atol=1e-9)
     np.testing.assert_allclose(moved.elastic_energy, twisted.elastic_energy, rtol=1e-10)
@@ -147,20 +152,20 @@ def supports(rod: Rod) -> dict[str, Scene]:
 @pytest.mark.parametrize("name", list(supports(problems.cable(20.0))))
 def test_every_pair_of_supports_balances_and_restarts_at_rest(name):
     scene = supports(problems.cable(20.0))[name]
-    first = rj.solve(scene, segments=SEGMENTS)
+    first = solve(scene)
     assert first.converged
     weight = 0.0 if scene.gravity is None else scene.rod.mass_per_length * scene.rod.length * scene.gravity
     unit = float(scene.rod.EI / scene.rod.length**2)
     # The tolerance 1e-8 EI/L^2 is one node's; N of them add up.
     np.testing.assert_allclose(first.end_force - first.start_force + weight, 0, atol=1e-8 * SEGMENTS * unit)
-    again = rj.solve(scene, guess=first)
+    again = solve(scene, guess=first)
     assert again.iterations == 0
     np.testing.assert_array_equal(again.nodes, first.nodes)
 
 
 def test_a_dead_moment_in_space_is_carried_to_the_clamp():
     scene = supports(problems.cable(20.0))["clamp-free-moment"]
-    result = rj.solve(scene, segments=SEGMENTS)
+    result = solve(scene)
     unit = float(scene.rod.EI)
     np.testing.assert_allclose(result.start_moment / unit, [1, 2, 1], atol=1e-7)
     np.testing.assert_allclose(result.start_force / unit, 0, atol=1e-7)
@@ -172,10 +177,10 @@ def test_a_dead_moment_in_space_is_carried_to_the_clamp():
 def test_units_do_not_matter(scale):
     """A scene 1e6 times larger or smaller, of the same material, takes the same way to the same shape."""
     rod = problems.cable()
-    same = rj.solve(problems.hanging_cable(), segments=SEGMENTS)
+    same = solve(problems.hanging_cable())
     scaled_rod = Rod.circular(scale, 0.005 * scale, 1e7, shear_modulus=1e7 / 3, density=1200.0)
     gravity = np.array([0, 0, -9.81]) / scale
-    scaled = rj.solve(problems.hanging_cable(0.8 * scale, gravity, scaled_rod), segments=SEGMENTS)
+    scaled = solve(problems.hanging_cable(0.8 * scale, gravity, scaled_rod))
     assert scaled.iterations == same.iterations
     np.testing.assert_allclose(scaled.nodes / scale, same.nodes, atol=1e-12)
     np.testing.assert_allclose(scaled.end_force / scale**2, same.end_force, rtol=1e-9, atol=1e-10)
@@ -186,15 +191,13 @@ def test_a_scene_far_from_the_origin_loses_nothing():
     near = problems.hanging_cable()
     shift = np.array([1000.0, -2000.0, 500.0])
     ends = [Clamp(end.position + shift, end.frame) for end in (near.start, near.end)]
-    far = rj.solve(Scene(near.rod, *ends, near.gravity), segments=SEGMENTS)
-    np.testing.assert_allclose(
-        np.asarray(far.nodes) - shift, rj.solve(near, segments=SEGMENTS).nodes, atol=1e-12 * 2000
-    )
+    far = solve(Scene(near.rod, *ends, near.gravity))
+    np.testing.assert_allclose(np.asarray(far.nodes) - shift, solve(near).nodes, atol=1e-12 * 2000)
 
 
 def test_position_at_interpolates_the_centerline(twisted):
     np.testing.assert_allclose(twisted.position_at(twisted.s), twisted.nodes, atol=1e-15)
-    fine = rj.solve(twisted_scene(), segments=8 * SEGMENTS)
+    fine = solve(twisted_scene(), 8 * SEGMENTS)
     between = (fine.s[:-1] + fine.s[1:]) / 2
     at_nodes = np.max(np.abs(fine.position_at(twisted.s) - twisted.nodes))
     assert np.max(np.abs(fine.position_at(between) - twisted.position_at(between))) < 1.2 * at_nodes
@@ -205,8 +208,8 @@ def test_position_at_interpolates_the_centerline(twisted):
 def test_a_guess_may_be_points_or_another_mesh(twisted):
     scene = twisted_scene()
     shape = rj.Guess(twisted.position_at(jnp.linspace(0, 1, 30)), total_twist=twisted.total_twist)
-    for guess in (shape, rj.solve(scene, segments=30)):
-        result = rj.solve(scene, segments=SEGMENTS, solver=TIGHT, guess=guess)
+    for guess in (shape, solve(scene, 30)):
+        result = solve(scene, solver=TIGHT, guess=guess)
         np.testing.assert_allclose(result.nodes, twisted.nodes, atol=1e-9)
 
 
@@ -214,16 +217,16 @@ def test_turns_choose_the_total_twist():
     rod = problems.cable(20.0)
     straight = [Clamp((x, 0, 0), frame((1, 0, 0))) for x in (0, 1)]
     for turns in (-2, 0, 1):
-        result = rj.solve(Scene(rod, *straight, turns=turns), segments=SEGMENTS)
+        result = solve(Scene(rod, *straight, turns=turns))
         np.testing.assert_allclose(result.total_twist, 2 * np.pi * turns, atol=1e-9)
         np.testing.assert_allclose(result.end_moment[0], 2 * np.pi * turns * rod.GJ, atol=1e-9 * float(rod.GJ))
     guess = rj.Guess([[0, 0, 0], [1, 0, 0]], total_twist=11.0)
-    np.testing.assert_allclose(rj.solve(Scene(rod, *straight), guess=guess, segments=SEGMENTS).total_twist, 4 * np.pi)
+    np.testing.assert_allclose(solve(Scene(rod, *straight), guess=guess).total_twist, 4 * np.pi)
 
 
 def test_solve_under_jit_and_vmap():
     def tip(load):
-        return rj.solve(problems_cantilever(load), segments=SEGMENTS).nodes[-1]
+        return solve(problems_cantilever(load)).nodes[-1]
 
     def problems_cantilever(load):
         rod = problems.cable()
@@ -238,7 +241,7 @@ def test_solve_under_jit_and_vmap():
 def test_an_unconverged_result_says_so():
     solver = rj.NonlinearCG(max_iterations=2)
     with pytest.warns(rj.NotConvergedWarning, match="stopped at the largest number of iterations"):
-        result = rj.solve(problems.hanging_cable(), segments=SEGMENTS, solver=solver)
+        result = solve(problems.hanging_cable(), solver=solver)
     assert not result.converged
     assert result.status == Status.MAX_ITERATIONS
     assert "residual" in rj.describe(result)
@@ -246,22 +249,11 @@ def test_an_unconverged_result_says_so():
 
 def test_the_rounding_floor_is_stated_and_not_chased():
     solver = rj.NonlinearCG(tolerance=0.0)
-    result = rj.solve(problems.hanging_cable(), segments=SEGMENTS, solver=solver)
+    result = solve(problems.hanging_cable(), solver=solver)
     assert result.converged
     assert result.status == Status.ROUNDING_FLOOR
     assert "rounding floor" in rj.describe(result)
     assert result.residual < 4 * np.finfo(float).eps * (1.6e5 + 4 * SEGMENTS**2)
-
-
-def test_derivatives_are_refused_until_they_are_right():
-    def height(load):
-        rod = problems.cable()
-        scene = Scene(rod, Clamp((0, 0, 0), frame((1, 0, 0))), Free(force=load * jnp.array([0.0, 0, -1])))
-        return rj.solve(scene, segments=SEGMENTS).nodes[-1, 2]
-
-    for derivative in (jax.grad, jax.jacfwd):
-        with pytest.raises(NotImplementedError, match="derivative of a solve"):
-            derivative(height)(0.01)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +288,7 @@ def test_float32_works_and_says_how_far():
     code = """
 import warnings; warnings.simplefilter("error")
 import numpy as np, rodjax as rj
-result = rj.solve(rj.problems.hanging_cable(), segments=20)
+result = rj.solve(rj.problems.hanging_cable(), segments=20, discretization="finite_difference")
 assert result.nodes.dtype == np.float32 and result.converged, rj.describe(result)
 print(float(result.nodes[10, 2]))
 """
@@ -305,6 +297,6 @@ print(float(result.nodes[10, 2]))
 
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     with warnings.catch_warnings():
-        truth = float(rj.solve(problems.hanging_cable(), segments=20).nodes[10, 2])
+        truth = float(solve(problems.hanging_cable(), 20).nodes[10, 2])
     # Rounding of EA (1 + strain) in float32: strains of 1e-7 times EA L^2/EI = 1.6e5 is 1e-2 EI/L^2 of 188.
     np.testing.assert_allclose(float(output), truth, atol=1e-4)

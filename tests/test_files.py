@@ -20,11 +20,28 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
-from rodjax import Equilibrium, problems, solve, solve_path
-from rodjax.discretization.finite_difference import Polyline
-from rodjax.discretization.hermite import Curve
-from rodjax.discretization.shape import Shape
+from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Swivel, frame, problems, solve, solve_path
 from rodjax.files import FIELDS, FORMAT, load, point_data, save
+
+ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
+CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))
+
+
+def scene_with_everything(twist: float) -> Scene:
+    """Clamps, gravity, turns and two point forces."""
+    forces = [PointForce(0.43, (0.001, 0.0, 0.002)), PointForce(0.8, (0.0, 0.001, 0.0))]
+    end = Clamp(FAR, frame((1, 0.3, 0), (0, np.cos(twist), np.sin(twist))))
+    return Scene(problems.cable(), CLAMP, end, GRAVITY, forces, turns=1)
+
+
+# Every kind of support and load at both ends; a rod without radius.
+SCENES = {
+    "clamps": scene_with_everything(0.0),
+    "swivels": Scene(problems.cable(), Swivel(ORIGIN, (1, 0, 1)), Swivel(FAR, (0, 0, 1))),
+    "pins": Scene(Rod(1.0, 1 / 3, 0.2, 1e4), Pin(ORIGIN), Pin(FAR)),
+    "free end": Scene(problems.cable(), CLAMP, Free((0, 0.1, 1 / 3), (0.1, 0, 0)), GRAVITY),
+    "free start": Scene(problems.cable(), Free((0, 0.1, 1 / 3), (0.1, 0, 0)), CLAMP),
+}
 
 
 @pytest.fixture(scope="session")
@@ -34,10 +51,19 @@ def single() -> Equilibrium:
 
 @pytest.fixture(scope="session")
 def path_of_three(single) -> Equilibrium:
-    return solve_path([problems.omega(1.0, turn) for turn in (0.3, 0.6, 0.9)], guess=single)
+    return solve_path([problems.omega(1.0, turn) for turn in (0.3, 0.6, 0.9)], segments=8, guess=single)
 
 
-@pytest.fixture(params=["single", "path_of_three"])
+@pytest.fixture(scope="session")
+def loaded_path() -> Equilibrium:
+    """By finite differences."""
+    scenes = [scene_with_everything(twist) for twist in (0.0, 0.1, 0.2)]
+    path = solve_path(scenes, segments=8, discretization="finite_difference")
+    assert np.all(path.converged)
+    return path
+
+
+@pytest.fixture(params=["single", "path_of_three", "loaded_path"])
 def equilibrium(request) -> Equilibrium:
     return request.getfixturevalue(request.param)
 
@@ -78,10 +104,22 @@ def test_load_gives_back_every_bit(equilibrium, tmp_path):
     assert_same(load(tmp_path / "rod.vtkhdf"), equilibrium)
 
 
-def test_unknown_radius_stays_unknown(single, tmp_path):
-    bare = dataclasses.replace(single, radius=None)
-    save(bare, str(tmp_path / "rod.vtkhdf"))
-    assert_same(load(str(tmp_path / "rod.vtkhdf")), bare)
+def test_the_error_is_estimated_after_load_too(equilibrium, tmp_path):
+    save(equilibrium, tmp_path / "rod.vtkhdf")
+    estimate = load(tmp_path / "rod.vtkhdf").error_estimate
+    np.testing.assert_array_equal(estimate, equilibrium.error_estimate)
+    assert np.all(estimate > 0)
+
+
+@pytest.mark.parametrize("steps", [None, 2])
+@pytest.mark.parametrize("name", SCENES)
+def test_every_kind_of_scene_comes_back(name, steps, single, tmp_path):
+    scene = SCENES[name]
+    of_scene = dataclasses.replace(single, scene=scene)
+    if steps is not None:
+        of_scene = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + leaf]), of_scene)
+    save(of_scene, str(tmp_path / "rod.vtkhdf"))
+    assert_same(load(str(tmp_path / "rod.vtkhdf")), of_scene)
 
 
 def test_not_a_number_and_float32_survive(single, tmp_path):
@@ -91,10 +129,10 @@ def test_not_a_number_and_float32_survive(single, tmp_path):
 
 
 def test_warm_start_from_a_file_takes_no_iteration(single, saved):
-    again = solve(problems.omega(1.0, 0.3), guess=load(saved))
+    again = solve(problems.omega(1.0, 0.3), segments=8, guess=load(saved))
     assert int(again.iterations) == 0
     np.testing.assert_array_equal(again.nodes, single.nodes)
-    assert_same(again, solve(problems.omega(1.0, 0.3), guess=single))
+    assert_same(again, solve(problems.omega(1.0, 0.3), segments=8, guess=single))
 
 
 def test_same_result_gives_the_same_bytes(single, saved):
@@ -106,31 +144,33 @@ def test_same_result_gives_the_same_bytes(single, saved):
 # --- what is in the file --------------------------------------------------------------------------------------------
 
 
-SHAPES = (Polyline, Curve)
+def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path):
+    seen = set()
+
+    def look(name: str, entry: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(entry, h5py.Dataset):
+            place = re.sub(r"/\d+/", "/*/", name)
+            seen.add(place)
+            assert (entry.attrs["units"], entry.attrs["description"]) == FIELDS[place]
+            assert all(FIELDS[place])
+
+    results = [loaded_path, *(dataclasses.replace(single, scene=scene) for scene in SCENES.values())]
+    for result in results:
+        save(result, tmp_path / "rod.vtkhdf")
+        with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:
+            group = file["rodjax"]
+            assert isinstance(group, h5py.Group)
+            group.visititems(look)
+    assert seen == set(FIELDS)
 
 
-def places(kind, place="") -> set[str]:
-    """Every field of a module class, nested ones with slashes between."""
-    found = set()
-    for field in dataclasses.fields(kind):
-        nested = isinstance(field.type, type) and issubclass(field.type, eqx.Module)
-        for kind_of_field in SHAPES if field.type is Shape else [field.type]:
-            found |= places(kind_of_field, f"{place}{field.name}/") if nested else {place + field.name}
-    return found
-
-
-def test_every_field_has_units_and_a_description(saved):
-    assert places(Equilibrium) == set(FIELDS)
+def test_the_file_names_its_format_and_its_classes(saved):
     with h5py.File(saved, "r") as file:
-        for place, (units, description) in FIELDS.items():
-            if place in ("state/shape/tangents", "state/shape/s"):
-                continue  # of Hermite elements
-            attributes = file[f"rodjax/{place}"].attrs
-            assert (attributes["units"], attributes["description"]) == (units, description)
-            assert units
-            assert description
         assert file["rodjax"].attrs["format"] == FORMAT
         assert re.fullmatch(r"\d+\.\d+\.\d+.*", str(file["rodjax"].attrs["version"]))
+        assert file["rodjax"].attrs["discretization"] == "hermite"
+        kinds = {place: file[f"rodjax/{place}"].attrs["kind"] for place in ("scene/start", "scene/end", "state/shape")}
+    assert kinds == {"scene/start": "Clamp", "scene/end": "Clamp", "state/shape": "Curve"}
 
 
 def test_vtk_reads_the_polyline_and_its_data_at_every_step(equilibrium, tmp_path):
@@ -294,6 +334,8 @@ def test_a_file_cut_short_is_refused(part, saved):
         ("rodjax/end_force", "lacks /rodjax/end_force"),
         ("rodjax/state", "lacks /rodjax/state"),
         ("rodjax/state/units/length", "lacks /rodjax/state/units/length"),
+        ("rodjax/scene", "lacks /rodjax/scene"),
+        ("rodjax/scene/rod/EI", "lacks /rodjax/scene/rod/EI"),
     ],
 )
 def test_what_a_file_lacks_is_named(missing, message, saved):

@@ -171,7 +171,7 @@ def test_transport_along_is_that_by_rotations():
 def solved(request) -> tuple[MixedForm, FiniteDifference, Polyline, MixedPoint]:
     """A scene solved to its rounding floor, in both unknowns."""
     scene = loaded_scenes()[request.param]
-    result = rj.solve(scene, segments=N, solver=rj.Newton(tolerance=0.0))
+    result = rj.solve(scene, segments=N, discretization="finite_difference", solver=rj.Newton(tolerance=0.0))
     assert result.converged
     scaled, _ = nondimensional(scene)
     problem, polyline = FiniteDifference.begin(scaled, result.state.shape, result.total_twist)

@@ -18,7 +18,9 @@ GREENHILL = 8.986819
 def test_steps_of_figure_1_take_few_iterations(segments, slenderness):
     """Thick, as in the report, or thin: EA L^2/EI from 1.6e3 to 1.6e11."""
     rod = problems.cable(slenderness)
-    path = rj.solve_path(problems.figure_1(rod), segments=segments, guess=problems.figure_1_start())
+    path = rj.solve_path(
+        problems.figure_1(rod), segments=segments, discretization="finite_difference", guess=problems.figure_1_start()
+    )
     assert np.all(path.converged)
     assert np.all(path.stable)
     assert np.all(path.substeps == 1)
@@ -27,7 +29,7 @@ def test_steps_of_figure_1_take_few_iterations(segments, slenderness):
     if slenderness == 2e5:
         return  # beyond conjugate gradients, whose rounding floor grows with EA
     last = jax.tree.map(lambda leaf: leaf[-1], path)
-    again = rj.solve(problems.figure_1(rod)[-1], guess=last, solver=rj.NonlinearCG())
+    again = rj.solve(problems.figure_1(rod)[-1], segments=segments, guess=last, solver=rj.NonlinearCG())
     # Both stop at a residual of 1e-8, in which energies are quadratic; what is left is rounding.
     np.testing.assert_allclose(again.energy, last.energy, rtol=1e-9)
 
@@ -48,7 +50,7 @@ def test_a_radian_at_once_ends_where_ten_small_steps_do(slenderness):
 
 
 def solved_omega(tilt: float, rod: rj.Rod, guess: rj.Guess | rj.Equilibrium) -> rj.Equilibrium:
-    return rj.solve(problems.omega(tilt, 0.0, rod), segments=10, guess=guess)
+    return rj.solve(problems.omega(tilt, 0.0, rod), segments=10, discretization="finite_difference", guess=guess)
 
 
 # --- minima ----------------------------------------------------------------------------------------------------------
@@ -58,7 +60,7 @@ def solved_from_straight(span: float, rod: rj.Rod, turns: int = 0) -> rj.Equilib
     """Between two clamps along one line, from the straight shape."""
     ends = [Clamp((x, 0, 0), frame((1, 0, 0))) for x in (0.0, span)]
     guess = rj.Guess([[0, 0, 0], [span, 0, 0]])
-    return rj.solve(Scene(rod, *ends, turns=turns), segments=20, guess=guess)
+    return rj.solve(Scene(rod, *ends, turns=turns), segments=20, discretization="finite_difference", guess=guess)
 
 
 def sideways(result: rj.Equilibrium) -> float:
@@ -100,7 +102,11 @@ def test_a_twisted_rod_buckles_beyond_greenhills_moment(fraction, buckles):
 def test_a_thin_rod_pulled_by_a_tenth_converges_to_its_rounding_floor(slenderness, direction):
     rod = problems.cable(slenderness)
     end = 1.1 * np.array(direction) / np.linalg.norm(direction)
-    result = rj.solve(Scene(rod, *(Clamp(x, frame(direction)) for x in (np.zeros(3), end))), segments=20)
+    result = rj.solve(
+        Scene(rod, *(Clamp(x, frame(direction)) for x in (np.zeros(3), end))),
+        segments=20,
+        discretization="finite_difference",
+    )
     assert result.status == rj.Status.ROUNDING_FLOOR
     assert result.stable
     assert result.iterations <= 10
@@ -113,7 +119,12 @@ def test_a_saddle_that_is_not_left_is_flagged(monkeypatch):
     monkeypatch.setattr(newton, "MAX_PUSHES", 0)
     ends = [Clamp((x, 0, 0), frame((1, 0, 0))) for x in (0.0, 0.9)]
     with pytest.warns(rj.NotConvergedWarning, match="an equilibrium was found that is not a minimum"):
-        result = rj.solve(Scene(problems.cable(), *ends), segments=13, guess=rj.Guess([[0, 0, 0], [0.9, 0, 0]]))
+        result = rj.solve(
+            Scene(problems.cable(), *ends),
+            segments=13,
+            discretization="finite_difference",
+            guess=rj.Guess([[0, 0, 0], [0.9, 0, 0]]),
+        )
     assert result.status == rj.Status.SADDLE
     assert not result.converged
     assert not result.stable
@@ -125,7 +136,13 @@ def test_a_saddle_that_is_not_left_is_flagged(monkeypatch):
 def test_too_few_iterations_are_flagged():
     solver = rj.Newton(max_iterations=1)
     with pytest.warns(rj.NotConvergedWarning, match="stopped at the largest number of iterations"):
-        result = rj.solve(problems.omega(0.5, 0.0), segments=10, solver=solver, guess=problems.figure_1_start())
+        result = rj.solve(
+            problems.omega(0.5, 0.0),
+            segments=10,
+            discretization="finite_difference",
+            solver=solver,
+            guess=problems.figure_1_start(),
+        )
     assert result.status == rj.Status.MAX_ITERATIONS
     assert not result.converged
     assert not result.stable
@@ -155,7 +172,9 @@ def test_vmap_agrees_with_one_after_another():
     rod, guess = problems.cable(), problems.figure_1_start()
     tilts = problems.ARC_HALF_ANGLE - np.array([0.0, 0.3, 1.0])
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(problems.omega(tilt, 0.0, rod) for tilt in tilts))
-    results = jax.jit(jax.vmap(lambda scene: rj.solve(scene, segments=10, guess=guess)))(stacked)
+    results = jax.jit(
+        jax.vmap(lambda scene: rj.solve(scene, segments=10, discretization="finite_difference", guess=guess))
+    )(stacked)
     assert np.all(results.stable)
     for k, tilt in enumerate(tilts):
         alone = solved_omega(tilt, rod, guess)

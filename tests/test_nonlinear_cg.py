@@ -102,5 +102,5 @@ def test_an_extreme_rod_is_solved_or_flagged_but_never_nan():
 def test_a_guess_without_length_is_reported_as_not_finite():
     guess = rj.Guess([[0, 0, 0], [0, 0, 0]])
     with pytest.warns(rj.NotConvergedWarning, match="not a finite number"):
-        result = rj.solve(problems.cantilever(), segments=4, guess=guess)
+        result = rj.solve(problems.cantilever(), segments=4, discretization="finite_difference", guess=guess)
     assert result.status == rj.Status.NOT_FINITE

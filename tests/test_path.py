@@ -1,5 +1,7 @@
 """solve_path(): turns carried, the same as single solves, prediction, steps that are split, what it refuses."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +15,24 @@ from rodjax.scene import between
 SEGMENTS = 10
 
 
+def solve(scene: Scene, **options) -> rj.Equilibrium:
+    return rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", **options)
+
+
+def solve_path(scenes: Sequence[Scene] | Scene, segments: int = SEGMENTS, **options) -> rj.Equilibrium:
+    """By finite differences, which are quick to compile: prediction and splitting do not look at the mesh."""
+    return rj.solve_path(scenes, segments=segments, discretization="finite_difference", **options)
+
+
 @pytest.fixture(scope="module")
 def figure_1() -> rj.Equilibrium:
-    return rj.solve_path(problems.figure_1(), segments=SEGMENTS, guess=problems.figure_1_start())
+    return solve_path(problems.figure_1(), guess=problems.figure_1_start())
 
 
 def test_a_path_is_the_single_solves_one_after_another(figure_1):
     guess: rj.Guess | rj.Equilibrium = problems.figure_1_start()
     for k, scene in enumerate(problems.figure_1()[:3]):
-        guess = rj.solve(scene, segments=SEGMENTS, guess=guess)
+        guess = solve(scene, guess=guess)
         np.testing.assert_allclose(guess.nodes, figure_1.nodes[k], atol=1e-9)
         np.testing.assert_allclose(guess.energy, figure_1.energy[k], rtol=1e-11)
 
@@ -35,26 +46,26 @@ def test_turns_are_carried(figure_1):
         cosine, sine = np.cos(k * np.pi / 2), np.sin(k * np.pi / 2)
         turned = frame((1, 0, 0), (0, cosine, sine))
         scenes.append(Scene(rod, start, Clamp((1.0, 0, 0), turned)))
-    path = rj.solve_path(scenes, segments=4)
+    path = solve_path(scenes, 4)
     np.testing.assert_allclose(path.total_twist, np.arange(1, 21) * np.pi / 2, atol=1e-9)
     assert np.all(np.diff(figure_1.total_twist[8:]) > 0)
 
 
 def test_a_stacked_scene_is_a_path(figure_1):
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems.figure_1())
-    path = rj.solve_path(stacked, segments=SEGMENTS, guess=problems.figure_1_start())
+    path = solve_path(stacked, guess=problems.figure_1_start())
     np.testing.assert_array_equal(path.nodes, figure_1.nodes)
 
 
 def test_an_unchanged_scene_takes_no_iteration(figure_1):
     last = jax.tree.map(lambda leaf: leaf[-1], figure_1)
-    again = rj.solve_path([problems.figure_1()[-1]] * 3, guess=last)
+    again = solve_path([problems.figure_1()[-1]] * 3, guess=last)
     np.testing.assert_array_equal(again.iterations, 0)
     np.testing.assert_array_equal(again.nodes, jnp.broadcast_to(last.nodes, again.nodes.shape))
 
 
 def test_progress_changes_nothing(figure_1, capsys):
-    path = rj.solve_path(problems.figure_1(), segments=SEGMENTS, guess=problems.figure_1_start(), progress=True)
+    path = solve_path(problems.figure_1(), guess=problems.figure_1_start(), progress=True)
     np.testing.assert_array_equal(path.nodes, figure_1.nodes)
     assert "100.00%" in capsys.readouterr().err
 
@@ -63,7 +74,7 @@ def test_unconverged_steps_are_counted():
     # Even in parts only some of the steps take so few iterations.
     solver = rj.NonlinearCG(max_iterations=8)
     with pytest.warns(rj.NotConvergedWarning, match="not converged: stopped at the largest number"):
-        path = rj.solve_path(problems.figure_1(), segments=SEGMENTS, guess=problems.figure_1_start(), solver=solver)
+        path = solve_path(problems.figure_1(), guess=problems.figure_1_start(), solver=solver)
     assert 0 < np.sum(path.converged) < 25  # 7 seen
 
 
@@ -76,7 +87,7 @@ def test_prediction_saves_iterations(figure_1):
     assert np.median(figure_1.iterations) == 2
     assert np.max(figure_1.iterations) <= 3
     for k in (5, 15):
-        unpredicted = rj.solve(problems.figure_1()[k], guess=step(figure_1, k - 1))
+        unpredicted = solve(problems.figure_1()[k], guess=step(figure_1, k - 1))
         assert figure_1.iterations[k] < unpredicted.iterations
 
 
@@ -85,7 +96,7 @@ def test_prediction_saves_iterations(figure_1):
 
 def test_steps_that_converge_are_not_split(figure_1):
     np.testing.assert_array_equal(figure_1.substeps, 1)
-    single = rj.solve(problems.figure_1()[0], segments=SEGMENTS, guess=problems.figure_1_start())
+    single = solve(problems.figure_1()[0], guess=problems.figure_1_start())
     assert single.substeps == 1
 
 
@@ -94,15 +105,15 @@ def test_a_step_too_large_for_the_solver_is_split(figure_1):
     level, turned = problems.figure_1()[8], problems.omega(np.pi / 6, 3.0)
     solver = rj.Newton(max_iterations=3)
     with pytest.warns(rj.NotConvergedWarning, match="largest number of iterations"):
-        rj.solve(turned, guess=step(figure_1, 8), solver=solver)
-    split = rj.solve_path([level, turned], guess=step(figure_1, 8), solver=solver)
+        solve(turned, guess=step(figure_1, 8), solver=solver)
+    split = solve_path([level, turned], guess=step(figure_1, 8), solver=solver)
     assert np.all(split.converged)
     assert split.substeps[0] == 1
     # One solve that fails at the least; each converged one doubles the share, so that two halves do it at best.
     assert 3 <= split.substeps[1] <= 2 ** (MAX_SPLITS + 1)
     assert split.substeps[1] < split.iterations[1] <= 3 * split.substeps[1]
     fine = [between(level, turned, jnp.asarray(fraction)) for fraction in np.linspace(0.0, 1.0, 25)]
-    path = rj.solve_path(fine, segments=SEGMENTS, guess=problems.figure_1_start())
+    path = solve_path(fine, guess=problems.figure_1_start())
     # Residuals of 1e-8 EI/L^2 at most, against a stiffness of 1e2 EI/L^3.
     np.testing.assert_allclose(split.nodes[-1], path.nodes[-1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(split.total_twist[-1], path.total_twist[-1], rtol=0, atol=1e-9)
@@ -113,7 +124,7 @@ def test_a_step_that_no_split_helps_is_given_up_and_flagged():
     scenes = [problems.omega(0.6, 0.0), problems.omega(0.6, 3.0)]
     solver = rj.Newton(max_iterations=1, tolerance=0.0)
     with pytest.warns(rj.NotConvergedWarning, match="2 not converged: stopped at the largest number of iterations"):
-        path = rj.solve_path(scenes, segments=SEGMENTS, guess=problems.figure_1_start(), solver=solver)
+        path = solve_path(scenes, guess=problems.figure_1_start(), solver=solver)
     np.testing.assert_array_equal(path.status, Status.MAX_ITERATIONS)
     assert not np.any(path.stable)
     # The first scene has nothing to be split from. The second is tried at once, halved so often, and at once again.

@@ -32,12 +32,14 @@ def turned(scene: Scene, rotation: Rotation) -> Scene:
 
 @pytest.fixture(scope="module")
 def in_space() -> dict[str, rj.Equilibrium]:
-    return {name: rj.solve(scene, segments=SEGMENTS) for name, scene in SCENES.items()}
+    return {
+        name: rj.solve(scene, segments=SEGMENTS, discretization="finite_difference") for name, scene in SCENES.items()
+    }
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_planar_solve_is_the_one_in_space(name, in_space):
-    planar = rj.solve(SCENES[name], segments=SEGMENTS, planar=True)
+    planar = rj.solve(SCENES[name], segments=SEGMENTS, discretization="finite_difference", planar=True)
     space = in_space[name]
     assert planar.stable
     # The same iterates up to rounding: 1e-15, times 1e2 of stiffness for forces and moments in EI/L^2 and EI/L.
@@ -55,7 +57,7 @@ def test_a_planar_solve_is_the_one_in_space(name, in_space):
 def test_the_plane_may_stand_anywhere(name, turn, in_space):
     matrix = TURNS[turn].as_matrix()
     scene = turned(SCENES[name], TURNS[turn])
-    planar = rj.solve(scene, segments=SEGMENTS, planar=True)
+    planar = rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", planar=True)
     assert planar.stable
     # Other roundings, which the converged residual of 1e-8 EI/L^2 at most turns into less than 1e-10 of length.
     np.testing.assert_allclose(planar.nodes, in_space[name].nodes @ matrix.T, rtol=0, atol=1e-10)
@@ -75,7 +77,7 @@ def test_a_straight_scene_lies_in_any_plane_through_it(direction, planar):
     tension = 5.0 * float(rod.EI)
     d2 = (0, 1, 0) if direction[1] == 0 else (0, 0, 1)
     scene = Scene(rod, Clamp((0, 0, 0), frame(unit, d2)), Free(force=tension * unit))
-    result = rj.solve(scene, segments=SEGMENTS, planar=planar)
+    result = rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", planar=planar)
     assert result.stable
     strain = tension / float(rod.EA)
     np.testing.assert_allclose(result.nodes[-1], (1 + strain) * unit, rtol=0, atol=1e-14)  # exact, a few roundings
@@ -89,7 +91,9 @@ def test_the_guess_chooses_the_plane_of_a_scene_along_one_line(angle):
     """Both clamps point along the chord, about which the arch of the guess is turned."""
     turn = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()
     guess = rj.Guess(problems.figure_1_start().points @ turn.T)
-    arch = rj.solve(problems.omega(0.0, 0.0), segments=SEGMENTS, guess=guess, planar=True)
+    arch = rj.solve(
+        problems.omega(0.0, 0.0), segments=SEGMENTS, discretization="finite_difference", guess=guess, planar=True
+    )
     assert arch.converged
     np.testing.assert_allclose(arch.nodes @ turn[:, 1], 0.0, atol=1e-14)  # the roundings of sums over the rod
     assert np.max(np.abs(arch.nodes @ turn[:, 2])) > 0.3
@@ -111,7 +115,9 @@ TILTS = np.linspace(problems.ARC_HALF_ANGLE, -0.6, 12)  # the last three are neg
 def closing() -> rj.Equilibrium:
     """An arch whose ends turn down until, with tilt 0, it would rather fall over."""
     scenes = [problems.omega(tilt, 0.0) for tilt in TILTS]
-    return rj.solve_path(scenes, segments=SEGMENTS, guess=problems.figure_1_start(), planar=True)
+    return rj.solve_path(
+        scenes, segments=SEGMENTS, discretization="finite_difference", guess=problems.figure_1_start(), planar=True
+    )
 
 
 def test_stable_speaks_of_motions_out_of_the_plane(closing):
@@ -124,7 +130,9 @@ def test_stable_speaks_of_motions_out_of_the_plane(closing):
 @pytest.mark.slow
 def test_in_space_the_arch_falls_over(closing):
     scenes = [problems.omega(tilt, 0.0) for tilt in TILTS]
-    space = rj.solve_path(scenes, segments=SEGMENTS, guess=problems.figure_1_start())
+    space = rj.solve_path(
+        scenes, segments=SEGMENTS, discretization="finite_difference", guess=problems.figure_1_start()
+    )
     assert np.all(space.converged & space.stable)
     # The same until then, from guesses that differ by the rounding; beyond, turned over to the other side of the chord.
     is_stable = TILTS > 0
@@ -137,7 +145,9 @@ def test_in_space_the_arch_falls_over(closing):
 
 def test_a_planar_path_takes_a_stack_of_scenes(closing):
     stacked = stack_scenes([problems.omega(tilt, 0.0) for tilt in TILTS])
-    path = rj.solve_path(stacked, segments=SEGMENTS, guess=problems.figure_1_start(), planar=True)
+    path = rj.solve_path(
+        stacked, segments=SEGMENTS, discretization="finite_difference", guess=problems.figure_1_start(), planar=True
+    )
     np.testing.assert_array_equal(path.nodes, closing.nodes)
 
 
@@ -145,7 +155,13 @@ def test_a_planar_path_takes_a_stack_of_scenes(closing):
 def test_a_planar_solve_under_jit_and_vmap(closing):
     scenes = stack_scenes([problems.omega(tilt, 0.0) for tilt in TILTS[[3, 6]]])
     guess = problems.figure_1_start()
-    batch = jax.jit(jax.vmap(lambda scene: rj.solve(scene, segments=SEGMENTS, guess=guess, planar=True)))(scenes)
+    batch = jax.jit(
+        jax.vmap(
+            lambda scene: rj.solve(
+                scene, segments=SEGMENTS, discretization="finite_difference", guess=guess, planar=True
+            )
+        )
+    )(scenes)
     assert np.all(batch.stable)
     # Both converged to residuals of 1e-8 EI/L^2, against a stiffness of 1e2 EI/L^3.
     np.testing.assert_allclose(batch.nodes, closing.nodes[jnp.array([3, 6])], rtol=0, atol=1e-9)
@@ -204,7 +220,7 @@ def test_planar_must_be_true_or_false():
 
 def test_inside_jit_a_scene_that_leaves_the_plane_is_flagged():
     """Where no error can be raised. One program: the first scene lies in the plane, the second does not."""
-    solve = jax.jit(lambda scene: rj.solve(scene, segments=SEGMENTS, planar=True))
+    solve = jax.jit(lambda scene: rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", planar=True))
     assert solve(problems.omega(0.6, 0.0)).converged
     result = solve(problems.omega(0.6, 0.3))
     assert result.status == rj.Status.NOT_PLANAR

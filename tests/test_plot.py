@@ -19,9 +19,20 @@ TURNS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2, 2 * np.pi)
 
 @pytest.fixture(scope="module")
 def stages():
-    found = [solve(problems.omega(problems.ARC_HALF_ANGLE, 0.0), segments=SEGMENTS, guess=problems.figure_1_start())]
+    found = [
+        solve(
+            problems.omega(problems.ARC_HALF_ANGLE, 0.0),
+            segments=SEGMENTS,
+            discretization="finite_difference",
+            guess=problems.figure_1_start(),
+        )
+    ]
     for turn in TURNS:
-        found.append(solve(problems.omega(np.pi / 6, turn), guess=found[-1]))
+        found.append(
+            solve(
+                problems.omega(np.pi / 6, turn), segments=SEGMENTS, discretization="finite_difference", guess=found[-1]
+            )
+        )
     return found
 
 
@@ -89,7 +100,7 @@ def test_the_strip_keeps_turns_within_a_segment():
     rod = Rod(1.0, EI=1.0, GJ=0.2, EA=1e4)  # soft in torsion, so that it stays straight
     level = frame((1.0, 0.0, 0.0))
     straight = Scene(rod, Clamp((0.0, 0.0, 0.0), level), Clamp((1.0, 0.0, 0.0), level), turns=3)
-    equilibrium = solve(straight, segments=2)
+    equilibrium = solve(straight, segments=2, discretization="finite_difference")
     _, centerline, points = plot.tube(equilibrium, 0.02)
     strip = strip_middle(points) - centerline
     angle = np.unwrap(np.arctan2(strip[:, 2], strip[:, 1]))
@@ -159,7 +170,7 @@ def test_loads_are_drawn_with_their_size(twisted):
 def test_a_free_end_without_load_has_no_arrow(cable):
     force = PointForce(0.5, (0.0, 0.0, -0.01))
     scene = Scene(cable, Clamp((0.0, 0.0, 0.0), frame((1.0, 0.0, 0.0))), Free(), point_forces=[force])
-    equilibrium = solve(scene, segments=SEGMENTS)
+    equilibrium = solve(scene, segments=SEGMENTS, discretization="finite_difference")
     texts = [text.get_text() for text in plot.plot_rod(equilibrium, loads=True).axes[0].texts]
     assert texts[0] == "0.01 N"
     assert [text.split()[-1] for text in texts[:-1]] == ["N", "m"]

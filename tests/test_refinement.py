@@ -8,7 +8,8 @@ from scipy.interpolate import CubicSpline
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
-from rodjax.refinement import GRADING, LONGEST, SIZES, graded, next_size
+from rodjax.equilibrium import TRACED_SEGMENTS, Discretization, _solve
+from rodjax.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
 TWISTED = Scene(
     problems.cable(),
@@ -31,11 +32,15 @@ def true_error(result: rj.Equilibrium, truth: CubicSpline) -> float:
     return float(np.max(np.linalg.norm(truth(np.asarray(result.s)) - result.nodes, axis=1)))
 
 
-def test_the_estimate_is_the_error(scene_and_truth):
+@pytest.mark.parametrize(
+    ("discretization", "segments", "margin"),
+    # To leading order in the mesh: 1 to 4 % seen. That of the elements, of fourth order: 0.03 and 0.2 % seen.
+    [("hermite", 16, 0.08), ("finite_difference", 32, 0.01)],
+)
+def test_the_estimate_is_the_error(scene_and_truth, discretization, segments, margin):
     scene, truth = scene_and_truth
-    result = rj.solve(scene, segments=16, discretization="hermite")
-    # To leading order in the mesh: 1 to 4 % seen.
-    np.testing.assert_allclose(result.error_estimate, true_error(result, truth), rtol=0.08)
+    result = rj.solve(scene, segments=segments, discretization=discretization)
+    np.testing.assert_allclose(result.error_estimate, true_error(result, truth), rtol=margin)
 
 
 @pytest.mark.slow
@@ -52,6 +57,39 @@ def test_a_tolerance_is_met_and_not_by_far(scene_and_truth):
         np.testing.assert_array_equal(again.nodes, result.nodes)
 
 
+def compiled_programs() -> int:
+    return _solve._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    ("discretization", "asked"), [("hermite", {}), ("finite_difference", dict(discretization="finite_difference"))]
+)
+def test_without_segments_the_error_is_below_a_thousandth(scene_and_truth, discretization, asked):
+    scene, truth = scene_and_truth
+    result = rj.solve(scene, **asked)
+    assert result.converged
+    assert result.discretization == discretization
+    assert result.error_estimate < 1e-3
+    # Seen 2.7e-4 and 3.1e-4 with 8 elements, 2.0e-4 and 2.2e-4 with 64 edges.
+    assert true_error(result, truth) < 1e-3
+    programs = compiled_programs()
+    again = rj.solve(scene, guess=result)
+    assert again.discretization == discretization
+    assert again.iterations == 0
+    assert compiled_programs() == programs
+
+
+@pytest.mark.slow
+def test_a_path_is_refined_as_a_whole():
+    scenes, guess = problems.figure_1()[::8], problems.figure_1_start()
+    path = rj.solve_path(scenes, rtol=1e-4, guess=guess)
+    assert np.all(path.converged)
+    assert path.error_estimate.shape == (4,)
+    assert np.all(path.error_estimate <= 1e-4)
+    again = rj.solve_path(scenes, segments=path.s.shape[-1] - 1, guess=guess)
+    np.testing.assert_array_equal(again.nodes, path.nodes)
+
+
 def test_a_guess_whose_mesh_is_kept_brings_its_elements(scene_and_truth):
     scene, _ = scene_and_truth
     first = rj.solve(scene, segments=16, discretization="hermite")
@@ -63,8 +101,19 @@ def test_a_guess_whose_mesh_is_kept_brings_its_elements(scene_and_truth):
         np.testing.assert_array_equal(again.nodes, first.nodes)
 
 
-def test_finite_differences_have_no_estimate():
-    assert np.isnan(rj.solve(problems.hanging_cable(), segments=16).error_estimate)
+def test_every_entry_of_a_stack_has_its_estimate():
+    result = rj.solve(TWISTED, segments=16, discretization="hermite")
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), result)
+    assert stack.error_estimate.shape == (2,)
+    # The same operations, vectorised.
+    np.testing.assert_allclose(stack.error_estimate, result.error_estimate, rtol=1e-9)
+
+
+@pytest.mark.parametrize("discretization", TRACED_SEGMENTS)
+def test_inside_jit_the_mesh_has_one_size(discretization: Discretization):
+    traced = jax.eval_shape(lambda scene: rj.solve(scene, discretization=discretization), problems.hanging_cable())
+    assert traced.s.shape == (TRACED_SEGMENTS[discretization] + 1,)
+    assert traced.discretization == discretization
 
 
 @pytest.mark.slow
@@ -78,7 +127,6 @@ def test_inside_jit_the_mesh_is_given():
     ("options", "message"),
     [
         (dict(rtol=1e-3, segments=10), "segments must be None where rtol is given, got segments=10"),
-        (dict(rtol=1e-3, discretization="finite_difference"), "discretization must be 'hermite' where rtol is given"),
         (dict(rtol=0.0), "rtol must be positive, got 0"),
         (dict(rtol=1e-12), "rtol must lie in 1e-10 to 1"),
         (dict(rtol="small"), "rtol must be a number, got 'small'"),
@@ -112,15 +160,33 @@ def test_elements_gather_where_the_defects_are():
 
 
 @pytest.mark.parametrize(
-    ("segments", "error", "rtol", "expected"),
+    ("segments", "error", "rtol", "discretization", "expected"),
     [
-        (6, 1e-3, 1e-3, 8),  # just missed
-        (8, 1e-3, 1e-5, 32),  # (120)^(1/4) = 3.3 times as many
-        (8, 1.0, 1e-8, 32),  # no more than four times
-        (8, float("nan"), 1e-3, 16),  # no estimate: twice
-        (512, 1.0, 1e-8, 512),
+        (6, 1e-3, 1e-3, "hermite", 8),  # just missed
+        (8, 1e-3, 1e-5, "hermite", 32),  # (120)^(1/4) = 3.3 times as many
+        (8, 1.0, 1e-8, "hermite", 32),  # no more than four times
+        (8, float("nan"), 1e-3, "hermite", 16),  # no estimate: twice
+        (512, 1.0, 1e-8, "hermite", 512),
+        (12, 1e-3, 1e-3, "finite_difference", 16),
+        (12, 1e-2, 1e-3, "finite_difference", 48),  # (12)^(1/2) = 3.5 times as many
+        (8, float("nan"), 1e-3, "finite_difference", 16),
+        (4096, 1.0, 1e-8, "finite_difference", 4096),
     ],
 )
-def test_next_size(segments, error, rtol, expected):
-    assert expected in SIZES
-    assert next_size(segments, error, rtol) == expected
+def test_next_size(segments, error, rtol, discretization, expected):
+    assert expected in SIZES[discretization]
+    assert next_size(segments, error, rtol, discretization) == expected
+
+
+@pytest.mark.parametrize(
+    ("rtol", "discretization", "expected"),
+    [
+        (1e-2, "hermite", 6),  # (300)^(1/4) = 4.2, and no mesh is coarser than the first
+        (1e-3, "hermite", 8),  # (3000)^(1/4) = 7.4
+        (1e-6, "hermite", 48),  # (3e6)^(1/4) = 42
+        (1e-3, "finite_difference", 64),  # (3000)^(1/2) = 55
+        (1e-9, "finite_difference", 4096),  # and none finer than the last
+    ],
+)
+def test_first_size(rtol, discretization, expected):
+    assert first_size(rtol, discretization) == expected

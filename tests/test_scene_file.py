@@ -111,7 +111,7 @@ def test_the_example_in_the_documentation_is_a_path_with_all_it_names(read):
     assert {"rod", "start", "end", "loads", "solve", "path"} == set(tomllib.loads(example))
     file = read(example)
     assert len(file.scenes) == 29
-    assert file.segments == 50
+    assert (file.segments, file.rtol, file.discretization) == (None, 1e-3, "hermite")
     np.testing.assert_allclose(file.scenes[10].end.position, [0.5, 0, 0], atol=1e-15)
 
 
@@ -315,6 +315,10 @@ MISTAKES = [
     (ROD + START + END + "[solve]\nsegments = 1\n", "solve.segments must be a whole number", "2 to 100000"),
     (ROD + START + END + "[solve]\nsegments = 2.5\n", "solve.segments must be a whole number", "2 to 100000"),
     (ROD + START + END + "[solve]\nsteps = 2\n", "solve.steps is not allowed", "segments"),
+    (ROD + START + END + "[solve]\nrtol = 0\n", "solve.rtol must be positive", "got 0"),
+    (ROD + START + END + "[solve]\nrtol = 2\n", "solve.rtol must lie in 1e-10 to 1", "got 2"),
+    (ROD + START + END + "[solve]\nrtol = 1e-3\nsegments = 9\n", "solve.rtol is not allowed", "solve.segments"),
+    (ROD + START + END + '[solve]\ndiscretization = "fine"\n', "solve.discretization must be one of", "hermite"),
     # paths
     (ROD + START + END + "[[path]]\nsteps = 3\n", "path[0] changes nothing", "end.spin"),
     (ROD + START + END + "[[path]]\nsteps = 0\n", "path[0].steps must be a whole number", "1 to 10000"),

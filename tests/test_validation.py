@@ -26,7 +26,10 @@ def node_error(result: rj.Equilibrium, truth: Continuum) -> float:
 def test_figure_1_converges_to_the_continuum_with_second_order():
     scenes = problems.figure_1()
     bounds = {10: 1.0e-2, 20: 2.5e-3, 50: 4.0e-4, 100: 1.0e-4}
-    ends = {n: last(rj.solve_path(scenes, segments=n, guess=problems.figure_1_start())) for n in bounds}
+    ends = {
+        n: last(rj.solve_path(scenes, segments=n, discretization="finite_difference", guess=problems.figure_1_start()))
+        for n in bounds
+    }
     truth = Continuum(scenes[-1], near=ends[100])
     EI = float(scenes[0].rod.EI)
     np.testing.assert_allclose(truth.elastic_energy / EI, 19.9696, atol=5e-5)
@@ -44,7 +47,7 @@ def test_figure_1_converges_to_the_continuum_with_second_order():
 
 def test_cantilever_tip():
     scene = problems.cantilever(4.0)
-    result = rj.solve(scene, segments=100)
+    result = rj.solve(scene, segments=100, discretization="finite_difference")
     truth = Continuum(scene, near=result)
     tip = truth.nodes_at(np.array([1.0]))[0]
     np.testing.assert_allclose(result.nodes[-1], tip, atol=1e-4)
@@ -56,7 +59,7 @@ def test_cantilever_tip():
 
 def test_hanging_cable_is_second_order():
     scene = problems.hanging_cable()
-    results = [rj.solve(scene, segments=n) for n in (25, 50, 100)]
+    results = [rj.solve(scene, segments=n, discretization="finite_difference") for n in (25, 50, 100)]
     truth = Continuum(scene, near=results[-1])
     errors = [node_error(result, truth) for result in results]
     assert errors[-1] < 1e-4
@@ -68,7 +71,11 @@ def test_a_cable_without_bending_stiffness_is_an_elastic_catenary():
     """A cable on pins, w L^3/EI = 1e5; sag and horizontal pull of the elastic catenary (Irvine 1981)."""
     length, span, weight, EA = 1.0, 0.8, 1.0, 50.0
     rod = Rod(length, EI=1e-5, GJ=1e-5, EA=EA, mass_per_length=weight / 9.81)
-    result = rj.solve(Scene(rod, Pin(ORIGIN), Pin((span, 0, 0)), gravity=(0, 0, -9.81)), segments=100)
+    result = rj.solve(
+        Scene(rod, Pin(ORIGIN), Pin((span, 0, 0)), gravity=(0, 0, -9.81)),
+        segments=100,
+        discretization="finite_difference",
+    )
     assert result.converged
 
     def reach(pull):
@@ -86,7 +93,7 @@ def rolled_up(turns: int, segments: int, guess: rj.Equilibrium | None = None) ->
     rod = problems.cable()
     moment = 2 * math.pi * turns * float(rod.EI)
     scene = Scene(rod, Clamp(ORIGIN, LEVEL), Free(moment=(0, -moment, 0)))
-    result = rj.solve(scene, segments=segments, guess=guess)
+    result = rj.solve(scene, segments=segments, discretization="finite_difference", guess=guess)
     assert result.converged
     np.testing.assert_allclose(result.start_moment, [0, -moment, 0], atol=1e-6 * moment)
     return result
@@ -116,7 +123,7 @@ def test_an_euler_column_below_and_above_its_load(load, buckles):
     # A first shape with a visible bow: from the straight one the way out of the saddle is long.
     s = np.linspace(0, 1, 41)
     bow = rj.Guess(np.stack([s, 0 * s, 0.1 * (1 - np.cos(math.pi / 2 * s))], axis=1))
-    result = rj.solve(scene, segments=40, guess=bow)
+    result = rj.solve(scene, segments=40, discretization="finite_difference", guess=bow)
     assert result.converged
     tip = float(result.nodes[-1, 2])
     if buckles:

@@ -14,10 +14,10 @@ from rodjax.discretization.joints import (
     with_held_tangents,
 )
 from rodjax.discretization.tangent_field import Blocks
-from rodjax.discretization.twist import swept_twist
+from rodjax.discretization.twist import angle_about, swept_twist, transport_along
 from rodjax.energy import density
 from rodjax.scene import Scene
-from rodjax.supports import Free, Held
+from rodjax.supports import Clamp, Free, Held
 
 
 class EdgeTangents(eqx.Module):
@@ -43,6 +43,9 @@ class EdgeTangents(eqx.Module):
 
     def with_held(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 k"]:
         return with_held_tangents(scene, tangents)
+
+    def as_held(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return tangents
 
     def basis(self, scene: Scene, bases: Float[Array, "3 b k"]) -> Float[Array, "3 b n"]:
         return of_edges(scene, bases, self.segments)
@@ -72,11 +75,25 @@ class EdgeTangents(eqx.Module):
     def swept(self, scene: Scene, old: Float[Array, "3 n"], new: Float[Array, "3 n"]) -> Float[Array, ""]:
         return swept_twist(with_held_tangents(scene, old), with_held_tangents(scene, new))
 
+    def principal_twist(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
+        assert isinstance(scene.start, Clamp)
+        assert isinstance(scene.end, Clamp)
+        held = with_held_tangents(scene, tangents)
+        return angle_about(held[:, -1], transport_along(scene.start.frame[:, 0], held)[:, -1], scene.end.frame[:, 0])
+
     def ways(self, slopes: Float[Array, "3 n"]) -> Float[Array, "n 3"]:
         return slopes.T / self.segments
 
     def forces_beyond(self, scene: Scene) -> Float[Array, "3 n"]:
         return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments).T)
+
+    def force_spread(self, scene: Scene) -> None:
+        return None
+
+    def ways_of_spread(
+        self, scene: Scene, tangents: Float[Array, "3 n"], softness: Float[Array, "n"]
+    ) -> Float[Array, "n 3"]:
+        return jnp.zeros_like(tangents.T)
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 n"], lengths: Float[Array, "n"]) -> Float[Array, ""]:
         """Largest component of the force on a free node."""

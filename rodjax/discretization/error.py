@@ -1,10 +1,13 @@
-"""How far an equilibrium on Hermite elements is from the continuum: an estimate from its own defects.
+"""How far an equilibrium is from the continuum.
 
-Between two nodes the rod's differential equations are integrated from what the nodes say (tangent, moment, force). What
-they miss the next node by is the defect of the element, of fifth order. Put into the linearised discrete equations as
-rotations, couples and gaps that the elements lack, the defects give the error of the nodes to leading order: one more
-solution of the system of a Newton step. No second mesh is needed, and no neighbours, so that jumps of curvature or mesh
-do no harm.
+On Hermite elements: an estimate from their own defects. Between two nodes the rod's differential equations are
+integrated from what the nodes say (tangent, moment, force). What they miss the next node by is the defect of the
+element, of fifth order. Put into the linearised discrete equations as rotations, couples and gaps that the elements
+lack, the defects give the error of the nodes to leading order: one more solution of the system of a Newton step. No
+second mesh is needed, and no neighbours, so that jumps of curvature or mesh do no harm.
+
+By finite differences: the way to the elements between the same nodes, whose error is of fourth order, by one step of
+Newton's method.
 """
 
 import itertools
@@ -14,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.hermite import HermiteElements
-from rodjax.discretization.joints import cross, dot
+from rodjax.discretization.hermite import HermiteElements, interleaved
+from rodjax.discretization.joints import components, cross, dot
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
-from rodjax.linalg import factor_and_solve
+from rodjax.linalg import factor_and_solve, short_sum
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
 
@@ -41,14 +44,28 @@ class Section(NamedTuple):
 
 class Errors(NamedTuple):
     """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
-    as the displacement that each alone might make.
+    as the displacement that each alone might make, `None` where there are none.
     """
 
     nodes: Float[Array, "n+1 3"]
-    defects: Float[Array, "n"]
+    defects: Float[Array, "n"] | None
 
 
-def estimated_errors(form: MixedForm, point: MixedPoint) -> Errors:
+def errors_of_differences(
+    form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], at_nodes: Float[Array, "3 n+1"]
+) -> Errors:
+    """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
+    scene, field = form.scene, HermiteElements(form.field.s)
+    elements = MixedForm.of(scene, field)
+    tangents = interleaved(at_nodes, point.tangents)
+    begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
+    here = elements.linearized(begin)
+    _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
+    end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
+    return Errors(elements.nodes(elements.edges(end)) - nodes, None)
+
+
+def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     field, scene, tangents = form.field, form.scene, point.tangents
     assert isinstance(field, HermiteElements)
     rod, h = scene.rod, field.h
@@ -66,7 +83,7 @@ def estimated_errors(form: MixedForm, point: MixedPoint) -> Errors:
     passed = [tangent + k / STEPS * -cross(turn, tangent) for k, tangent in enumerate(passed)]
     force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 1]
     couple = last.moment - moments[:, 1:]
-    gap = last.way + h[None] / 2 * back - field.ways(form.slopes(point)).T
+    gap = last.way + h[None] / 2 * back - form.edges(point).T
 
     here = form.linearized(point)
     # To turn it back takes moments at both ends, which differ as force and torque go with the tangent.
@@ -76,24 +93,22 @@ def estimated_errors(form: MixedForm, point: MixedPoint) -> Errors:
     none = jnp.zeros_like(couple[:, :1])
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
-    gradient = (
-        jnp.zeros_like(here.gradient).at[:, ::2].set(jnp.sum(here.bases[..., ::2] * by_rotation[:, None], axis=0))
-    )
+    gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
     closure = -form.of_force(jnp.sum(gap, axis=1))
     if form.has_torsion:
         missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
         closure = jnp.concatenate([missing[None], closure])
     elif len(here.closure) > len(closure):
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
-    _, rotation, multipliers = factor_and_solve(here.system, -gradient, -closure)
+    _, rotation, multipliers = factor_and_solve(form.regular(here.system), -gradient, -closure)
 
     force_change = form.force_change(form.closure(multipliers))
-    turned = jnp.sum(here.bases * rotation[None], axis=1)
-    moved = MixedPoint(tangents, point.end_force + force_change, point.total_twist)
-    slopes, change = jax.jvp(
-        lambda tangents: form.slopes(MixedPoint(tangents, moved.end_force, point.total_twist)), (tangents,), (turned,)
+    turned = short_sum(here.bases * rotation[None], axis=1)
+    end_force = point.end_force + force_change
+    ways, change = jax.jvp(
+        lambda tangents: form.edges(MixedPoint(tangents, end_force, point.total_twist)), (tangents,), (turned,)
     )
-    ways = field.ways(change + slopes - form.slopes(point)).T + gap
+    ways = (ways + change - form.edges(point)).T + gap
     sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]

@@ -37,7 +37,8 @@ from rodjax.discretization.twist import (
     twist_under_moment,
 )
 from rodjax.energy import axial_strain_under, density
-from rodjax.linalg import Factors, SaddlePointSystem, factor
+from rodjax.guess import resampled
+from rodjax.linalg import Factors, SaddlePointSystem, factor, short_sum
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
 from rodjax.strain import axial_strain
 from rodjax.supports import Clamp, Directed, Held
@@ -68,6 +69,9 @@ class Polyline(Shape):
     @property
     def unknown_tangents(self) -> Float[Array, "3 n"]:
         return self.tangents
+
+    def points(self, pieces: int) -> Float[Array, "k 3"]:
+        return resampled(self.nodes, pieces)
 
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "Polyline":
         return Polyline(self.nodes * scale + shift[None], self.edges * scale)
@@ -263,7 +267,7 @@ class Preconditioner(eqx.Module):
         rotation, common = self.factors.solve(self.lengths[None] * components(self.bases, forces), closure)
         if constraints:
             stretched += self.per_tension * (common @ self.tangents)
-        return self.lengths[None] * jnp.sum(self.bases * rotation[None], axis=1) + stretched[None] * self.tangents
+        return self.lengths[None] * short_sum(self.bases * rotation[None], axis=1) + stretched[None] * self.tangents
 
 
 # Stiffness against rigid motion, in units of EI/L^3 per length, that the preconditioner adds where no end holds a

@@ -10,6 +10,8 @@ The rotation from b to a by an angle t has the length t in v only as far as t^10
 t approaches pi: an element has no way through a fold. All strains are rational functions of the three chords.
 """
 
+import functools
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -17,16 +19,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.joints import Joints, components, cross, dot, outer, twist_derivatives
+from rodjax.discretization.joints import Joints, components, cross, dot, outer, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
 from rodjax.energy import axial_strain_under, density
+from rodjax.guess import cubic
+from rodjax.linalg import short_sum
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import swept_angle
-from rodjax.supports import Directed, Free, Held
+from rodjax.supports import Clamp, Directed, Free, Held
 
 # Simpson's weights of the three points of an element.
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
@@ -36,6 +40,10 @@ PAIRS = ((0, 1), (1, 2), (0, 2))
 ARC_WEIGHTS = (4 / 3, 4 / 3, -1 / 3)
 
 
+# Point forces nearer to one another or to an end, in parts of an element, share it: shorter ones would cost digits.
+LEAST_ELEMENT = 0.05
+
+
 class HermiteElements(eqx.Module):
     """n elements between nodes at the arclengths `s` in units of L: 0, ..., 1. Points are nodes and middles in turn."""
 
@@ -43,9 +51,9 @@ class HermiteElements(eqx.Module):
 
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "HermiteElements":
-        """On these nodes, of which the nearest is moved to each point force: the moment has a kink there."""
+        """On these nodes, moved so that one lies at each point force: the moment has a kink there."""
         places = [load.at for load in scene.point_forces]
-        return HermiteElements(_with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
+        return HermiteElements(with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
 
     @property
     def points(self) -> int:
@@ -62,7 +70,7 @@ class HermiteElements(eqx.Module):
     @property
     def places(self) -> Float[Array, "m"]:
         """Arclengths of the points."""
-        return _interleaved(self.s, (self.s[:-1] + self.s[1:]) / 2)
+        return interleaved(self.s, (self.s[:-1] + self.s[1:]) / 2)
 
     @property
     def finest(self) -> Float[Array, ""]:
@@ -70,6 +78,13 @@ class HermiteElements(eqx.Module):
         return jnp.min(self.h) / 2
 
     def with_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+        return tangents
+
+    def as_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+        if isinstance(scene.start, Directed):
+            tangents = tangents.at[:, 0].set(scene.start.tangent)
+        if isinstance(scene.end, Directed):
+            tangents = tangents.at[:, -1].set(scene.end.tangent)
         return tangents
 
     def basis(self, scene: Scene, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
@@ -112,17 +127,21 @@ class HermiteElements(eqx.Module):
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]) -> Blocks:
         """Derivatives of the total twist by rotations of the tangents."""
-        points, point_bases = _of_elements(tangents), _of_elements(self.basis(scene, bases))
-        gradient, blocks = [0.0] * 3, {}
-        for (i, j), weight in zip(PAIRS, ARC_WEIGHTS, strict=True):
-            arc = twist_derivatives(Joints(points[i], points[j], self.h), (point_bases[i], point_bases[j]))
-            arc = jax.tree.map(lambda leaf, weight=weight: weight * leaf, arc)
-            gradient[i] += arc.before
-            gradient[j] += arc.after
-            blocks[i, i] = blocks.get((i, i), 0.0) + arc.before_before
-            blocks[j, j] = blocks.get((j, j), 0.0) + arc.after_after
-            blocks[j, i] = arc.after_before
-        return _blocks(gradient, blocks)
+        points, point_bases = _of_pairs(tangents), _of_pairs(self.basis(scene, bases))
+        spacing = jnp.broadcast_to(self.h[None], points[0].shape[1:])
+        weights = jnp.array(ARC_WEIGHTS, spacing.dtype)[:, None]
+        joints, joint_bases = jax.tree.map(_flat, (Joints(*points, spacing), point_bases))
+        arcs = jax.tree.map(
+            lambda leaf: (
+                leaf.reshape(*leaf.shape[:-1], *spacing.shape) * jnp.expand_dims(weights, range(leaf.ndim - 1))
+            ),
+            twist_derivatives(joints, joint_bases),
+        )
+        return _blocks(
+            gradient=_by_points(arcs.before, arcs.after),
+            diagonal=_by_points(arcs.before_before, arcs.after_after),
+            below=arcs.after_before,
+        )
 
     def swept(self, scene: Scene, old: Float[Array, "3 m"], new: Float[Array, "3 m"]) -> Float[Array, ""]:
         """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
@@ -133,21 +152,18 @@ class HermiteElements(eqx.Module):
     ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
         """The derivatives of what each element adds to the Lagrangian by the tangents of its start and end."""
         rod = scene.rod
-        forces = end_force[:, None, None] + self.forces_in_elements(scene)
-
-        def lagrangian(start, end):
-            points = jnp.stack([start, tangents[:, 1::2], end], axis=1)
-            a, b, c = points[:, 0], points[:, 1], points[:, 2]
-            bending = _bending_energies(rod, _half_squared_chords_of((a, b, c)), self.h)
-            tension = jnp.sum(forces * points, axis=0)
-            strain = axial_strain_under(rod, tension)
-            weights = jnp.array(SIMPSON, tension.dtype)[:, None] * self.h[None]
-            stretching = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
-            twist = jnp.sum(_arcs((a, b, c), _of_elements(tangents)))
-            return jnp.sum(bending) + stretching + torque * twist
-
-        start, end = tangents[:, 0:-1:2], tangents[:, 2::2]
-        return jax.grad(lagrangian, argnums=(0, 1))(start, end)
+        forces = end_force[:, None, None] + self.forces_in_elements(scene)[:, ::2]
+        chords = _half_squared_chords(tangents)
+        first, last = _of_pairs(tangents)
+        by_chord = jax.grad(lambda chords: jnp.sum(_bending_energies(rod, chords, self.h)))(chords)
+        normals = (torque * jnp.array(ARC_WEIGHTS, torque.dtype))[None, :, None] * twist_gradient(first, last)
+        points = jnp.stack([tangents[:, 0:-1:2], tangents[:, 2::2]], axis=1)
+        strain = axial_strain_under(rod, dot(forces, points))
+        stretching = (-SIMPSON[0] * self.h[None] * (1 + strain))[None] * forces
+        by_first, by_last = normals - by_chord[None] * last, normals - by_chord[None] * first
+        start = by_first[:, 0] + by_first[:, 2] + stretching[:, 0]
+        end = by_last[:, 1] + by_last[:, 2] + stretching[:, 1]
+        return start, end
 
     def carried(self, d1: Float[Array, "3"], tangents: Float[Array, "3 m"]) -> Float[Array, "3 n+1"]:
         """`d1` at the first tangent carried along the curve without twist, to the nodes."""
@@ -162,11 +178,12 @@ class HermiteElements(eqx.Module):
         angle = -jnp.concatenate([jnp.zeros_like(bulge[:1]), jnp.cumsum(bulge)]) / 3
         return jnp.cos(angle)[None] * along + jnp.sin(angle)[None] * cross(nodes, along)
 
-    def total_twist(
-        self, tangents: Float[Array, "3 m"], start_d1: Float[Array, "3"], end_d1: Float[Array, "3"]
-    ) -> Float[Array, ""]:
-        """Total twist between end frames with these directors [rad], up to whole turns."""
-        return angle_about(tangents[:, -1], self.carried(start_d1, tangents)[:, -1], end_d1)
+    def principal_twist(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
+        """The total twist between two clamps [rad], up to whole turns."""
+        assert isinstance(scene.start, Clamp)
+        assert isinstance(scene.end, Clamp)
+        carried = self.carried(scene.start.frame[:, 0], tangents)[:, -1]
+        return angle_about(tangents[:, -1], carried, scene.end.frame[:, 0])
 
     # --- places and loads --------------------------------------------------------------------------------------------
 
@@ -180,6 +197,26 @@ class HermiteElements(eqx.Module):
         of_elements = self.forces_in_elements(scene)
         parts = (weight * self.h[None] * of_elements[:, k] for k, weight in enumerate(SIMPSON))
         return _assembled(*parts) / self.weights[None]
+
+    def force_spread(self, scene: Scene) -> Float[Array, "3 3 m"] | None:
+        """The weighted products of what the forces on both sides of a point differ from `forces_beyond` by."""
+        if not scene.point_forces:
+            return None
+        differences = self._side_differences(scene)
+        products = differences[:, None] * differences[None]
+        return _assembled(*(weight * self.h[None, None] * products[:, :, k] for k, weight in enumerate(SIMPSON)))
+
+    def ways_of_spread(
+        self, scene: Scene, tangents: Float[Array, "3 m"], softness: Float[Array, "m"]
+    ) -> Float[Array, "n 3"]:
+        """By how much the ways between nodes differ where the tension on their side of a point does."""
+        along = jnp.stack(_of_elements(tangents), axis=1)
+        strain = jnp.stack(_of_elements(softness)) * dot(self._side_differences(scene), along)
+        weights = jnp.array(SIMPSON, strain.dtype)[:, None] * self.h[None]
+        return short_sum((weights * strain)[None] * along, axis=1).T
+
+    def _side_differences(self, scene: Scene) -> Float[Array, "3 3 n"]:
+        return self.forces_in_elements(scene) - jnp.stack(_of_elements(self.forces_beyond(scene)), axis=1)
 
     def forces_in_elements(self, scene: Scene) -> Float[Array, "3 3 n"]:
         """The same at start, middle and end of each element, on its side of a point force at a node."""
@@ -241,9 +278,13 @@ class Curve(Shape):
         tangents = self.tangents + ratio * (self.tangents - older.tangents)
         return Curve(self.nodes, tangents / jnp.sqrt(dot(tangents, tangents))[None], self.s)
 
+    def points(self, pieces: int) -> Float[Array, "k 3"]:
+        s = jnp.linspace(0.0, 1.0, pieces + 1, dtype=self.s.dtype)
+        return cubic(self.s, self.nodes, self.tangents[:, ::2].T, s)
+
     def on(self, s: Float[Array, "n+1"]) -> "Curve":
         """The same on other nodes, to begin a solve with."""
-        places = _interleaved(s, (s[:-1] + s[1:]) / 2)
+        places = interleaved(s, (s[:-1] + s[1:]) / 2)
         cell = jnp.clip(jnp.searchsorted(self.s, places, side="right") - 1, 0, len(self.s) - 2)
         x = ((places - self.s[cell]) / (self.s[cell + 1] - self.s[cell]))[None]
         a, b, c = (part[:, cell] for part in _of_elements(self.tangents))
@@ -256,10 +297,8 @@ class Curve(Shape):
         tangents = self.tangents
         if isinstance(scene.start, Directed):
             tangents = _turned(tangents, tangents[:, 0], scene.start.tangent, 1.0 - places)
-            tangents = tangents.at[:, 0].set(scene.start.tangent)
         if isinstance(scene.end, Directed):
             tangents = _turned(tangents, tangents[:, -1], scene.end.tangent, places)
-            tangents = tangents.at[:, -1].set(scene.end.tangent)
         return tangents
 
 
@@ -278,17 +317,26 @@ def _turned(
     return jnp.where(turns, turned, tangents)
 
 
-def _with_nodes_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Float[Array, "n+1"]:
-    """The nodes, of which the nearest to each of the sorted places is moved there, but for the ends.
+def with_nodes_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Float[Array, "n+1"]:
+    """The nodes moved, with all between them and the next one fixed, so that one lies at each of the sorted places.
 
-    Of places that are nearer to one another than an element some may get none.
+    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none.
     """
-    n = len(s) - 1
+    n, k = len(s) - 1, min(len(places), len(s) - 2)
     index = jnp.arange(n + 1)
-    for k in range(len(places)):
-        nearest = jnp.argmin(jnp.abs(s - places[k]))
-        taken = (nearest == 0) | (nearest == n)
-        s = jnp.where((index == nearest) & ~taken, places[k], s)
+    fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
+    for remaining, place in zip(range(k, 0, -1), places[:k], strict=True):
+        nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - remaining)
+        here = s[nearest]
+        # Written so that the same bits come out where the node is there already.
+        before = s + (s - fixed_place) * ((place - fixed_place) / (here - fixed_place) - 1)
+        beyond = s + (1 - s) * (1 - (1 - place) / (1 - here))
+        moved = jnp.where(index <= fixed, s, jnp.where(index < nearest, before, beyond))
+        moved = jnp.where(index == nearest, place, moved)
+        is_apart = (place - fixed_place) * n >= LEAST_ELEMENT
+        is_apart &= (1 - place) * n >= LEAST_ELEMENT
+        s = jnp.where(is_apart, moved, s)
+        fixed, fixed_place = jnp.where(is_apart, nearest, fixed), jnp.where(is_apart, place, fixed_place)
     return s
 
 
@@ -304,7 +352,7 @@ def _arcs(new: tuple[Array, Array, Array], old: tuple[Array, Array, Array]) -> F
     return arcs[0] + arcs[1] + arcs[2]
 
 
-def _interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) -> Float[Array, "... m"]:
+def interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) -> Float[Array, "... m"]:
     pairs = jnp.stack([nodes[..., :-1], middles], axis=-1)
     return jnp.concatenate([pairs.reshape(*nodes.shape[:-1], -1), nodes[..., -1:]], axis=-1)
 
@@ -313,85 +361,104 @@ def _assembled(start: Float[Array, "... n"], middle: Float[Array, "... n"], end:
     """Sums over the elements at each point."""
     none = jnp.zeros_like(start[..., :1])
     nodes = jnp.concatenate([start, none], axis=-1) + jnp.concatenate([none, end], axis=-1)
-    return _interleaved(nodes, middle)
+    return interleaved(nodes, middle)
 
 
-def _blocks(gradient: list, blocks: dict) -> Blocks:
-    """Element by element -> point by point. `blocks[i, j]`: derivative by point i, then j <= i."""
+def _of_pairs(by_point: Float[Array, "... m"]) -> tuple[Float[Array, "... 3 n"], Float[Array, "... 3 n"]]:
+    """What belongs to the first and to the last point of each pair."""
+    parts = _of_elements(by_point)
+    first, last = zip(*PAIRS, strict=True)
+    return jnp.stack([parts[i] for i in first], axis=-2), jnp.stack([parts[j] for j in last], axis=-2)
+
+
+def _flat(by_pair: Float[Array, "... 3 n"]) -> Float[Array, "... 3n"]:
+    return by_pair.reshape(*by_pair.shape[:-2], -1)
+
+
+def _by_points(
+    first: Float[Array, "... 3 n"], last: Float[Array, "... 3 n"]
+) -> tuple[Float[Array, "... n"], Float[Array, "... n"], Float[Array, "... n"]]:
+    """At start, middle and end of the elements, sums of what the pairs give to their first and last points."""
+    ab, bc, ac = range(3)
+    return (
+        first[..., ab, :] + first[..., ac, :],
+        last[..., ab, :] + first[..., bc, :],
+        last[..., bc, :] + last[..., ac, :],
+    )
+
+
+def _added(terms: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, terms)
+
+
+def _blocks(gradient: tuple[Array, Array, Array], diagonal: tuple[Array, Array, Array], below: Array) -> Blocks:
+    """Element by element -> point by point. `below`: by the last point of each pair, then by its first."""
     return Blocks(
         gradient=_assembled(*gradient),
-        diagonal=_assembled(*(blocks[i, i] for i in range(3))),
-        lower=jnp.stack([blocks[1, 0], blocks[2, 1]], axis=-1).reshape(*blocks[1, 0].shape[:2], -1),
-        across=blocks[2, 0],
+        diagonal=_assembled(*diagonal),
+        lower=jnp.stack([below[..., 0, :], below[..., 1, :]], axis=-1).reshape(*below.shape[:2], -1),
+        across=below[..., 2, :],
     )
 
 
 def _half_squared_chords(tangents: Float[Array, "3 m"]) -> Float[Array, "3 n"]:
     """1 - cos of the angles between the points of each pair, without cancellation."""
-    return _half_squared_chords_of(_of_elements(tangents))
-
-
-def _half_squared_chords_of(points: tuple[Array, Array, Array]) -> Float[Array, "3 n"]:
-    differences = [points[j] - points[i] for i, j in PAIRS]
-    return jnp.stack([dot(difference, difference) / 2 for difference in differences])
+    first, last = _of_pairs(tangents)
+    return dot(last - first, last - first) / 2
 
 
 def _by_chords(
     first: Float[Array, "3 n"], second: Float[Array, "3 3 n"], tangents: Float[Array, "3 m"], bases: Array
 ) -> Blocks:
     """Derivatives by rotations from those by the three chords of each element."""
-    points, point_bases = _of_elements(tangents), _of_elements(bases)
-    # 1 - a.b changes by -e.b as a turns along e, and as fast again by a.b.
-    by_point: list[dict[int, Array]] = [{}, {}, {}]
+    points, point_bases = _of_pairs(tangents), _of_pairs(bases)
+    # 1 - a.b falls by e.b as a turns along e, and grows again by a.b.
+    toward_last = components(point_bases[0], points[1])
+    toward_first = components(point_bases[1], points[0])
+    falls: list[dict[int, Array]] = [{}, {}, {}]
     for p, (i, j) in enumerate(PAIRS):
-        by_point[i][p] = -components(point_bases[i], points[j])
-        by_point[j][p] = -components(point_bases[j], points[i])
+        falls[i][p], falls[j][p] = toward_last[:, p], toward_first[:, p]
+    bent = [[_added(second[p, q][None] * fall for p, fall in falls[i].items()) for q in range(3)] for i in range(3)]
+
+    def block(i: int, j: int) -> Float[Array, "b b n"]:
+        return _added(outer(bent[i][q], fall) for q, fall in falls[j].items())
+
+    cosines = first * dot(*points)
+    at_points = _by_points(cosines, cosines)
+    between = first[None, None] * short_sum(point_bases[1][:, :, None] * point_bases[0][:, None], axis=0)
     identity = jnp.eye(bases.shape[1], dtype=bases.dtype)[..., None]
-    gradient = [sum(first[p][None] * change for p, change in by_point[i].items()) for i in range(3)]
-    blocks = {}
-    for i, j in ((0, 0), (1, 1), (2, 2), (1, 0), (2, 1), (2, 0)):
-        terms = [
-            second[p][q][None, None] * outer(by_p, by_q)
-            for p, by_p in by_point[i].items()
-            for q, by_q in by_point[j].items()
-        ]
-        if i == j:
-            terms += [(first[p] * dot(*(points[k] for k in PAIRS[p])))[None, None] * identity for p in by_point[i]]
-        else:
-            between = jnp.sum(point_bases[i][:, :, None] * point_bases[j][:, None, :], axis=0)
-            terms.append(-first[PAIRS.index((j, i))][None, None] * between)
-        blocks[i, j] = sum(terms[1:], terms[0])
-    return _blocks(gradient, blocks)
+
+    def on_diagonal(i: int) -> Float[Array, "b b n"]:
+        return block(i, i) + at_points[i][None, None] * identity
+
+    return _blocks(
+        gradient=_by_points(-first[None] * toward_last, -first[None] * toward_first),
+        diagonal=(on_diagonal(0), on_diagonal(1), on_diagonal(2)),
+        below=jnp.stack([block(j, i) for i, j in PAIRS], axis=2) - between,
+    )
 
 
 def _bending_energies(rod: Rod, chords: Float[Array, "3 n"], h: Float[Array, "n"]) -> Float[Array, "n"]:
-    squared = [curvature / h**2 for curvature in _squared_curvatures(chords)]
-    parts = [weight * density(rod, squared_curvature=k) for weight, k in zip(SIMPSON, squared, strict=True)]
-    return h * sum(parts[1:], parts[0])
+    at_ends, middle = _squared_curvatures(chords)
+    ends = density(rod, squared_curvature=at_ends / (h**2)[None])
+    return h * (SIMPSON[0] * (ends[0] + ends[1]) + SIMPSON[1] * density(rod, squared_curvature=middle / h**2))
 
 
-def _squared_curvatures(chords: Float[Array, "3 n"]) -> list[Float[Array, "n"]]:
-    """|dt/dx|^2, x = s/h, at start, middle and end of an element, from `_half_squared_chords`."""
+def _squared_curvatures(chords: Float[Array, "3 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "n"]]:
+    """|dt/dx|^2, x = s/h, at both ends and in the middle of an element, from `_half_squared_chords`."""
     ab, bc, ac = chords
-    u, w = ab / 2, bc / 2  # squared sines of half the angles
-    ratio_u, rest_u = _series(u)
-    ratio_w, rest_w = _series(w)
-    squared_a, squared_c = 4 * u * ratio_u, 4 * w * ratio_w  # |v_a|^2, |v_c|^2
-    product = jnp.sqrt(ratio_u * ratio_w / ((1 - u) * (1 - w))) * (ab + bc - ac - ab * bc)  # v_a . v_c
-
-    def at_end(squared, other, x, ratio, rest):
-        # v changes by 3 v_a + v_c; across v_a that moves the tangent only by sin(t)/t as much.
-        whole = 9 * squared + other + 6 * product
-        return whole - (x * rest / ratio) * other + rest / (4 * ratio**2) * product**2
-
-    return [
-        at_end(squared_a, squared_c, u, ratio_u, rest_u),
-        squared_a + squared_c - 2 * product,
-        at_end(squared_c, squared_a, w, ratio_w, rest_w),
-    ]
+    x = chords[:2] / 2  # squared sines of half the angles
+    ratio, rest = _series(x)
+    squared = 4 * x * ratio  # |v_a|^2, |v_c|^2
+    root = jnp.sqrt(ratio / (1 - x))
+    product = root[0] * root[1] * (ab + bc - ac - ab * bc)  # v_a . v_c
+    # v changes by 3 v_a + v_c; across v_a that moves the tangent only by sin(t)/t as much.
+    whole = 9 * squared + squared[::-1] + 6 * product[None]
+    at_ends = whole - (x * rest / ratio) * squared[::-1] + rest / (4 * ratio**2) * (product**2)[None]
+    return at_ends, squared[0] + squared[1] - 2 * product
 
 
-def _series(x: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+def _series(x: Float[Array, "2 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
     """t^2/(4 x) for x = sin(t/2)^2 as far as x^4, then growing to infinity at x = 1; and what it is above 1 - x, by x.
 
     t^2/4 = x + x^2/3 + 8 x^3/45 + 4 x^4/35 + 128 x^5/1575 + ...

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.energy import density
+from rodjax.linalg import short_sum
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import squared_curvature_between
@@ -90,7 +91,7 @@ def rotated(
     tangents: Float[Array, "3 n"], bases: Float[Array, "3 2 n"], rotation: Float[Array, "2 n"]
 ) -> Float[Array, "3 n"]:
     """Each tangent turned along a great circle, by an angle and in a direction given in its basis [rad]."""
-    across = jnp.sum(bases * rotation[None], axis=1)
+    across = short_sum(bases * rotation[None], axis=1)
     squared = dot(rotation, rotation)
     is_zero = squared == 0
     angle = jnp.sqrt(jnp.where(is_zero, 1.0, squared))
@@ -119,7 +120,7 @@ def bending_derivatives(
     before_basis, after_basis = bases
     toward_after, toward_before = components(before_basis, joints.after), components(after_basis, joints.before)
     cosine = dot(joints.before, joints.after)
-    between = jnp.sum(after_basis[:, :, None] * before_basis[:, None, :], axis=0)
+    between = short_sum(outer(after_basis, before_basis), axis=0)
     if gauss_newton:
         transported = between - outer(toward_before, toward_after) / (1 + cosine)[None, None]
         cosine = jnp.maximum(cosine, LEAST_COSINE)
@@ -139,11 +140,11 @@ def twist_derivatives(joints: Joints, bases: tuple[Float[Array, "3 2 k"], Float[
     a, b = joints.before, joints.after
     before_basis, after_basis = bases
     scale = 1 / (1 + dot(a, b))
-    normal = scale[None] * cross(a, b)
+    normal = twist_gradient(a, b)
     normal_before, normal_after = components(before_basis, normal), components(after_basis, normal)
     toward_after, toward_before = scale[None] * components(before_basis, b), scale[None] * components(after_basis, a)
     a_cross = jnp.stack([cross(a, after_basis[:, i]) for i in range(after_basis.shape[1])], axis=1)
-    between = scale[None, None] * jnp.sum(a_cross[:, :, None] * before_basis[:, None, :], axis=0)
+    between = scale[None, None] * short_sum(outer(a_cross, before_basis), axis=0)
     return JointDerivatives(
         before=normal_before,
         after=normal_after,
@@ -151,6 +152,11 @@ def twist_derivatives(joints: Joints, bases: tuple[Float[Array, "3 2 k"], Float[
         after_after=-_symmetric_outer(normal_after, toward_before),
         after_before=between - outer(toward_before, normal_before),
     )
+
+
+def twist_gradient(before: Float[Array, "3 *k"], after: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """The derivative of the total twist by either tangent of a joint."""
+    return cross(before, after) / (1 + dot(before, after))[None]
 
 
 def of_edges(scene: Scene, by_point: Float[Array, "... m"], segments: int) -> Float[Array, "... n"]:
@@ -183,20 +189,26 @@ def _two_derivatives(function, x: Float[Array, "k"]) -> tuple[Float[Array, "k"],
     return jax.jvp(lambda x: jax.jvp(function, (x,), (ones,))[1], (x,), (ones,))
 
 
-def components(basis: Float[Array, "3 2 k"], vectors: Float[Array, "3 k"]) -> Float[Array, "2 k"]:
-    return jnp.sum(basis * vectors[:, None], axis=0)
+def components(basis: Float[Array, "3 b *k"], vectors: Float[Array, "3 *k"]) -> Float[Array, "b *k"]:
+    return short_sum(basis * vectors[:, None], axis=0)
 
 
-def dot(a: Float[Array, "c k"], b: Float[Array, "c k"]) -> Float[Array, "k"]:
-    return jnp.sum(a * b, axis=0)
+def dot(a: Float[Array, "c *k"], b: Float[Array, "c *k"]) -> Float[Array, "*k"]:
+    return short_sum(a * b, axis=0)
 
 
-def cross(a: Float[Array, "3 k"], b: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
+def cross(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Array, "2 2 k"]:
-    return a[:, None] * b[None]
+def root(x: Float[Array, "*k"]) -> Float[Array, "*k"]:
+    """Square root, with the derivative 0 at 0."""
+    is_zero = x == 0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, x)))
+
+
+def outer(a: Float[Array, "*c 2 k"], b: Float[Array, "*c 2 k"]) -> Float[Array, "*c 2 2 k"]:
+    return a[..., :, None, :] * b[..., None, :, :]
 
 
 def _symmetric_outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Array, "2 2 k"]:

@@ -28,12 +28,16 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.joints import components, dot, outer, rotated, tangent_bases
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.twist import twist_under_moment
+from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
-from rodjax.linalg import SaddlePointSystem
+from rodjax.linalg import SaddlePointSystem, short_sum
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
 from rodjax.supports import Clamp, Free, Held
 
+# Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
+# a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
+# costs Newton a factor of 1e7 a step instead of quadratic convergence. The softest mode of a clamped rod has pi^2.
+NEUTRAL = 1e-6
 # Multiple of eps (stiffness or force + 4 N^2) that is taken for the rounding floor of the gradient.
 FLOOR_SAFETY = 4.0
 # Where the gradient is at the tolerance, the polyline must close to this multiple of it: a hundredth, as a bent rod has
@@ -75,22 +79,24 @@ class Linearization(eqx.Module):
 class MixedForm(eqx.Module):
     """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
-    `forces_beyond`: what the loads exert on what lies beyond each point; `axes`: unit
-    vectors along which the rod may leave its place, `None` for all of space: two for a rod in a plane, its normal for
-    motions out of it. In a symmetric scene the two kinds do not couple.
+    `forces_beyond`: what the loads exert on what lies beyond each point; `force_spread`: as in `TangentField`, as the
+    energy of stretch is the mean of that on both sides of a point force; `axes`: unit vectors along which the rod may
+    leave its place, `None` for all of space: two for a rod in a plane, its normal for motions out of it. In a symmetric
+    scene the two kinds do not couple.
     """
 
     scene: Scene
     field: TangentField
     forces_beyond: Float[Array, "3 m"]
+    force_spread: Float[Array, "3 3 m"] | None
     axes: Float[Array, "3 a"] | None = None
 
     @staticmethod
     def of(scene: Scene, field: TangentField) -> "MixedForm":
-        return MixedForm(scene, field, field.forces_beyond(scene))
+        return MixedForm(scene, field, field.forces_beyond(scene), field.force_spread(scene))
 
     def along(self, axes: Float[Array, "3 a"]) -> "MixedForm":
-        return MixedForm(self.scene, self.field, self.forces_beyond, axes)
+        return MixedForm(self.scene, self.field, self.forces_beyond, self.force_spread, axes)
 
     def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
         """Directions at right angles to each tangent, along the axes."""
@@ -121,7 +127,11 @@ class MixedForm(eqx.Module):
 
     def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
         """From node to node."""
-        return self.field.ways(self.slopes(point))
+        ways = self.field.ways(self.slopes(point))
+        if self.force_spread is not None:
+            _, softness = self._strain(point)
+            ways += self.field.ways_of_spread(self.scene, point.tangents, softness)
+        return ways
 
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
         """Nodes along the edges, between held ends to the last digit."""
@@ -150,14 +160,39 @@ class MixedForm(eqx.Module):
         held = start if isinstance(start, Held) else end
         assert isinstance(held, Held), "a scene holds at least one position"
         work = jnp.sum(self.field.weights * dot(self.forces_beyond, self.slopes(point)))
+        work += 2 * self.stretching_of_spread(point)
         return -work - jnp.sum(total_force(self.scene) * held.position)
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod
         strain = axial_strain_under(rod, self.edge_tension(point))
-        stretching = jnp.sum(self.field.weights * density(rod, axial_strain=strain))
+        stretching = jnp.sum(self.field.weights * density(rod, axial_strain=strain)) + self.stretching_of_spread(point)
         bending = self.field.bending_energy(self.scene, point.tangents)
         return bending + stretching + density(rod, twist=point.total_twist)
+
+    def stretching_of_spread(self, point: MixedPoint) -> Float[Array, ""]:
+        """What the energy of stretch on both sides of the points is above that of their mean tension."""
+        if self.force_spread is None:
+            return jnp.zeros((), point.tangents.dtype)
+        _, softness = self._strain(point)
+        return jnp.sum(softness * dot(_times(self.force_spread, point.tangents), point.tangents)) / 2
+
+    def _strain(self, point: MixedPoint) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
+        """The axial strain, and its derivative by tension."""
+        tension = self.edge_tension(point)
+        return jax.jvp(
+            lambda tension: axial_strain_under(self.scene.rod, tension), (tension,), (jnp.ones_like(tension),)
+        )
+
+    def twist_near(
+        self, tangents: Float[Array, "3 m"], twist: Float[Array, ""], turns: Float[Array, ""] | None = None
+    ) -> Float[Array, ""]:
+        """The total twist [rad]: between two clamps the nearest to `twist`, or of so many turns; or under a moment."""
+        if not self.has_potential:
+            return twist_under_moment(self.scene, tangents)
+        if isinstance(self.scene.start, Clamp) and isinstance(self.scene.end, Clamp):
+            return nearest_twist(self.field.principal_twist(self.scene, tangents), twist, turns)
+        return jnp.zeros_like(twist)
 
     def moved(
         self,
@@ -196,9 +231,7 @@ class MixedForm(eqx.Module):
 
         forces = point.end_force[:, None] + self.forces_beyond
         tension = dot(forces, tangents)
-        strain, softness = jax.jvp(
-            lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
-        )
+        strain, softness = self._strain(point)
         lengths = weights * (1 + strain)
         across = components(bases, forces)
         gradient -= lengths[None] * across
@@ -206,6 +239,14 @@ class MixedForm(eqx.Module):
         diagonal += (lengths * tension)[None, None] * identity
         diagonal -= (weights * softness)[None, None] * outer(across, across)
         energy += jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
+        if self.force_spread is not None:
+            spread = _times(self.force_spread, tangents)
+            along = softness * dot(spread, tangents)
+            of_bases = short_sum(self.force_spread[:, :, None] * bases[None], axis=1)
+            energy -= jnp.sum(along) / 2
+            gradient -= softness[None] * components(bases, spread)
+            diagonal += along[None, None] * identity
+            diagonal -= softness[None, None] * short_sum(bases[:, :, None] * of_bases[:, None], axis=0)
         if isinstance(scene.start, Held) and isinstance(scene.end, Held):
             span = scene.end.position - scene.start.position
             energy += jnp.sum(point.end_force * span)
@@ -213,7 +254,7 @@ class MixedForm(eqx.Module):
             directions, along = jnp.swapaxes(bases, 0, 1), tangents
             if self.axes is not None:
                 lacking = lacking @ self.axes
-                directions = jnp.sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
+                directions = short_sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
                 along = self.axes.T @ tangents
             columns.append(-lengths[None, None] * directions - (weights * softness)[None, None] * outer(across, along))
             closure.append(lacking)
@@ -248,8 +289,12 @@ class MixedForm(eqx.Module):
                 blocks.across,
             ),
             energy=energy,
-            residual=field.residual(scene, jnp.sum(bases * gradient[None], axis=1), lengths),
+            residual=field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
         )
+
+    def regular(self, system: SaddlePointSystem) -> SaddlePointSystem:
+        """The system of a linearisation, neutral modes held."""
+        return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
 
     @property
     def _closures(self) -> int:
@@ -282,7 +327,7 @@ class MixedForm(eqx.Module):
     def closure_gradient(self, here: Linearization, change: Float[Array, "c"]) -> Float[Array, "b n"]:
         """What another end force adds to the gradient by the rotations."""
         first = len(here.closure) - self._closures
-        return jnp.sum(here.system.border[:, first:] * change[None, :, None], axis=1)
+        return short_sum(here.system.border[:, first:] * change[None, :, None], axis=1)
 
     def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
@@ -294,6 +339,10 @@ class MixedForm(eqx.Module):
         """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
         least = CLOSURE_ROUNDINGS * jnp.finfo(closure.dtype).eps
         return jnp.all(jnp.abs(closure) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))
+
+
+def _times(matrices: Float[Array, "3 3 m"], vectors: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+    return short_sum(matrices * vectors[None], axis=1)
 
 
 def _with_derivatives(

@@ -1,6 +1,7 @@
 """What an equilibrium says at its nodes and ends, from its tangents, the forces on its ends and its total twist."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,11 +11,13 @@ from rodjax.discretization.joints import (
     bending_derivatives,
     cross,
     dot,
+    root,
     tangent_bases,
     twist_derivatives,
 )
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import angle_about, transport, transport_along
+from rodjax.energy import axial_strain_under
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Directed, Free, Support
@@ -47,7 +50,7 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     torque = rod.GJ * point.total_twist
     by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
-    curvature = jnp.sqrt(dot(moments, moments)) / rod.EI
+    curvature = root(dot(moments, moments)) / rod.EI
     moments += torque * nodes
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
@@ -63,6 +66,48 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
         end_force=forces[1],
         end_moment=_given_moment(scene.end, moments[:, -1], sign=1),
     )
+
+
+def positions_between(
+    form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], s: Float[Array, "k"]
+) -> Float[Array, "k 3"]:
+    """The centerline at arclengths between the nodes of elements: polynomials of fifth degree by position, slope and
+    second derivative, which force and moment give on each side of a node.
+    """
+    field, scene = form.field, form.scene
+    assert isinstance(field, HermiteElements)
+    rod, tangents = scene.rod, point.tangents
+    torque = rod.GJ * point.total_twist
+    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    forces = point.end_force[:, None, None] + field.forces_in_elements(scene)
+    weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
+    cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
+
+    def derivatives(tangent, force, moment) -> tuple[Float[Array, "3 k"], Float[Array, "3 k"]]:
+        turn = cross(moment, tangent) / rod.EI
+        strain, softening = jax.jvp(
+            lambda tension: axial_strain_under(rod, tension),
+            (dot(force, tangent),),
+            (dot(force, turn) - weight @ tangent,),
+        )
+        return (1 + strain)[None] * tangent, (1 + strain)[None] * turn + softening[None] * tangent
+
+    start, end = tangents[:, 0:-1:2][:, cell], tangents[:, 2::2][:, cell]
+    slope, bend = derivatives(start, forces[:, 0, cell], -cross(start, by_start[:, cell]))
+    end_slope, end_bend = derivatives(end, forces[:, 2, cell], cross(end, by_end[:, cell]))
+    h = field.h[cell]
+    x = (s - field.s[cell]) / h
+    # From the first node: what the way, the slopes and the second derivatives add.
+    y = 1 - x
+    weights = (
+        x**3 * (10 - 15 * x + 6 * x**2),
+        h * x * y**3 * (1 + 3 * x),
+        h**2 * x**2 * y**3 / 2,
+        -h * x**3 * y * (1 + 3 * y),
+        h**2 * x**3 * y**2 / 2,
+    )
+    values = ((nodes[cell + 1] - nodes[cell]).T, slope, bend, end_slope, end_bend)
+    return nodes[cell] + sum(weight[:, None] * value.T for weight, value in zip(weights, values, strict=True))
 
 
 def _given_moment(end: Support, held: Float[Array, "3"], *, sign: int) -> Float[Array, "3"]:
@@ -100,7 +145,7 @@ def _on_edges(
     tension = jnp.concatenate([end_tensions[0], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1]])
     return Resultants(
         frames=_frames(scene, tangents, at_nodes, twist),
-        curvature=jnp.sqrt(jnp.concatenate(squared_curvatures)),
+        curvature=root(jnp.concatenate(squared_curvatures)),
         twist=jnp.full(n + 1, twist),
         tension=tension,
         start_force=end_forces[0],

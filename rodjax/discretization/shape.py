@@ -25,6 +25,10 @@ class Shape(eqx.Module):
         """Through equally spaced points."""
 
     @abstractmethod
+    def points(self, pieces: int) -> Float[Array, "k 3"]:
+        """`pieces` + 1 equally spaced points of it."""
+
+    @abstractmethod
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> Self:
         """Scaled, then shifted."""
 

@@ -46,6 +46,10 @@ class TangentField(Protocol):
         """With the tangents that supports hold beyond the points."""
         ...
 
+    def as_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+        """With those at the points that supports hold in their place."""
+        ...
+
     def basis(self, scene: Scene, bases: Float[Array, "3 b k"]) -> Float[Array, "3 b m"]:
         """The directions in which the tangents may turn: none where a support holds one."""
         ...
@@ -70,12 +74,28 @@ class TangentField(Protocol):
         """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
         ...
 
+    def principal_twist(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
+        """The total twist between two clamps [rad], up to whole turns."""
+        ...
+
     def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:
         """From node to node, of a curve with these derivatives by arclength at the points."""
         ...
 
     def forces_beyond(self, scene: Scene) -> Float[Array, "3 m"]:
         """What the loads beyond each point exert on it; where the start is free, less all of them."""
+        ...
+
+    def force_spread(self, scene: Scene) -> Float[Array, "3 3 m"] | None:
+        """Where a point force acts at a point: products of the differences from `forces_beyond` on both sides, by the
+        length of rod on each; `None` where there are none.
+        """
+        ...
+
+    def ways_of_spread(
+        self, scene: Scene, tangents: Float[Array, "3 m"], softness: Float[Array, "m"]
+    ) -> Float[Array, "n 3"]:
+        """By how much the ways between nodes differ where the tension on their side of a point does."""
         ...
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 m"], lengths: Float[Array, "m"]) -> Float[Array, ""]:

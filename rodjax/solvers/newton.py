@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import not_negative, plain_number, whole_number
-from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.discretization.joints import components
+from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
 from rodjax.linalg import factor, factor_and_solve
 from rodjax.status import Outcome, Status
 
@@ -36,11 +37,8 @@ class Newton(eqx.Module):
             raise ValueError(f"max_rotation must lie between 0 and 3 rad, got {self.max_rotation!r}")
 
 
-# Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
-# a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
-# costs Newton a factor of 1e7 a step instead of quadratic convergence. The softest mode of a clamped rod has pi^2.
-NEUTRAL = 1e-6
-# Where that is not enough, the shift starts with FIRST_SHIFT and grows by SHIFT_GROWTH until the Hessian is definite.
+# Where the shift by NEUTRAL is not enough, it starts with FIRST_SHIFT and grows by SHIFT_GROWTH until the Hessian is
+# definite.
 FIRST_SHIFT = 1.0
 SHIFT_GROWTH = 4.0
 MAX_FACTORS = 30
@@ -90,8 +88,7 @@ class _State(eqx.Module):
 
 def is_stable(form: MixedForm, point: MixedPoint) -> Bool[Array, ""]:
     """Whether the energy has no negative curvature at an equilibrium, neutral modes apart."""
-    shift = jnp.asarray(NEUTRAL / point.tangents.shape[1], point.tangents.dtype)
-    return factor(form.linearized(point).system.shifted(shift)).is_minimum
+    return factor(form.regular(form.linearized(point).system)).is_minimum
 
 
 def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMinimum:
@@ -134,7 +131,7 @@ def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMi
         least = jnp.asarray(NEUTRAL, dtype)
         first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
         may_push = (state.pushes == 0) | is_balanced
-        pattern = jnp.sum(here.bases * _generic_field(point.tangents)[:, None], axis=0)
+        pattern = components(here.bases, _generic_field(point.tangents))
 
         def is_indefinite(attempt) -> Bool[Array, ""]:
             _, is_definite, _, _, count = attempt

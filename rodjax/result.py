@@ -1,0 +1,182 @@
+"""What a solve gives: the equilibrium of a scene, and how far it is to be believed."""
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import is_known
+from rodjax.discretization.edges import EdgeTangents
+from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
+from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.results import positions_between
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.tangent_field import TangentField
+from rodjax.guess import cubic
+from rodjax.scene import Scene, nondimensional
+from rodjax.status import Status
+from rodjax.units import Units
+
+
+class NotConvergedWarning(UserWarning):
+    """A solve ended without an equilibrium; the message says why."""
+
+
+class SolverState(eqx.Module):
+    """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
+
+    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements; `end_force`: the force at s = L between
+    held ends, else zero.
+    """
+
+    shape: Shape
+    end_force: Float[Array, "... 3"]
+    units: Units
+
+
+class Equilibrium(eqx.Module):
+    """The equilibrium of a scene, or several of them along a leading axis `...` of every field.
+
+    Forces and moments are what the part of the rod beyond s exerts on the part before it, global axes, moments about
+    the centerline: at s = L what the support applies to the rod, at s = 0 the reverse of it.
+
+    - `s` [..., n+1] arclength of the nodes, m
+    - `nodes` [..., n+1, 3] centerline, m
+    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
+    - `curvature` [..., n+1] |t x t'|, 1/m
+    - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
+    - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of a dead
+      moment depends on the way and is left out; `elastic_energy` [...] J
+    - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
+    - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
+    - `stable` [...] bool: converged, and the energy has no negative curvature there; with a dead moment, which has no
+      potential, this is not examined and False
+    - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
+      a step of a path took: 1, or more where it was split
+    - `residual` [...] largest component of the gradient, in EI/L^2
+    - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; computed when it
+      is asked for
+    - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
+    - `state`: what a solve that begins from here takes over
+    """
+
+    s: Float[Array, "... n+1"]
+    nodes: Float[Array, "... n+1 3"]
+    frames: Float[Array, "... n+1 3 3"]
+    curvature: Float[Array, "... n+1"]
+    twist: Float[Array, "... n+1"]
+    total_twist: Float[Array, "..."]
+    tension: Float[Array, "... n+1"]
+    axial_strain: Float[Array, "... n+1"]
+    energy: Float[Array, "..."]
+    elastic_energy: Float[Array, "..."]
+    start_force: Float[Array, "... 3"]
+    start_moment: Float[Array, "... 3"]
+    end_force: Float[Array, "... 3"]
+    end_moment: Float[Array, "... 3"]
+    converged: Bool[Array, "..."]
+    stable: Bool[Array, "..."]
+    status: Int[Array, "..."]
+    iterations: Int[Array, "..."]
+    evaluations: Int[Array, "..."]
+    substeps: Int[Array, "..."]
+    residual: Float[Array, "..."]
+    scene: Scene
+    state: SolverState
+    discretization: str = eqx.field(static=True)
+
+    @property
+    def tangents(self) -> Float[Array, "... n+1 3"]:
+        return self.frames[..., 2]
+
+    @property
+    def error_estimate(self) -> Float[Array, "..."]:
+        errors = estimated_errors(self).nodes
+        return jnp.sqrt(jnp.max(jnp.sum(errors**2, axis=-1), axis=-1))
+
+    def position_at(self, s: Any) -> Float[Array, "... k 3"]:
+        """Centerline at arclengths `s` (k,) [m] from 0 to L, [..., k, 3].
+
+        Between the nodes of elements a polynomial of fifth degree by position, tangent and curvature, as accurate as
+        the nodes; between those of finite differences a cubic.
+
+        Raises `ValueError` where an arclength lies beyond the rod.
+        """
+        s = jnp.atleast_1d(jnp.asarray(s, self.s.dtype))
+        if is_known(s, self.s):
+            length = float(np.min(self.s[..., -1]))
+            if np.any(s < 0) or np.any(s > length):
+                raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
+        return _positions_at(self, s)
+
+
+def over_leading_axes(function: Callable) -> Callable:
+    """The function of one equilibrium as one of any number of them, compiled."""
+
+    @functools.wraps(function)
+    def mapped(equilibrium: Equilibrium, *shared: Any):
+        mapped = function
+        for _ in range(equilibrium.s.ndim - 1):
+            mapped = jax.vmap(mapped, in_axes=(0, *[None] * len(shared)))
+        return mapped(equilibrium, *shared)
+
+    return jax.jit(mapped)
+
+
+@over_leading_axes
+def estimated_errors(equilibrium: Equilibrium) -> Errors:
+    """How far the equilibrium is from the continuum; of the continuum itself not a number."""
+    state = equilibrium.state
+    if equilibrium.discretization == "continuum":
+        return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), None)
+    if isinstance(state.shape, Curve):
+        return errors_of_elements(*_form_and_point(equilibrium))
+    return errors_of_differences(*_form_and_point(equilibrium), state.shape.nodes, equilibrium.tangents.T)
+
+
+@over_leading_axes
+def _positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    if not isinstance(equilibrium.state.shape, Curve):
+        slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
+        return cubic(equilibrium.s, equilibrium.nodes, slopes, s)
+    units = equilibrium.state.units
+    form, point = _form_and_point(equilibrium)
+    positions = positions_between(form, point, equilibrium.state.shape.nodes, s / units.length)
+    return units.origin[None] + units.length * positions
+
+
+def _form_and_point(equilibrium: Equilibrium) -> tuple[MixedForm, MixedPoint]:
+    scaled, _ = nondimensional(equilibrium.scene)
+    state = equilibrium.state
+    point = MixedPoint(state.shape.unknown_tangents, state.end_force, equilibrium.total_twist)
+    return MixedForm.of(scaled, field_of(scaled, state.shape)), point
+
+
+def field_of(scene: Scene, shape: Shape) -> TangentField:
+    if isinstance(shape, Curve):
+        return HermiteElements.of(scene, shape.s)
+    return EdgeTangents.of(scene, len(shape.nodes) - 1)
+
+
+def describe(equilibrium: Equilibrium) -> str:
+    """How a solve ended, in words; for several, each outcome with its count."""
+    codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
+    if equilibrium.status.ndim == 0:
+        return (
+            f"{Status(codes[0]).message}; residual {float(equilibrium.residual):.1e} EI/L^2 "
+            f"after {int(equilibrium.iterations)} iterations"
+        )
+    return "\n".join(f"{count} {Status(code).message}" for code, count in zip(codes, counts, strict=True))
+
+
+def warn_if_not_converged(equilibrium: Equilibrium) -> None:
+    if is_known(equilibrium.converged) and not np.all(equilibrium.converged):
+        warnings.warn(describe(equilibrium), NotConvergedWarning, stacklevel=3)

@@ -1,0 +1,136 @@
+"""Derivatives of a solve: against differences, both ways, again, under vmap; and where there is none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import loaded_scenes
+
+import rodjax as rj
+from rodjax import Clamp, Free, PointForce, Scene, Swivel, frame, problems, rotate
+
+SEGMENTS = 8
+TIGHT = rj.Newton(tolerance=1e-12)
+SCENES = loaded_scenes()
+
+
+def moved(scene: Scene, by: dict[str, jax.Array]) -> Scene:
+    """The scene with all of its numbers changed."""
+    rod = jax.tree.map(
+        lambda leaf, change: leaf * (1 + change),
+        scene.rod,
+        jax.tree.unflatten(jax.tree.structure(scene.rod), list(by["rod"][: len(jax.tree.leaves(scene.rod))])),
+    )
+
+    def support(end, by):
+        if isinstance(end, Free):
+            force = None if end.force is None else end.force * (1 + by[0])
+            return Free(force, None if end.moment is None else end.moment * (1 + by[1]))
+        position = end.position + by[2:5]
+        if isinstance(end, Clamp):
+            return Clamp(position, rotate(end.frame, by[5:8]))
+        return Swivel(position, end.tangent + by[5:8]) if isinstance(end, Swivel) else rj.Pin(position)
+
+    gravity = None if scene.gravity is None else scene.gravity + by["gravity"]
+    forces = [PointForce(load.at * (1 + by["at"][0]), load.force * (1 + by["at"][1])) for load in scene.point_forces]
+    return Scene(rod, support(scene.start, by["start"]), support(scene.end, by["end"]), gravity, forces)
+
+
+def changes(seed: int) -> dict[str, jax.Array]:
+    rng = np.random.default_rng(seed)
+    sizes = {"rod": 6, "start": 8, "end": 8, "gravity": 3, "at": 2}
+    return {name: jnp.asarray(rng.uniform(-0.1, 0.1, size)) for name, size in sizes.items()}
+
+
+def fields(result: rj.Equilibrium, EI: float) -> jax.Array:
+    """In units of L = 1 m and EI/L."""
+    parts = [result.nodes, result.frames, result.curvature, result.twist, result.total_twist, result.axial_strain]
+    in_newton = [result.tension, result.start_force, result.start_moment, result.end_force, result.end_moment]
+    in_newton += [result.energy, result.elastic_energy, result.position_at([0.3, 0.7])[0] * EI]
+    return jnp.concatenate([jnp.ravel(part) for part in parts] + [jnp.ravel(part) / EI for part in in_newton])
+
+
+@pytest.mark.parametrize(
+    ("name", "discretization"),
+    [
+        ("cantilever", "finite_difference"),
+        pytest.param("clamps", "finite_difference", marks=pytest.mark.slow),
+        pytest.param("clamps", "hermite", marks=pytest.mark.slow),
+        pytest.param("pins", "hermite", marks=pytest.mark.slow),
+        pytest.param("start moment", "hermite", marks=pytest.mark.slow),
+    ],
+)
+def test_all_fields_by_all_numbers_of_a_scene(name, discretization):
+    scene = SCENES[name]
+    EI = float(scene.rod.EI)
+    options = {"segments": SEGMENTS, "discretization": discretization, "solver": TIGHT}
+    base = rj.solve(scene, **options)
+    direction = changes(0)
+
+    def along(by):
+        return fields(rj.solve(moved(scene, by), guess=base, **options), EI)
+
+    @jax.jit
+    def both(direction, weights):
+        nowhere = jax.tree.map(jnp.zeros_like, direction)
+        values, change = jax.jvp(along, (nowhere,), (direction,))
+        return values, change, jax.vjp(along, nowhere)[1](weights)[0]
+
+    at = jax.jit(lambda h: along(jax.tree.map(lambda change: h * change, direction)))
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=fields(base, EI).shape))
+    values, change, by_weights = both(direction, weights)
+    h = 2e-3
+    expected = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+    # Differences of fourth order: h^4 of the fifth derivative, and 1e-12/h of the residual. Seen: 1e-8.
+    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-6 * float(np.max(np.abs(expected))))
+    np.testing.assert_allclose(values, fields(base, EI), rtol=0, atol=1e-11 * float(np.max(np.abs(values))))
+    backwards = sum(jnp.sum(by_weights[key] * direction[key]) for key in direction)
+    np.testing.assert_allclose(backwards, jnp.sum(weights * change), rtol=1e-10)  # roundings
+
+
+def height(load: jax.Array) -> jax.Array:
+    """Of the tip of a cantilever under a transverse load in EI/L^2."""
+    rod = problems.cable()
+    force = load * rod.EI * jnp.array([0.0, 0.0, -1.0])
+    scene = Scene(rod, Clamp((0, 0, 0), frame((1, 0, 0))), Free(force=force))
+    return rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", solver=TIGHT).nodes[-1, 2]
+
+
+def test_second_derivatives_and_batches():
+    loads = jnp.array([1.0, 2.0, 4.0])
+    slopes = jax.jit(jax.vmap(jax.grad(height)))(loads)
+    bends = jax.jit(jax.vmap(jax.grad(jax.grad(height))))(loads)
+    h = 1e-2
+    for load, slope, bend in zip(loads, slopes, bends, strict=True):
+        low, middle, high = (height(load + shift) for shift in (-h, 0.0, h))
+        # Second order in h: 1e-4 of a third and fourth derivative below 0.1.
+        assert float(slope) == pytest.approx(float(high - low) / (2 * h), abs=1e-5)
+        assert float(bend) == pytest.approx(float(high - 2 * middle + low) / h**2, abs=1e-5)
+    assert jax.hessian(height)(loads[0]) == pytest.approx(float(bends[0]), rel=1e-9)  # the other way, roundings
+
+
+def test_no_derivative_where_nothing_converged():
+    def tip(load):
+        rod = problems.cable()
+        scene = Scene(rod, Clamp((0, 0, 0), frame((1, 0, 0))), Free(force=load * rod.EI * jnp.array([0.0, 0.0, -1.0])))
+        few = rj.Newton(max_iterations=1)
+        result = rj.solve(scene, segments=SEGMENTS, discretization="finite_difference", solver=few)
+        return result.nodes[-1, 2], result.converged
+
+    with pytest.warns(rj.NotConvergedWarning):
+        derivative, converged = jax.grad(tip, has_aux=True)(10.0)
+    assert not converged
+    assert np.isnan(derivative)
+
+
+def test_rotate():
+    turned = rotate(frame((1, 0, 0)), (0.0, 0.0, np.pi / 2))
+    np.testing.assert_allclose(turned[:, 2], (0, 1, 0), atol=1e-15)
+    tiny = rotate(jnp.eye(3), (0.0, 0.00999, 0.0)), rotate(jnp.eye(3), (0.0, 0.01001, 0.0))
+    # On both sides of where the series takes over.
+    for matrix, angle in zip(tiny, (0.00999, 0.01001), strict=True):
+        np.testing.assert_allclose(matrix[0], (np.cos(angle), 0, np.sin(angle)), rtol=1e-14)
+    generator = jax.jacobian(lambda vector: rotate(jnp.eye(3), vector))(jnp.zeros(3))
+    np.testing.assert_array_equal(generator[..., 2], [[0, -1, 0], [1, 0, 0], [0, 0, 0]])
+    with pytest.raises(ValueError, match="rotation_vector must be numbers of shape"):
+        rotate(np.eye(3), (1, 2))

@@ -2,6 +2,7 @@
 
 Cantilevers, roll-up, heavy and clamped elasticas, the catenary, critical loads, localised helical buckling and Fig. 1
 of Linn & Stephan (2008), each beside its reference, with the error and the time of a solve: a table and its picture.
+Then two experiments of cosseratbench, scored by its own runner (`pip install 'rodjax[cosseratbench]'`).
 
     python experiments/validation.py [--segments 64] [--only cantilever ring] [--out docs]
 
@@ -12,13 +13,17 @@ minimum that the solver finds. (An unstable equilibrium it leaves by itself.)
 
 import argparse
 import functools
+import importlib
+import importlib.metadata
+import importlib.util
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -450,10 +455,76 @@ BENCHMARKS = {
     "figure_1": figure_1,
 }
 
+# --- cosseratbench ----------------------------------------------------------------------------------------------------
+
+OUTSIDE = "cosseratbench"
+# Experiment, its metric, and the errors stored in its repository (results-0.2); PyElastica 1.0.0 and MuJoCo 3.3.7 give
+# the same with version 0.3.0.
+STORED = {
+    ("cantilever", "tip_deflection_error"): {"PyElastica": 0.07312799512904854, "MuJoCo": 0.07405950060375971},
+    ("catenary", "shape_error"): {"PyElastica": 0.0004517862135954216, "MuJoCo": 0.0032933953034652084},
+    ("catenary", "sag_error"): {"PyElastica": 0.0001371069508865984, "MuJoCo": 0.012257527995285285},
+}
+# The reference of the catenary has no bending stiffness: divided by these numbers, it fades from ours.
+DIVISORS = (10, 100, 1000)
+
+
+class Score(NamedTuple):
+    """A line of the second table: a metric of cosseratbench, relative to its reference, of a shape to the length."""
+
+    experiment: str
+    metric: str
+    solver: str
+    segments: int
+    error: float
+    bound: float = math.inf
+
+
+def scores() -> list[Score]:
+    """Of what `STORED` names, on its own meshes."""
+    bench, registry = importlib.import_module(OUTSIDE), importlib.import_module(f"{OUTSIDE}.registry")
+    adapter: Any = importlib.import_module("rodjax.cosseratbench")
+
+    class Softer(adapter.RodjaxSolver):
+        def __init__(self, divisor: int):
+            super().__init__()
+            self.divisor = divisor
+
+        def scene(self, scenario: Any, segments: int) -> Scene:
+            scene = super().scene(scenario, segments)
+            return eqx.tree_at(lambda scene: scene.rod.EI, scene, scene.rod.EI / self.divisor)
+
+    experiments = {name: registry.load_experiment(name) for name, _ in STORED}
+    runs = {name: bench.run(experiment, adapter.RodjaxSolver()) for name, experiment in experiments.items()}
+    softer = {divisor: bench.run(experiments["catenary"], Softer(divisor)) for divisor in DIVISORS}
+
+    rod = experiments["cantilever"].scenario.rods[0]
+    load = -rod.loads[0].force[2] * rod.length**2 / (rod.material.youngs_modulus * rod.second_moment_of_area)
+    linear, exact = load / 3, cantilever_tip(load)[0]
+    tip = -float(runs["cantilever"].trajectory.positions[0][-1, -1, 2])
+
+    found = []
+    for (name, metric), stored in STORED.items():
+        errors = stored | {"rodjax": runs[name].metrics[metric]}
+        if name == "cantilever":
+            last = "rodjax, against the exact elastica"
+            errors |= {"the exact elastica": abs(exact - linear) / linear, last: abs(tip - exact) / exact}
+        else:
+            errors |= {f"rodjax, EI/{divisor}": run.metrics[metric] for divisor, run in softer.items()}
+            last = f"rodjax, EI/{DIVISORS[-1]}"
+        n = experiments[name].n_elements
+        found += [
+            Score(name, metric, solver, n, error, BOUND if solver == last else math.inf)
+            for solver, error in errors.items()
+        ]
+    return found
+
+
 # --- table and picture ------------------------------------------------------------------------------------------------
 
 HEADINGS = ("source", "quantity", "case", "reference", "ours", "error", "N", "ms")
 WIDTHS = (32, 21, 34, 15, 15, 13, 5, 8)
+SCORE_WIDTHS = (12, 24, 37, 5, 12)
 
 INTRODUCTION = """\
 # Validation
@@ -500,6 +571,24 @@ load, the median of the solves of its bisection.
 
 """
 
+SCORES_HEADING = "## cosseratbench\n"
+SCORES = (
+    SCORES_HEADING
+    + """
+Two experiments of [cosseratbench](https://github.com/jakeryderv/cosseratbench) {version}, an outside benchmark of rod
+solvers, by its own runner, meshes and metrics; rodjax takes part by `rodjax.cosseratbench`. Its other experiments need
+dynamics, contact or several rods.
+
+- what must hold, of the last line of each metric: {bound:.0e}; beyond it, marked (!): {beyond}
+- *Cantilever*: the reference, F L³/(3 EI), is linear. The exact elastica (elliptic integrals, as above) differs from it
+  by as much as rodjax does, on any mesh. What is left beside it is the extension, which it lacks: with EA ten thousand
+  times as large, 3e-10. PyElastica and MuJoCo hold the first element rigid.
+- *Catenary*: the reference has no bending stiffness. What bending changes falls with EI, and with it the error. With an
+  odd number of elements no node is at the lowest point, which adds to `sag_error`.
+
+"""
+)
+
 
 def cells(row: Row) -> tuple[str, ...]:
     mark = "" if row.error <= row.bound else " (!)"
@@ -511,6 +600,29 @@ def line(cells: Sequence[str]) -> str:
     return "".join(
         f"{cell:{'<' if k < 3 else '>'}{width}}" for k, (cell, width) in enumerate(zip(cells, WIDTHS, strict=True))
     )
+
+
+def score_cells(score: Score) -> tuple[str, ...]:
+    mark = "" if score.error <= score.bound else " (!)"
+    return score.experiment, f"`{score.metric}`", score.solver, str(score.segments), f"{score.error:.1e}{mark}"
+
+
+def scores_markdown(scores: Sequence[Score]) -> str:
+    beyond = [f"{score.experiment}, {score.metric}" for score in scores if not score.error <= score.bound]
+    version = importlib.metadata.version(OUTSIDE)
+    text = SCORES.format(version=version, bound=BOUND, beyond="; ".join(beyond) or "none")
+    headings = ("experiment", "metric", "solver", "N", "error")
+    return text + table([headings, ("---", "---", "---", "---:", "---:"), *map(score_cells, scores)])
+
+
+def stored_scores(file: Path) -> str:
+    """The section of scores as the file has it."""
+    text = file.read_text() if file.exists() else ""
+    return text[text.index(SCORES_HEADING) :] if SCORES_HEADING in text else ""
+
+
+def table(rows: Iterable[Sequence[str]]) -> str:
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -526,8 +638,7 @@ def markdown(rows: Sequence[Row]) -> str:
         beyond="; ".join(beyond) or "none",
         conditions=conditions(),
     )
-    table = [HEADINGS, ("---", "---", "---", *["---:"] * 5), *map(cells, rows)]
-    return introduction + "\n".join(f"| {' | '.join(row)} |" for row in table) + "\n"
+    return introduction + table([HEADINGS, ("---", "---", "---", *["---:"] * 5), *map(cells, rows)])
 
 
 def picture(rows: Sequence[Row]) -> Figure:
@@ -566,11 +677,23 @@ def picture(rows: Sequence[Row]) -> Figure:
     return figure
 
 
+def outside_scores() -> list[Score] | None:
+    """Printed; `None` where cosseratbench is not installed, so that the stored ones are kept."""
+    if importlib.util.find_spec(OUTSIDE) is None:
+        print(f"skipped, not installed: {OUTSIDE}")
+        return None
+    found = scores()
+    for score in found:
+        print("".join(f"{cell:<{width}}" for cell, width in zip(score_cells(score), SCORE_WIDTHS, strict=True)))
+    return found
+
+
 def main(argv: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     mesh = f"a multiple of 4; {HEAVY_FINER} times as many for the heavy elastica, {HELIX_FINER} for the long helix"
     parser.add_argument("--segments", type=int, default=64, help=mesh)
-    parser.add_argument("--only", nargs="+", choices=list(BENCHMARKS), default=list(BENCHMARKS))
+    everything = [*BENCHMARKS, OUTSIDE]
+    parser.add_argument("--only", nargs="+", choices=everything, default=everything)
     parser.add_argument("--out", type=Path, help="folder for validation.md and validation.png")
     options = parser.parse_args(argv)
     if options.segments < 8 or options.segments % 4:
@@ -580,13 +703,18 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
     print(line(HEADINGS))
     rows: list[Row] = []
     for name in options.only:
+        if name == OUTSIDE:
+            continue
         found = BENCHMARKS[name](options.segments)
         print("\n".join(line(cells(row)) for row in found), flush=True)
         rows += found
         jax.clear_caches()  # programs that are not needed again: they take memory maps, of which there are 65530
+    outside = outside_scores() if OUTSIDE in options.only else None
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "validation.md").write_text(markdown(rows))
+        file = options.out / "validation.md"
+        section = stored_scores(file) if outside is None else scores_markdown(outside)
+        file.write_text(markdown(rows) + ("\n" + section if section else ""))
         picture(rows).savefig(options.out / "validation.png", dpi=110)
     return rows
 

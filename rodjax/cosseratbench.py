@@ -1,0 +1,96 @@
+"""rodjax as a solver of cosseratbench, a benchmark of rod solvers (`pip install 'rodjax[cosseratbench]'`).
+
+cosseratbench finds `RodjaxSolver` by its entry point: `cosseratbench run cantilever catenary --solver rodjax`.
+"""
+
+import importlib
+from typing import Any
+
+import jax
+import numpy as np
+
+import rodjax
+from rodjax.supports import Support
+
+# Not by `import`: where it is not installed, a type checker takes this very file for it.
+bench: Any = importlib.import_module("cosseratbench")
+
+
+class RodjaxSolver:
+    """The equilibrium of one rod between ends that do not move: the first frame is the given shape, all others are it.
+
+    `scenario` and what `run` returns are a `Scenario` and a `Trajectory` of cosseratbench. Its runner reports as
+    unsupported what raises `NotImplementedError` here: dynamics, several rods, driven ends.
+    """
+
+    name = "rodjax"
+    backend_version = rodjax.__version__
+    capabilities = frozenset({bench.Capability.STRETCH})
+
+    def __init__(self, time_step_scale: float = 1.0):
+        # There is no time step; taken for a sweep over those of all solvers.
+        del time_step_scale
+
+    def settings(self, scenario: Any, *, n_elements: int, n_frames: int) -> dict[str, str]:
+        return {"method": "equilibrium by Newton's method, no time step", "discretization": "Hermite elements"}
+
+    def run(self, scenario: Any, *, n_elements: int, n_frames: int) -> Any:
+        with jax.enable_x64(True):
+            scene, rod = self.scene(scenario, n_elements), scenario.rods[0]
+            # The given shape is free of twist.
+            result = rodjax.solve(scene, segments=n_elements, guess=rodjax.Guess(rod.nodes(n_elements)))
+        if not result.converged:
+            raise bench.Diverged(f"rodjax: {rodjax.describe(result)}")
+        still = n_frames - 1
+        nodes = np.stack([rod.nodes(n_elements), *[np.asarray(result.nodes)] * still])
+        directions = np.stack([rod.directors(n_elements), *[directors(rod, result)] * still])
+        return bench.Trajectory(np.linspace(0.0, scenario.duration, n_frames), (nodes,), (directions,))
+
+    def scene(self, scenario: Any, segments: int) -> rodjax.Scene:
+        if not scenario.quasi_static:
+            raise NotImplementedError("dynamics")
+        if len(scenario.rods) != 1:
+            raise NotImplementedError("several rods")
+        rod = scenario.rods[0]
+        if rod.start_motion is not None or rod.end_motion is not None:
+            raise NotImplementedError("driven ends")
+        material = rod.material
+        body = rodjax.Rod.circular(
+            rod.length,
+            rod.radius,
+            material.youngs_modulus,
+            shear_modulus=material.shear_modulus,
+            density=material.density,
+        )
+        gravity = scenario.gravity if any(scenario.gravity) else None
+        start, end = (support(rod, end, segments) for end in (bench.End.START, bench.End.END))
+        return rodjax.Scene(body, start, end, gravity=gravity)
+
+
+def support(rod: Any, end: Any, segments: int) -> Support:
+    """What holds an end as the scenario has it; a load on a held end moves nothing."""
+    k = 0 if end is bench.End.START else -1
+    condition = rod.condition(end)
+    if condition is bench.EndCondition.FREE:
+        forces = [load.force for load in rod.loads if load.at is end]
+        return rodjax.Free(force=np.sum(forces, axis=0) if forces else None)
+    position = rod.centerline[k]
+    if condition is bench.EndCondition.PINNED:
+        return rodjax.Pin(position)
+    tangent = np.diff(np.asarray(rod.centerline), axis=0)[k]
+    d1 = rod.directors(segments)[k]
+    return rodjax.Clamp(position, rodjax.frame(tangent, np.cross(tangent, d1)))
+
+
+def directors(rod: Any, result: rodjax.Equilibrium) -> np.ndarray:
+    """d1 at right angles to the edges between the nodes (n, 3).
+
+    Without a clamp the rod is free to spin, and free of twist: as the given shape, it begins with `rod.normal`.
+    """
+    nodes = np.asarray(result.nodes)
+    if bench.EndCondition.CLAMPED not in (rod.start, rod.end):
+        return bench.scenario.parallel_transport(nodes, np.asarray(rod.normal, float))
+    d1 = np.asarray(result.frames)[:, :, 0]
+    middle, edges = d1[:-1] + d1[1:], np.diff(nodes, axis=0)
+    middle -= np.sum(middle * edges, axis=1, keepdims=True) / np.sum(edges**2, axis=1, keepdims=True) * edges
+    return middle / np.linalg.norm(middle, axis=1, keepdims=True)

@@ -1,0 +1,80 @@
+"""rodjax in cosseratbench, an outside benchmark of rod solvers: by its entry points, its runner and its metrics."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
+
+bench = pytest.importorskip("cosseratbench")
+registry = pytest.importorskip("cosseratbench.registry")
+
+
+def adapter():
+    return registry.load_solver("rodjax")
+
+
+def elastica_tip(load: float) -> float:
+    """Deflection over length of an inextensible cantilever, `load` = P L^2/EI (Bisshopp & Drucker 1945)."""
+
+    def amplitude(m):
+        return math.asin(1 / math.sqrt(2 * m))
+
+    m = brentq(lambda m: ellipk(m) - ellipkinc(amplitude(m), m) - math.sqrt(load), 0.5 + 1e-12, 1 - 1e-12, xtol=1e-15)
+    return 1 - 2 * (ellipe(m) - ellipeinc(amplitude(m), m)) / math.sqrt(load)
+
+
+def test_it_finds_rodjax():
+    assert "rodjax" in registry.names(registry.SOLVERS)
+    # Sweeps of the time step give this to every solver.
+    assert isinstance(registry.load_solver("rodjax", time_step_scale=2.0), bench.Solver)
+
+
+def test_the_tip_of_the_cantilever_is_that_of_the_elastica():
+    experiment = registry.load_experiment("cantilever")
+    result = bench.run(experiment, adapter())
+    assert result.outcome == "completed"
+    assert result.n_elements == 20
+    assert result.metrics["settling_residual"] == 0
+    # The reference is linear theory, which the elastica differs from by 4e-4.
+    load = 7.5e-3 / (1e6 * math.pi * 0.02**4 / 4)
+    linear, exact = load / 3, elastica_tip(load)
+    assert result.metrics["tip_deflection_error"] == pytest.approx((linear - exact) / linear, abs=1e-6)
+    # Extension by a pull of 6e-6 EA is left.
+    assert -result.trajectory.positions[0][-1, -1, 2] == pytest.approx(exact, rel=1e-6)
+
+
+def test_the_catenary_is_off_by_its_bending_stiffness():
+    experiment = registry.load_experiment("catenary")
+    result = bench.run(experiment, adapter())
+    assert result.outcome == "completed"
+    # Converged: 4.7e-4 and 3.8e-4 on any mesh, less in proportion to EI (experiments/validation.py).
+    assert result.metrics["shape_error"] == pytest.approx(4.73e-4, rel=0.01)
+    assert result.metrics["sag_error"] == pytest.approx(3.83e-4, rel=0.01)
+    start = experiment.scenario.rods[0]
+    np.testing.assert_allclose(result.trajectory.positions[0][0], start.nodes(50))
+    np.testing.assert_allclose(result.trajectory.directors[0][-1], [[0.0, 1.0, 0.0]] * 50, atol=1e-9)
+
+
+def test_directors_of_a_clamped_rod_turn_with_its_section():
+    experiment = registry.load_experiment("cantilever")
+    frames = bench.run(experiment, adapter(), n_elements=6, n_frames=3).trajectory
+    nodes, directors = frames.positions[0][-1], frames.directors[0][-1]
+    np.testing.assert_allclose(frames.directors[0][0], [[0.0, 0.0, 1.0]] * 6, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(directors, axis=1), 1.0)
+    np.testing.assert_allclose(np.sum(directors * np.diff(nodes, axis=0), axis=1), 0.0, atol=1e-15)
+    np.testing.assert_allclose(directors[:, 1], 0.0, atol=1e-12)
+
+
+def test_it_says_what_it_cannot_do():
+    experiment = registry.load_experiment("cantilever")
+
+    def missing(**changes):
+        scenario = dataclasses.replace(experiment.scenario, **changes)
+        return bench.run(dataclasses.replace(experiment, build=lambda: scenario), adapter()).missing
+
+    assert missing(quasi_static=False) == ("dynamics",)
+    assert missing(rods=experiment.scenario.rods * 2) == ("several rods",)
+    assert bench.run(registry.load_experiment("capstan"), adapter()).missing == ("cylinder_contact",)

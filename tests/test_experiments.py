@@ -184,7 +184,8 @@ def test_peers(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
     peers = script("peers")
     monkeypatch.setattr(peers, "FINE", (40, 80))  # compiles quicker, and is good for three digits
-    options = ["--problems", "P3", "--segments", "10", "--elements", "10", "--rounds", "1", "--repeats", "1"]
+    options = ["--problems", "P3", "--segments", "10", "--hermite", "6", "--elements", "10"]
+    options += ["--rounds", "1", "--repeats", "1"]
     rows = peers.main([*options, "--out", str(tmp_path)])
     assert rows[0].error == pytest.approx(8.84e-3, rel=0.01)
     with open(tmp_path / "peers.csv", newline="") as file:
@@ -209,3 +210,13 @@ def test_validation(tmp_path, capsys, monkeypatch):
     table = [line for line in (tmp_path / "validation.md").read_text().splitlines() if line.startswith("| ")]
     assert len(table) == 2 + 31
     assert (tmp_path / "validation.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_tolerance(capsys):
+    (row,) = script("tolerance").main(["--count", "2", "--rtol", "1e-3"])
+    assert (row.converged, row.judged, row.below) == (2, 2, 1.0)
+    assert row.worst <= 1.0
+    # Of the 200 scenes 90 % lie between 0.95 and 1.16.
+    assert 0.9 < row.estimate[0] <= row.estimate[1] < 1.2
+    assert "2 of 2" in capsys.readouterr().out

@@ -434,10 +434,12 @@ print(float(result.nodes[8, 2]))
 def test_the_rounding_floor_is_stated_only_where_it_is_above_the_tolerance(segments):
     scene = problems.hanging_cable()
     result = solve(scene, segments)
-    assert result.status == Status.CONVERGED
+    assert result.converged
     assert result.stable
     # The floor by rounding of tangents at a distance h/2: 4 eps (4 |n| + 16 n^2).
     floor = 4 * np.finfo(float).eps * (4 * 188 + 16 * segments**2)
+    if floor < 1e-8:
+        assert result.status == Status.CONVERGED
     lowest = solve(scene, segments, solver=rj.Newton(tolerance=0.0))
     assert lowest.status == Status.ROUNDING_FLOOR
     assert lowest.residual < 10 * floor  # STAGNATION

@@ -181,10 +181,11 @@ def test_next_size(segments, error, rtol, discretization, expected):
 @pytest.mark.parametrize(
     ("rtol", "discretization", "expected"),
     [
-        (1e-2, "hermite", 6),  # (300)^(1/4) = 4.2, and no mesh is coarser than the first
-        (1e-3, "hermite", 8),  # (3000)^(1/4) = 7.4
-        (1e-6, "hermite", 48),  # (3e6)^(1/4) = 42
-        (1e-3, "finite_difference", 64),  # (3000)^(1/2) = 55
+        (1.0, "hermite", 4),  # no mesh is coarser than the first
+        (1e-2, "hermite", 4),  # (200)^(1/4) = 3.8
+        (1e-3, "hermite", 8),  # (2000)^(1/4) = 6.7
+        (1e-6, "hermite", 48),  # (2e6)^(1/4) = 37.6
+        (1e-3, "finite_difference", 48),  # (2000)^(1/2) = 45
         (1e-9, "finite_difference", 4096),  # and none finer than the last
     ],
 )

@@ -81,8 +81,8 @@ def solve_continuum(
     - `rtol`: tolerance of the integration in s, relative to L, EI/L and EI.
     - `intervals`: of multiple shooting, besides those that point forces add; `None`: as many as keep the growth of
       errors in each modest, or 16 inside `jax.jit`.
-    - `segments`: the result is given at `segments` + 1 equally spaced arclengths, of which the nearest is moved to each
-        point force; `None`: as many as those of the guess, else 50.
+    - `segments`: the result is given at `segments` + 1 equally spaced arclengths, or moved so that one lies at each
+      point force; `None`: as many as those of the guess, else 50.
 
     At a point force the tension is that beyond it. `stable` is not examined and False; `residual` is the largest miss
     of a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest force and moment in the

@@ -49,6 +49,8 @@ DEFAULT_RTOL = 1e-3
 LEAST_RTOL = 1e-10
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
+# A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
+MOST_FAILURES = 3
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
@@ -111,10 +113,12 @@ def solve(
 
 def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
     """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`."""
+    failures = 0
     while True:
+        failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
         error = float(np.max(np.linalg.norm(errors.nodes, axis=1)))
-        if (bool(result.converged) and SAFETY * error <= rtol) or is_finest(options):
+        if (bool(result.converged) and SAFETY * error <= rtol) or is_finest(options) or failures == MOST_FAILURES:
             break
         options = options._replace(
             segments=next_size(options.segments, error if result.converged else np.nan, rtol, options.discretization)

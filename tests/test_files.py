@@ -173,6 +173,18 @@ def test_the_file_names_its_format_and_its_classes(saved):
     assert kinds == {"scene/start": "Clamp", "scene/end": "Clamp", "state/shape": "Curve"}
 
 
+@pytest.mark.parametrize("place", ["scene/start", "state/shape"])
+def test_a_group_of_no_known_kind_is_named(place, saved, tmp_path):
+    damaged = tmp_path / "damaged.vtkhdf"
+    damaged.write_bytes(saved.read_bytes())
+    for kind in ("Spring", None):
+        with h5py.File(damaged, "r+") as file:
+            attributes = file[f"rodjax/{place}"].attrs
+            attributes.update({"kind": kind}) if kind else attributes.pop("kind")
+        with pytest.raises(ValueError, match=f"says of /rodjax/{place} that it is {kind}; allowed are Clamp"):
+            load(damaged)
+
+
 def test_vtk_reads_the_polyline_and_its_data_at_every_step(equilibrium, tmp_path):
     save(equilibrium, tmp_path / "rod.vtkhdf")
     steps = read_steps(tmp_path / "rod.vtkhdf")

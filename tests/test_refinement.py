@@ -178,6 +178,15 @@ def test_next_size(segments, error, rtol, discretization, expected):
     assert next_size(segments, error, rtol, discretization) == expected
 
 
+def test_a_scene_that_does_not_converge_is_given_up():
+    few = rj.Newton(max_iterations=1)
+    with pytest.warns(rj.NotConvergedWarning, match="largest number of iterations"):
+        result = rj.solve(problems.hanging_cable(), rtol=1e-2, discretization="finite_difference", solver=few)
+    # Three meshes: 16 segments, twice as many each time.
+    assert not result.converged
+    assert result.s.shape == (65,)
+
+
 @pytest.mark.parametrize(
     ("rtol", "discretization", "expected"),
     [

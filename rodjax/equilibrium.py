@@ -271,15 +271,20 @@ class Found(eqx.Module):
 
 
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
-    """The one code path of every solve: from a state to where the solver stops."""
+    """The one code path of every solve: from a state to where the solver stops.
+
+    Differentiating the iterations would give numbers that look right and are not: `equilibrium` knows the derivatives.
+    """
+    scene, state, twist = jax.lax.stop_gradient((scene, state, twist))
     scaled, units = nondimensional(scene)
-    return _found(scaled, _in_units(state, units), twist, solver=options.solver, planar=options.planar)
+    return _found(scaled, _in_units(state, units), twist, options)
 
 
 def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
     """What a solver found, in SI units."""
-    scaled, _ = nondimensional(scene)
-    point, outcome, units = found.point, found.outcome, found.state.units
+    scaled, units = nondimensional(scene)
+    found = _following(scaled, found)
+    point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
     form = MixedForm.of(scaled, field_of(scaled, found.state.shape))
     results = resultants(form, point)
@@ -309,13 +314,13 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         substeps=substeps,
         residual=outcome.residual,
         scene=scene,
-        state=found.state,
+        state=SolverState(found.state.shape, found.state.end_force, units),
         discretization="hermite" if isinstance(form.field, HermiteElements) else "finite_difference",
     )
 
 
-@eqx.filter_custom_jvp
-def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver: Solver, planar: bool) -> Found:
+def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+    solver = options.solver
     form = MixedForm.of(scene, field_of(scene, guess.shape))
     if isinstance(solver, NonlinearCG):
         assert isinstance(guess.shape, Polyline)
@@ -326,7 +331,7 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], *, solver:
         return Found(state, point, minimum.outcome, is_stable(form, point))
     start, begin = _first_point(form, guess, twist)
     normal = None
-    if planar:
+    if options.planar:
         normal, axes = plane(scene, begin.tangents)
         begin = begin.flattened(axes)
         form = form.along(axes)
@@ -358,23 +363,27 @@ def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -
     return shape, MixedPoint(tangents, end_force, total_twist)
 
 
-@_found.def_jvp
-def _found_jvp(primals, tangents, *, solver: Solver, planar: bool):
-    """Differentiating the iterations would give numbers that look right and are not."""
-    scene, *_ = primals
-    scene_change, guess_change, _ = tangents
-    found = _found(*primals, solver=solver, planar=planar)
+@eqx.filter_custom_jvp
+def _following(scene: Scene, found: Found) -> Found:
+    """What was found, with the derivatives by the nondimensional scene that the search for it has not."""
+    return found
+
+
+@_following.def_jvp
+def _following_jvp(primals, tangents):
+    scene, found = primals
+    scene_change, _ = tangents
+    found = _following(scene, found)
     scene_change = jax.tree.map(
         lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
         scene_change,
         scene,
         is_leaf=lambda change: change is None,
     )
-    outcome = found.outcome
+    outcome, units = found.outcome, found.state.units
     shape, point = change(scene, scene_change, found.state.shape, found.point, is_converged(outcome.status))
-    state = SolverState(shape, point.end_force, guess_change.units)
-    nothing = jax.tree.map(lambda leaf: None, (outcome, found.is_stable))
-    return found, Found(state, point, *nothing)
+    nothing = jax.tree.map(lambda leaf: None, (units, outcome, found.is_stable))
+    return found, Found(SolverState(shape, point.end_force, nothing[0]), point, *nothing[1:])
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.

@@ -116,6 +116,9 @@ def _solve_path(
     scenes: Scene, state: SolverState, twist: Float[Array, ""], options: Options, progress: bool
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
+    # The way to the equilibria is not differentiated, which `equilibrium` does.
+    given, scenes = scenes, jax.lax.stop_gradient(scenes)
+    state, twist = jax.lax.stop_gradient((state, twist))
     meter = _progress_meter() if progress else None
     first = jax.tree.map(lambda leaf: leaf[0], scenes)
 
@@ -132,7 +135,7 @@ def _solve_path(
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return jax.vmap(equilibrium)(scenes, found, substeps)
+    return jax.vmap(equilibrium)(given, found, substeps)
 
 
 class _Station(eqx.Module):

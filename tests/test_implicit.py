@@ -109,6 +109,19 @@ def test_second_derivatives_and_batches():
     assert jax.hessian(height)(loads[0]) == pytest.approx(float(bends[0]), rel=1e-9)  # the other way, roundings
 
 
+def test_paths_both_ways():
+    rod = problems.cable()
+
+    def tip(load):
+        forces = [Free(force=part * load * rod.EI * jnp.array([0.0, 0.0, -1.0])) for part in (0.5, 1.0)]
+        scenes = [Scene(rod, Clamp((0, 0, 0), frame((1, 0, 0))), force) for force in forces]
+        path = rj.solve_path(scenes, segments=SEGMENTS, discretization="finite_difference", solver=TIGHT)
+        return path.nodes[-1, -1, 2]
+
+    forward, backward = jax.jvp(tip, (1.0,), (1.0,))[1], jax.grad(tip)(1.0)
+    np.testing.assert_allclose([forward, backward], jax.grad(height)(1.0), rtol=1e-10)  # roundings and residuals
+
+
 def test_no_derivative_where_nothing_converged():
     def tip(load):
         rod = problems.cable()

@@ -39,11 +39,11 @@ from rodjax.discretization.joints import (
 )
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
-from rodjax.equilibrium import Found, Options, equilibrium, first_state
+from rodjax.equilibrium import Options, first_state
 from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
 from rodjax.path import stack_scenes
 from rodjax.plane import plane
-from rodjax.result import SolverState
+from rodjax.result import Found, SolverState, equilibrium
 from rodjax.scene import nondimensional
 from rodjax.status import Outcome
 from rodjax.strain import swept_angle

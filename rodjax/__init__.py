@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from rodjax import problems
-from rodjax.compilation_cache import enable_compilation_cache
+from rodjax.compilation import enable_compilation_cache
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
 from rodjax.guess import Guess

@@ -9,24 +9,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, positive, whole_number
-from rodjax.discretization.dead_loads import energy_of_origin
+from rodjax.compilation import compiled
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import resultants
 from rodjax.discretization.shape import Shape
-from rodjax.energy import axial_strain_under
 from rodjax.guess import Guess, first_shape
-from rodjax.implicit import change
+from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
 from rodjax.refinement import SAFETY, SIZES, first_size, graded, next_size
 from rodjax.result import (
     Equilibrium,
+    Found,
     NotConvergedWarning,
     SolverState,
+    equilibrium,
     estimated_errors,
     field_of,
     warn_if_not_converged,
@@ -34,7 +34,7 @@ from rodjax.result import (
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
 from rodjax.solvers.newton import Newton, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
-from rodjax.status import Outcome, Status, is_converged
+from rodjax.status import Status
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -103,12 +103,13 @@ def solve(
             f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
-    options, rtol = checked_options(scene, segments, rtol, discretization, solver, guess, planar)
-    result = _solve(scene, *first_state(scene, guess, options), options)
+    fixed_scene, guess = not_differentiated(scene, guess)
+    options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar)
+    result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), options)
     if rtol is not None and is_known(result):
         result = _refined(result, options, rtol)
     warn_if_not_converged(result)
-    return result
+    return differentiable(scene, result)
 
 
 def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
@@ -148,7 +149,7 @@ def warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
         )
 
 
-@functools.partial(jax.jit, static_argnames=("options",))
+@functools.partial(compiled, static_argnames=("options",))
 def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Options) -> SolverState:
     """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
     state = coarse.state
@@ -241,7 +242,7 @@ def _kind(options: Options) -> type[Polyline] | type[Curve]:
     return Polyline if options.discretization == "finite_difference" else Curve
 
 
-@functools.partial(jax.jit, static_argnames=("options",))
+@functools.partial(compiled, static_argnames=("options",))
 def _first_state(
     scene: Scene, guess: Guess | Equilibrium | None, options: Options
 ) -> tuple[SolverState, Float[Array, ""]]:
@@ -261,62 +262,10 @@ def _first_state(
     return SolverState(shape, state.end_force, state.units), guess.total_twist
 
 
-class Found(eqx.Module):
-    """Where a solver stopped, nondimensional."""
-
-    state: SolverState
-    point: MixedPoint
-    outcome: Outcome
-    is_stable: Bool[Array, ""]
-
-
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
-    """The one code path of every solve: from a state to where the solver stops.
-
-    Differentiating the iterations would give numbers that look right and are not: `equilibrium` knows the derivatives.
-    """
-    scene, state, twist = jax.lax.stop_gradient((scene, state, twist))
+    """The one code path of every solve: from a state to where the solver stops."""
     scaled, units = nondimensional(scene)
     return _found(scaled, _in_units(state, units), twist, options)
-
-
-def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
-    """What a solver found, in SI units."""
-    scaled, units = nondimensional(scene)
-    found = _following(scaled, found)
-    point, outcome = found.point, found.outcome
-    nodes = found.state.shape.nodes
-    form = MixedForm.of(scaled, field_of(scaled, found.state.shape))
-    results = resultants(form, point)
-    elastic_energy = form.elastic_energy(point)
-    potential = elastic_energy + form.load_energy(point)
-    converged = is_converged(outcome.status)
-    return Equilibrium(
-        s=form.field.s * scene.rod.length,
-        nodes=units.origin[None] + units.length * nodes,
-        frames=results.frames,
-        curvature=results.curvature / units.length,
-        twist=results.twist / units.length,
-        total_twist=point.total_twist,
-        tension=results.tension * units.force,
-        axial_strain=axial_strain_under(scaled.rod, results.tension),
-        energy=units.energy * potential + energy_of_origin(scaled, units),
-        elastic_energy=units.energy * elastic_energy,
-        start_force=results.start_force * units.force,
-        start_moment=results.start_moment * units.energy,
-        end_force=results.end_force * units.force,
-        end_moment=results.end_moment * units.energy,
-        converged=converged,
-        stable=converged & found.is_stable,
-        status=outcome.status,
-        iterations=outcome.iterations,
-        evaluations=outcome.evaluations,
-        substeps=substeps,
-        residual=outcome.residual,
-        scene=scene,
-        state=SolverState(found.state.shape, found.state.end_force, units),
-        discretization="hermite" if isinstance(form.field, HermiteElements) else "finite_difference",
-    )
 
 
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
@@ -363,31 +312,8 @@ def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -
     return shape, MixedPoint(tangents, end_force, total_twist)
 
 
-@eqx.filter_custom_jvp
-def _following(scene: Scene, found: Found) -> Found:
-    """What was found, with the derivatives by the nondimensional scene that the search for it has not."""
-    return found
-
-
-@_following.def_jvp
-def _following_jvp(primals, tangents):
-    scene, found = primals
-    scene_change, _ = tangents
-    found = _following(scene, found)
-    scene_change = jax.tree.map(
-        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
-        scene_change,
-        scene,
-        is_leaf=lambda change: change is None,
-    )
-    outcome, units = found.outcome, found.state.units
-    shape, point = change(scene, scene_change, found.state.shape, found.point, is_converged(outcome.status))
-    nothing = jax.tree.map(lambda leaf: None, (units, outcome, found.is_stable))
-    return found, Found(SolverState(shape, point.end_force, nothing[0]), point, *nothing[1:])
-
-
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
-@functools.partial(jax.jit, static_argnames=("options",))
+@functools.partial(compiled, static_argnames=("options",))
 def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Equilibrium:
     return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int))
 

@@ -6,65 +6,125 @@ border, says which rotations and forces take it away: O(n). All of it is made of
 derivative has derivatives itself, and a transpose.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.checks import is_known
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.linalg import factor
-from rodjax.result import field_of
-from rodjax.scene import Scene
+from rodjax.result import Equilibrium, Found, SolverState, equilibrium, field_of, form_and_point
+from rodjax.scene import Scene, nondimensional
+from rodjax.stability import Motion, is_critical, neutral_turn
+from rodjax.status import Outcome
 
 
-class Unknowns(eqx.Module):
-    """Rotations of the tangents away from a point, and the change of the force at s = L."""
-
-    rotation: Float[Array, "b m"]
-    force: Float[Array, "3"]
+def not_differentiated(*values: Any) -> tuple[Any, ...]:
+    """For a search: the derivatives of its iterations would be numbers that look right and are not."""
+    return values if is_known(values) else jax.lax.stop_gradient(values)
 
 
-def change(
-    scene: Scene, scene_change: Scene, shape: Shape, point: MixedPoint, is_equilibrium: Bool[Array, ""]
+def differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
+    """What a search found, with the derivatives by the scene that the search for it has not. Both may be stacks."""
+    return result if is_known(scene) else _differentiable(scene, result)
+
+
+@eqx.filter_custom_jvp
+def _differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
+    return result
+
+
+@_differentiable.def_jvp
+def _(primals, tangents):
+    scene, result = primals
+    scene_change, _ = tangents
+    scene_change = jax.tree.map(
+        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
+        scene_change,
+        scene,
+        is_leaf=lambda change: change is None,
+    )
+    # The value stays what the search found, whatever XLA makes of the same numbers beside the derivatives.
+    inputs = jax.lax.optimization_barrier((scene, _differentiable(scene, result)))
+    return result, _change_of_result(*inputs, scene_change)
+
+
+@jax.jit
+def _change_of_result(scene: Scene, result: Equilibrium, scene_change: Scene) -> Equilibrium:
+    mapped = _change_of_one
+    for _ in range(result.s.ndim - 1):
+        mapped = jax.vmap(mapped)
+    return mapped(scene, result, scene_change)
+
+
+def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Equilibrium:
+    shape = result.state.shape
+    outcome = Outcome(result.residual, result.iterations, result.evaluations, result.status)
+
+    def same(scene: Scene, shape: Shape, point: MixedPoint) -> Equilibrium:
+        units = nondimensional(scene)[1]
+        found = Found(SolverState(shape, point.end_force, units), point, outcome, result.stable)
+        return equilibrium(scene, found, result.substeps)
+
+    (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
+    _, point = form_and_point(result)
+    changes = _change(scaled, scaled_change, shape, point, result.converged, result.residual)
+    _, change = jax.jvp(same, (scene, shape, point), (scene_change, *changes))
+    return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
+
+
+def _change(
+    scene: Scene,
+    scene_change: Scene,
+    shape: Shape,
+    point: MixedPoint,
+    is_equilibrium: Bool[Array, ""],
+    residual: Float[Array, ""],
 ) -> tuple[Shape, MixedPoint]:
     """The change of shape and point of an equilibrium with that of its scene, nondimensional.
 
-    Not a number where the point is no equilibrium.
+    Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
     """
 
-    def form_and_point(scene: Scene, unknowns: Unknowns | None = None) -> tuple[MixedForm, MixedPoint]:
+    def form_and_point(scene: Scene, motion: Motion | None = None) -> tuple[MixedForm, MixedPoint]:
         """The point under other numbers of the scene, the tangents that supports hold with it."""
         form = MixedForm.of(scene, field_of(scene, shape))
         tangents = form.field.as_held(scene, point.tangents)
         begin = MixedPoint(tangents, point.end_force, form.twist_near(tangents, point.total_twist))
-        if unknowns is None:
+        if motion is None:
             return form, begin
         bases = form.field.basis(scene, form.bases(form.field.with_held(scene, tangents)))
-        return form, form.moved(begin, bases, unknowns.rotation, unknowns.force)
+        force_change = form.force_change(form.closure(motion.multipliers))
+        return form, form.moved(begin, bases, motion.rotation, force_change)
 
-    def residual(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+    def gradient(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         form, here = form_and_point(scene)
         linearization = form.linearized(here)
         return linearization.gradient, linearization.closure
 
-    def reached(scene: Scene, unknowns: Unknowns) -> tuple[Shape, MixedPoint]:
-        form, there = form_and_point(scene, unknowns)
+    def reached(scene: Scene, motion: Motion) -> tuple[Shape, MixedPoint]:
+        form, there = form_and_point(scene, motion)
         return shape.reached(form, there), there
 
-    form, here = form_and_point(scene)
-    system = form.linearized(here).system
-    _, (f, c) = jax.jvp(residual, (scene,), (scene_change,))
+    form, begin = form_and_point(scene)
+    here = form.linearized(begin)
+    factors = factor(form.regular(here.system))
+    fixed = jax.lax.stop_gradient((form, begin, here, factors, residual))
+    neutral = neutral_turn(*fixed[:3])
+    is_regular = is_equilibrium & ~is_critical(*fixed[:4], neutral, fixed[4])
+    _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
     # A factor, as a choice between numbers would leave the transpose without the one that is none.
-    sign = jnp.where(is_equilibrium, -1.0, jnp.nan).astype(f.dtype)
+    sign = jnp.where(is_regular, -1.0, jnp.nan).astype(f.dtype)
     f, c = sign * f, sign * c
-    factors = factor(form.regular(system))
-    rotation, multipliers = factors.solve(f, c)
-    # The factors are those of a matrix shifted by what neutral modes need: once more, without.
-    left = system.times(rotation, multipliers)
-    correction = factors.solve(f - left[0], c - left[1])
-    rotation, multipliers = rotation + correction[0], multipliers + correction[1]
-    unknowns = Unknowns(rotation, form.force_change(form.closure(multipliers)))
-    nothing = jax.tree.map(jnp.zeros_like, unknowns)
-    _, changes = jax.jvp(reached, (scene, nothing), (scene_change, unknowns))
+    motion = Motion(*factors.solve(f, c)).without(neutral)
+    # The factors are those of a matrix shifted by what neutral motions need: once more, without.
+    left = here.system.times(motion.rotation, motion.multipliers)
+    correction = Motion(*factors.solve(f - left[0], c - left[1])).without(neutral)
+    motion = jax.tree.map(jnp.add, motion, correction)
+    nothing = jax.tree.map(jnp.zeros_like, motion)
+    _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
     return changes

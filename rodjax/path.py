@@ -11,22 +11,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace
+from rodjax.compilation import compiled
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Discretization,
-    Found,
     Options,
     Solver,
     checked_options,
-    equilibrium,
     first_state,
     is_finest,
     solve_from,
     warn_if_inaccurate,
 )
 from rodjax.guess import Guess
+from rodjax.implicit import differentiable, not_differentiated
 from rodjax.refinement import SAFETY, next_size
-from rodjax.result import Equilibrium, SolverState, warn_if_not_converged
+from rodjax.result import Equilibrium, Found, SolverState, equilibrium, warn_if_not_converged
 from rodjax.scene import Scene, between, nondimensional
 from rodjax.status import Outcome, is_converged
 
@@ -66,10 +66,11 @@ def solve_path(
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
-    options, rtol = checked_options(stacked, segments, rtol, discretization, solver, guess, planar)
-    first = jax.tree.map(lambda leaf: leaf[0], stacked)
+    fixed_scenes, guess = not_differentiated(stacked, guess)
+    options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar)
+    first = jax.tree.map(lambda leaf: leaf[0], fixed_scenes)
     while True:
-        path = _solve_path(stacked, *first_state(first, guess, options), options, progress)
+        path = _solve_path(fixed_scenes, *first_state(first, guess, options), options, progress)
         if rtol is None or not is_known(path):
             break
         errors = np.asarray(path.error_estimate)[np.asarray(path.converged)]
@@ -79,7 +80,7 @@ def solve_path(
             break
         options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
     warn_if_not_converged(path)
-    return path
+    return differentiable(stacked, path)
 
 
 def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
@@ -111,14 +112,11 @@ def _structure(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-@functools.partial(jax.jit, static_argnames=("options", "progress"))
+@functools.partial(compiled, static_argnames=("options", "progress"))
 def _solve_path(
     scenes: Scene, state: SolverState, twist: Float[Array, ""], options: Options, progress: bool
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
-    # The way to the equilibria is not differentiated, which `equilibrium` does.
-    given, scenes = scenes, jax.lax.stop_gradient(scenes)
-    state, twist = jax.lax.stop_gradient((state, twist))
     meter = _progress_meter() if progress else None
     first = jax.tree.map(lambda leaf: leaf[0], scenes)
 
@@ -135,7 +133,7 @@ def _solve_path(
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return jax.vmap(equilibrium)(given, found, substeps)
+    return jax.vmap(equilibrium)(scenes, found, substeps)
 
 
 class _Station(eqx.Module):

@@ -12,16 +12,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import is_known
+from rodjax.compilation import compiled
+from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import positions_between
+from rodjax.discretization.results import positions_between, resultants
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
+from rodjax.energy import axial_strain_under
 from rodjax.guess import cubic
+from rodjax.linalg import factor
 from rodjax.scene import Scene, nondimensional
-from rodjax.status import Status
+from rodjax.stability import is_critical, neutral_turn
+from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
 
@@ -64,6 +69,8 @@ class Equilibrium(eqx.Module):
     - `residual` [...] largest component of the gradient, in EI/L^2
     - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; computed when it
       is asked for
+    - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
+      are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
     - `state`: what a solve that begins from here takes over
     """
@@ -102,6 +109,10 @@ class Equilibrium(eqx.Module):
         errors = estimated_errors(self).nodes
         return jnp.sqrt(jnp.max(jnp.sum(errors**2, axis=-1), axis=-1))
 
+    @property
+    def critical(self) -> Bool[Array, "..."]:
+        return _is_critical(self)
+
     def position_at(self, s: Any) -> Float[Array, "... k 3"]:
         """Centerline at arclengths `s` (k,) [m] from 0 to L, [..., k, 3].
 
@@ -118,6 +129,53 @@ class Equilibrium(eqx.Module):
         return _positions_at(self, s)
 
 
+class Found(eqx.Module):
+    """Where a solver stopped, nondimensional."""
+
+    state: SolverState
+    point: MixedPoint
+    outcome: Outcome
+    is_stable: Bool[Array, ""]
+
+
+def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
+    """What a solver found, in SI units."""
+    scaled, units = nondimensional(scene)
+    point, outcome = found.point, found.outcome
+    nodes = found.state.shape.nodes
+    form = MixedForm.of(scaled, field_of(scaled, found.state.shape))
+    results = resultants(form, point)
+    elastic_energy = form.elastic_energy(point)
+    potential = elastic_energy + form.load_energy(point)
+    converged = is_converged(outcome.status)
+    return Equilibrium(
+        s=form.field.s * scene.rod.length,
+        nodes=units.origin[None] + units.length * nodes,
+        frames=results.frames,
+        curvature=results.curvature / units.length,
+        twist=results.twist / units.length,
+        total_twist=point.total_twist,
+        tension=results.tension * units.force,
+        axial_strain=axial_strain_under(scaled.rod, results.tension),
+        energy=units.energy * potential + energy_of_origin(scaled, units),
+        elastic_energy=units.energy * elastic_energy,
+        start_force=results.start_force * units.force,
+        start_moment=results.start_moment * units.energy,
+        end_force=results.end_force * units.force,
+        end_moment=results.end_moment * units.energy,
+        converged=converged,
+        stable=converged & found.is_stable,
+        status=outcome.status,
+        iterations=outcome.iterations,
+        evaluations=outcome.evaluations,
+        substeps=substeps,
+        residual=outcome.residual,
+        scene=scene,
+        state=SolverState(found.state.shape, found.state.end_force, units),
+        discretization="hermite" if isinstance(form.field, HermiteElements) else "finite_difference",
+    )
+
+
 def over_leading_axes(function: Callable) -> Callable:
     """The function of one equilibrium as one of any number of them, compiled."""
 
@@ -128,7 +186,7 @@ def over_leading_axes(function: Callable) -> Callable:
             mapped = jax.vmap(mapped, in_axes=(0, *[None] * len(shared)))
         return mapped(equilibrium, *shared)
 
-    return jax.jit(mapped)
+    return compiled(mapped)
 
 
 @over_leading_axes
@@ -138,8 +196,18 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
     if equilibrium.discretization == "continuum":
         return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), None)
     if isinstance(state.shape, Curve):
-        return errors_of_elements(*_form_and_point(equilibrium))
-    return errors_of_differences(*_form_and_point(equilibrium), state.shape.nodes, equilibrium.tangents.T)
+        return errors_of_elements(*form_and_point(equilibrium))
+    return errors_of_differences(*form_and_point(equilibrium), state.shape.nodes, equilibrium.tangents.T)
+
+
+@over_leading_axes
+def _is_critical(equilibrium: Equilibrium) -> Bool[Array, ""]:
+    if equilibrium.discretization == "continuum":
+        return jnp.array(False)
+    form, point = form_and_point(equilibrium)
+    here = form.linearized(point)
+    neutral = neutral_turn(form, point, here)
+    return is_critical(form, point, here, factor(form.regular(here.system)), neutral, equilibrium.residual)
 
 
 @over_leading_axes
@@ -148,12 +216,12 @@ def _positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array
         slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
         return cubic(equilibrium.s, equilibrium.nodes, slopes, s)
     units = equilibrium.state.units
-    form, point = _form_and_point(equilibrium)
+    form, point = form_and_point(equilibrium)
     positions = positions_between(form, point, equilibrium.state.shape.nodes, s / units.length)
     return units.origin[None] + units.length * positions
 
 
-def _form_and_point(equilibrium: Equilibrium) -> tuple[MixedForm, MixedPoint]:
+def form_and_point(equilibrium: Equilibrium) -> tuple[MixedForm, MixedPoint]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
     point = MixedPoint(state.shape.unknown_tangents, state.end_force, equilibrium.total_twist)
@@ -167,7 +235,16 @@ def field_of(scene: Scene, shape: Shape) -> TangentField:
 
 
 def describe(equilibrium: Equilibrium) -> str:
-    """How a solve ended, in words; for several, each outcome with its count."""
+    """How a solve ended, in words, and whether derivatives exist; for several, each outcome with its count."""
+    critical = np.asarray(equilibrium.critical & equilibrium.converged)
+    without = "critical (a motion has no stiffness left), so that derivatives are not numbers"
+    outcome = _outcome(equilibrium)
+    if critical.ndim == 0:
+        return f"{outcome}; {without}" if critical else outcome
+    return f"{outcome}\n{np.sum(critical)} {without}" if np.any(critical) else outcome
+
+
+def _outcome(equilibrium: Equilibrium) -> str:
     codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
     if equilibrium.status.ndim == 0:
         return (
@@ -179,4 +256,4 @@ def describe(equilibrium: Equilibrium) -> str:
 
 def warn_if_not_converged(equilibrium: Equilibrium) -> None:
     if is_known(equilibrium.converged) and not np.all(equilibrium.converged):
-        warnings.warn(describe(equilibrium), NotConvergedWarning, stacklevel=3)
+        warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)

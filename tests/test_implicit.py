@@ -136,6 +136,114 @@ def test_no_derivative_where_nothing_converged():
     assert np.isnan(derivative)
 
 
+def between_clamps(x: jax.Array) -> Scene:
+    """A cable between clamps, the end moved and turned by multiples of x."""
+    turned = rotate(frame((1, 0, 0)), x * jnp.array([1.0, 0.3, 0.2]))
+    end = Clamp(jnp.array([0.8, 0.0, 0.0]) + x * jnp.array([0.0, 0.1, 0.05]), turned)
+    return Scene(problems.cable(), Clamp((0, 0, 0), frame((1, 0, 0))), end, gravity=(0, 0, -9.81))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("discretization", ["finite_difference", "hermite"])
+def test_the_value_beside_a_derivative_is_the_plain_one_bit_by_bit(discretization):
+    def loss(x):
+        result = rj.solve(between_clamps(x), segments=SEGMENTS, discretization=discretization)
+        return jnp.sum(result.nodes**2) + result.end_moment[1], result
+
+    both = jax.value_and_grad(loss, has_aux=True)
+    x = jnp.asarray(0.7)
+    for plain, beside in ((loss, both), (jax.jit(loss), jax.jit(both))):
+        value = plain(x)
+        jax.tree.map(np.testing.assert_array_equal, value, beside(x)[0])
+        assert value[1].converged
+
+
+def test_meshes_are_chosen_beside_derivatives_too():
+    def tip(load):
+        result = rj.solve(problems.cantilever(load), rtol=1e-2)
+        return result.nodes[-1, 2], result
+
+    plain = tip(2.0)[1]
+    (_, result), slope = jax.value_and_grad(tip, has_aux=True)(2.0)
+    assert result.s.shape == plain.s.shape
+    assert result.error_estimate <= 1e-2
+    # Of the mesh of this tolerance, and differences of second order.
+    assert slope == pytest.approx(float(tip(2.01)[0] - tip(1.99)[0]) / 0.02, rel=1e-3)
+
+
+def test_no_derivative_where_a_column_buckles():
+    # The critical load of 64 elements is that of the continuum to 1e-8 of it: the stiffness left is below 1e-6.
+    def end(load):
+        result = rj.solve(
+            Scene(problems.cable(), Clamp((0, 0, 0), frame((1, 0, 0))), Free(force=load * jnp.array([-1.0, 0.0, 0.0]))),
+            segments=64,
+        )
+        return result.nodes[-1, 0], result
+
+    rod = problems.cable()
+    buckling = float(np.pi**2 / 4 * rod.EI)
+    derivative, result = jax.grad(end, has_aux=True)(buckling)
+    assert result.converged
+    assert result.critical
+    assert "derivatives are not numbers" in rj.describe(result)
+    assert np.isnan(derivative)
+    derivative, result = jax.grad(end, has_aux=True)(0.99 * buckling)
+    assert not result.critical
+    assert derivative == pytest.approx(-1 / float(rod.EA), rel=1e-9)  # shortened as a bar
+
+
+@pytest.mark.slow
+def test_no_derivative_at_the_load_that_an_arch_bears():
+    rod = problems.cable()
+    options = {"segments": 16, "discretization": "hermite"}
+
+    def arch(load):
+        ends = Clamp((0, 0, 0), frame((1, 0, 0.5))), Clamp((0.95, 0, 0), frame((1, 0, -0.5)))
+        return Scene(rod, *ends, point_forces=[PointForce(0.5, load * rod.EI * jnp.array([0.0, 0.0, -1.0]))])
+
+    def height(load, guess):
+        return rj.solve(arch(load), guess=guess, **options).nodes[8, 2]
+
+    standing, low, high = rj.solve(arch(0.0), **options), 0.0, 60.0
+    for _ in range(45):
+        load = (low + high) / 2
+        result = rj.solve(arch(load), guess=standing, **options)
+        if result.converged and result.nodes[8, 2] > 0.05 and abs(result.nodes[8, 1]) < 1e-6:
+            low, standing = load, result
+        else:
+            high = load
+    assert standing.critical
+    assert np.isnan(jax.grad(height)(low, standing))
+    before = rj.solve(arch(0.9 * low), guess=standing, **options)
+    assert not before.critical
+    h = 1e-3 * low
+    slope = (height(0.9 * low + h, before) - height(0.9 * low - h, before)) / (2 * h)
+    assert jax.grad(height)(0.9 * low, before) == pytest.approx(float(slope), rel=1e-4)  # of second order in h
+
+
+@pytest.mark.slow
+def test_a_rod_that_may_spin_has_derivatives():
+    # Buckled between coaxial clamps it turns about their line without resistance.
+    rod = problems.cable()
+
+    def push(end):
+        scene = Scene(
+            rod, Clamp((0, 0, 0), frame((1, 0, 0))), Clamp(end * jnp.array([1.0, 0.0, 0.0]), jnp.eye(3)[:, [1, 2, 0]])
+        )
+        result = rj.solve(scene, segments=16, solver=TIGHT)
+        return result.end_force[0], result
+
+    stiffness, result = jax.grad(push, has_aux=True)(0.8)
+    assert result.converged
+    assert not result.critical
+    low, high = (
+        (8 * (push(0.8 + h)[0] - push(0.8 - h)[0]) - (push(0.8 + 2 * h)[0] - push(0.8 - 2 * h)[0])) / (12 * h)
+        for h in (1e-3, 2e-3)
+    )
+    assert low == pytest.approx(float(high), rel=1e-8)
+    assert stiffness == pytest.approx(float(low), rel=1e-8)
+
+
 def test_rotate():
     turned = rotate(frame((1, 0, 0)), (0.0, 0.0, np.pi / 2))
     np.testing.assert_allclose(turned[:, 2], (0, 1, 0), atol=1e-15)

@@ -213,3 +213,9 @@ def outer(a: Float[Array, "*c 2 k"], b: Float[Array, "*c 2 k"]) -> Float[Array, 
 
 def _symmetric_outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Array, "2 2 k"]:
     return (outer(a, b) + outer(b, a)) / 2
+
+
+def generic_field(tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Directions along the rod that no symmetry of a scene shares."""
+    s = jnp.linspace(0.0, 1.0, tangents.shape[1], dtype=tangents.dtype)
+    return jnp.stack([jnp.cos(1.0 + 2.0 * s), jnp.sin(2.0 + 3.0 * s), jnp.cos(3.0 + s)])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import not_negative, plain_number, whole_number
-from rodjax.discretization.joints import components
+from rodjax.discretization.joints import components, generic_field
 from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
 from rodjax.linalg import factor, factor_and_solve
 from rodjax.status import Outcome, Status
@@ -131,7 +131,7 @@ def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMi
         least = jnp.asarray(NEUTRAL, dtype)
         first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
         may_push = (state.pushes == 0) | is_balanced
-        pattern = components(here.bases, _generic_field(point.tangents))
+        pattern = components(here.bases, generic_field(point.tangents))
 
         def is_indefinite(attempt) -> Bool[Array, ""]:
             _, is_definite, _, _, count = attempt
@@ -239,9 +239,3 @@ def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMi
         outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
         is_stable=state.is_stable & form.has_potential,
     )
-
-
-def _generic_field(tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    """Directions along the rod that no symmetry of a scene shares."""
-    s = jnp.linspace(0.0, 1.0, tangents.shape[1], dtype=tangents.dtype)
-    return jnp.stack([jnp.cos(1.0 + 2.0 * s), jnp.sin(2.0 + 3.0 * s), jnp.cos(3.0 + s)])

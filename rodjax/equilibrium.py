@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.compilation import compiled
@@ -32,7 +32,7 @@ from rodjax.result import (
     warn_if_not_converged,
 )
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
-from rodjax.solvers.newton import Newton, find_minimum, is_stable
+from rodjax.solvers.newton import Newton, NewtonMinimum, find_minimum, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Status
 from rodjax.units import Units
@@ -264,38 +264,64 @@ def _first_state(
 
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
+    return _found(*in_units_of(scene, state), twist, options)
+
+
+def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
+    """The scene, nondimensional, and a state in its units."""
     scaled, units = nondimensional(scene)
-    return _found(scaled, _in_units(state, units), twist, options)
+    return scaled, _in_units(state, units)
+
+
+class Search(eqx.Module):
+    """Where Newton's method begins: the form it makes stationary, the first point, and the shape that belongs to it.
+
+    `normal`: of the plane in which it stays, if it does.
+    """
+
+    form: MixedForm
+    point: MixedPoint
+    shape: Shape
+    units: Units
+    is_within_plane: Bool[Array, ""] | None
+    normal: Float[Array, "3"] | None
+
+    @staticmethod
+    def of(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> "Search":
+        form = MixedForm.of(scene, field_of(scene, guess.shape))
+        shape, point = _first_point(form, guess, twist)
+        if not options.planar:
+            return Search(form, point, shape, guess.units, None, None)
+        normal, axes = plane(scene, point.tangents)
+        within = is_planar(scene, twist)
+        return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
+
+    def found(self, minimum: NewtonMinimum) -> Found:
+        point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
+        start, reached = self.shape, self.shape.reached(self.form, point)
+        # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
+        is_same = start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps
+        is_start = (outcome.iterations == 0) & is_same
+        shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
+        if self.normal is not None and self.is_within_plane is not None:
+            stable &= is_stable(self.form.along(self.normal[:, None]), point)
+            # Inside a user's own jit the scene could not be checked before.
+            status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
+            outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
+        return Found(SolverState(shape, point.end_force, self.units), point, outcome, stable)
 
 
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     solver = options.solver
-    form = MixedForm.of(scene, field_of(scene, guess.shape))
-    if isinstance(solver, NonlinearCG):
-        assert isinstance(guess.shape, Polyline)
-        problem, start = FiniteDifference.begin(scene, guess.shape, twist)
-        minimum = minimize(problem, start, solver)
-        point = minimum.problem.mixed_point(minimum.point)
-        state = SolverState(minimum.point, point.end_force, guess.units)
-        return Found(state, point, minimum.outcome, is_stable(form, point))
-    start, begin = _first_point(form, guess, twist)
-    normal = None
-    if options.planar:
-        normal, axes = plane(scene, begin.tangents)
-        begin = begin.flattened(axes)
-        form = form.along(axes)
-    minimum = find_minimum(form, begin, solver)
-    point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
-    reached = start.reached(form, point)
-    # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
-    is_start = (outcome.iterations == 0) & (start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps)
-    shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
-    if normal is not None:
-        stable &= is_stable(form.along(normal[:, None]), point)
-        # Inside a user's own jit the scene could not be checked before.
-        status = jnp.where(is_planar(scene, twist), outcome.status, Status.NOT_PLANAR)
-        outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
-    return Found(SolverState(shape, point.end_force, guess.units), point, outcome, stable)
+    if isinstance(solver, Newton):
+        search = Search.of(scene, guess, twist, options)
+        return search.found(find_minimum(search.form, search.point, solver))
+    assert isinstance(guess.shape, Polyline)
+    problem, start = FiniteDifference.begin(scene, guess.shape, twist)
+    minimum = minimize(problem, start, solver)
+    point = minimum.problem.mixed_point(minimum.point)
+    stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
+    return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
 
 
 def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, MixedPoint]:

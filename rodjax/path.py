@@ -68,9 +68,8 @@ def solve_path(
     stacked = stack_scenes(scenes)
     fixed_scenes, guess = not_differentiated(stacked, guess)
     options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar)
-    first = jax.tree.map(lambda leaf: leaf[0], fixed_scenes)
     while True:
-        path = _solve_path(fixed_scenes, *first_state(first, guess, options), options, progress)
+        path = path_from(fixed_scenes, guess, options, progress)
         if rtol is None or not is_known(path):
             break
         errors = np.asarray(path.error_estimate)[np.asarray(path.converged)]
@@ -134,6 +133,14 @@ def _solve_path(
     if meter is not None and bar is not None:
         meter.close(bar)
     return jax.vmap(equilibrium)(scenes, found, substeps)
+
+
+def path_from(
+    scenes: Scene, guess: Guess | Equilibrium | None, options: Options, progress: bool = False
+) -> Equilibrium:
+    """A path on one mesh; the guess is for its first scene."""
+    first = jax.tree.map(lambda leaf: leaf[0], scenes)
+    return _solve_path(scenes, *first_state(first, guess, options), options, progress)
 
 
 class _Station(eqx.Module):

@@ -63,7 +63,9 @@ class NewtonMinimum(eqx.Module):
     is_stable: Bool[Array, ""]
 
 
-class _State(eqx.Module):
+class NewtonState(eqx.Module):
+    """What a turn leaves to the next one."""
+
     # The last accepted point, and the step from it.
     point: MixedPoint
     bases: Float[Array, "3 b n"]
@@ -78,6 +80,7 @@ class _State(eqx.Module):
     step: Float[Array, ""]
     halvings: Int[Array, ""]
     restart: Bool[Array, ""]  # the next trial is the point itself
+    tries: Int[Array, ""]  # factorisations at the point that showed negative curvature
     is_pushed: Bool[Array, ""]  # the step leaves a saddle, and is not judged
     pushes: Int[Array, ""]
     iterations: Int[Array, ""]
@@ -92,128 +95,139 @@ def is_stable(form: MixedForm, point: MixedPoint) -> Bool[Array, ""]:
 
 
 def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMinimum:
-    """The stable equilibrium reached from `point`.
+    """The stable equilibrium reached from `point`."""
+    state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver), begin(form, point))
+    return minimum(form, state)
 
-    One loop, one evaluation of all derivatives a turn: the trial is accepted, factorised and gives the next step, or
-    the step is halved.
+
+def is_running(state: NewtonState) -> Bool[Array, ""]:
+    return state.status == Status.RUNNING
+
+
+def minimum(form: MixedForm, state: NewtonState) -> NewtonMinimum:
+    return NewtonMinimum(
+        point=state.point,
+        outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
+        is_stable=state.is_stable & form.has_potential,
+    )
+
+
+def turn(form: MixedForm, state: NewtonState, solver: Newton) -> NewtonState:
+    """One evaluation of all derivatives, at most one factorisation, and so the same work for every rod of a batch.
+
+    The trial is accepted, factorised and gives the next step; or the step is halved; or, where the Hessian has negative
+    curvature, it is shifted, and factorised again in the next turn.
     """
+    rotation = state.step * state.rotation
+    moved = form.moved(state.point, state.bases, rotation, state.force_change)
+    trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
+    linearization = form.linearized(trial)
+    closure = form.closure(linearization.closure)
+    merit = linearization.energy + state.weight / 2 * jnp.sum(closure**2)
+    promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
+    bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
+    state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
+    return jax.lax.cond(
+        state.restart | state.is_pushed | (merit <= bound),
+        lambda: _advanced(form, state, trial, linearization, solver),
+        lambda: _shortened(form, state),
+    )
+
+
+def _advanced(
+    form: MixedForm, state: NewtonState, point: MixedPoint, here: Linearization, solver: Newton
+) -> NewtonState:
     dtype = point.tangents.dtype
     h = 1 / point.tangents.shape[1]
+    iterations = state.iterations + jnp.where(state.restart, 0, 1)
+    floor = form.rounding_floor(point)
+    balanced = jnp.where(here.residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
+    balanced = jnp.where(here.residual <= solver.tolerance, Status.CONVERGED, balanced)
+    # Just above the floor, steps that no longer help show that it is reached.
+    stagnates = (iterations > 0) & (here.residual > state.residual / 2) & (here.residual <= STAGNATION * floor)
+    balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
+    balanced = jnp.where(form.is_closed(here.closure, solver.tolerance), balanced, Status.RUNNING)
+    is_balanced = balanced != Status.RUNNING
 
-    def turn(state: _State) -> _State:
-        rotation = state.step * state.rotation
-        moved = form.moved(state.point, state.bases, rotation, state.force_change)
-        trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
-        linearization = form.linearized(trial)
-        closure = form.closure(linearization.closure)
-        merit = linearization.energy + state.weight / 2 * jnp.sum(closure**2)
-        promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
-        bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
-        state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
-        return jax.lax.cond(
-            state.restart | state.is_pushed | (merit <= bound),
-            lambda: advanced(state, trial, linearization),
-            lambda: shortened(state),
-        )
+    # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
+    least = jnp.asarray(NEUTRAL, dtype)
+    first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
+    shift = jnp.where(state.tries == 0, first, jnp.maximum(SHIFT_GROWTH * state.shift, FIRST_SHIFT))
+    may_push = (state.pushes == 0) | is_balanced
+    pattern = components(here.bases, generic_field(point.tangents))
+    push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
+    factors, rotation, multipliers = factor_and_solve(
+        here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure
+    )
+    is_definite = factors.is_minimum
+    is_finite = jnp.isfinite(here.residual + here.energy)
+    again = ~is_definite & is_finite & (state.tries < MAX_FACTORS)
+    is_stable = is_definite & (shift <= least)
+    is_pushed = is_definite & ~is_stable & may_push
+    force_change = form.closure(multipliers)
+    largest = jnp.max(jnp.abs(rotation))
 
-    def advanced(state: _State, point: MixedPoint, here: Linearization) -> _State:
-        iterations = state.iterations + jnp.where(state.restart, 0, 1)
-        floor = form.rounding_floor(point)
-        balanced = jnp.where(here.residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
-        balanced = jnp.where(here.residual <= solver.tolerance, Status.CONVERGED, balanced)
-        # Just above the floor, steps that no longer help show that it is reached.
-        stagnates = ~state.restart & (here.residual > state.residual / 2) & (here.residual <= STAGNATION * floor)
-        balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
-        balanced = jnp.where(form.is_closed(here.closure, solver.tolerance), balanced, Status.RUNNING)
-        is_balanced = balanced != Status.RUNNING
+    # With the new force in place of the old one; L is quadratic in the force, up to the curvature of w.
+    softness = form.closure_softness(here, force_change)
+    closure = form.closure(here.closure)
+    energy = here.energy + jnp.sum(force_change * (closure - softness / 2))
+    closure -= softness
+    squared = jnp.sum(closure**2)
+    along = jnp.sum(rotation * (here.gradient + form.closure_gradient(here, force_change)))
+    if not form.has_potential:  # the "energy" is a sum of squares that a Newton step makes vanish
+        along = -2 * energy
+    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(squared > 0, squared, jnp.inf))
 
-        # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
-        least = jnp.asarray(NEUTRAL, dtype)
-        first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
-        may_push = (state.pushes == 0) | is_balanced
-        pattern = components(here.bases, generic_field(point.tangents))
+    status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
+    has_saddle = is_balanced & ~is_stable & (state.pushes >= MAX_PUSHES)
+    status = jnp.where(has_saddle, Status.SADDLE, status)
+    status = jnp.where(is_balanced & is_stable, balanced, status)
+    # A zero-iteration solve ends before its step is known to be finite, or needed.
+    status = jnp.where(is_finite & (is_definite | is_balanced), status, Status.NOT_FINITE)
+    status = jnp.where(again, Status.RUNNING, status)
+    return NewtonState(
+        point=point,
+        bases=here.bases,
+        residual=jnp.where(again, state.residual, here.residual),
+        shift=shift,
+        rotation=rotation,
+        force_change=form.force_change(force_change),
+        weight=weight,
+        merit=energy + weight / 2 * squared,
+        slope=along - weight * squared,
+        step=jnp.minimum(1.0, solver.max_rotation / largest),
+        halvings=jnp.zeros((), int),
+        restart=again,
+        tries=jnp.where(again, state.tries + 1, 0),
+        is_pushed=is_pushed,
+        pushes=state.pushes + jnp.where(is_pushed, 1, 0),
+        iterations=iterations,
+        evaluations=state.evaluations,
+        status=status.astype(int),
+        is_stable=is_stable,
+    )
 
-        def is_indefinite(attempt) -> Bool[Array, ""]:
-            _, is_definite, _, _, count = attempt
-            return ~is_definite & (count < MAX_FACTORS)
 
-        def solved(attempt):
-            shift, _, _, _, count = attempt
-            shift = jnp.where(count == 0, first, jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT))
-            push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
-            factors, rotation, multipliers = factor_and_solve(
-                here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure
-            )
-            return shift, factors.is_minimum, rotation, multipliers, count + 1
+def _shortened(form: MixedForm, state: NewtonState) -> NewtonState:
+    halvings = state.halvings + 1
+    stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
+    reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
+    failed = halvings > MAX_HALVINGS
+    return eqx.tree_at(
+        lambda state: (state.step, state.halvings, state.status),
+        state,
+        (state.step / 2, halvings, jnp.where(failed, reason, state.status).astype(int)),
+    )
 
-        attempt = (
-            first,
-            jnp.array(False),
-            jnp.zeros_like(here.gradient),
-            jnp.zeros_like(here.closure),
-            jnp.zeros((), int),
-        )
-        shift, is_definite, rotation, multipliers, _ = jax.lax.while_loop(is_indefinite, solved, attempt)
-        is_stable = is_definite & (shift <= least)
-        is_pushed = is_definite & ~is_stable & may_push
-        force_change = form.closure(multipliers)
-        largest = jnp.max(jnp.abs(rotation))
 
-        # With the new force in place of the old one; L is quadratic in the force, up to the curvature of w.
-        softness = form.closure_softness(here, force_change)
-        closure = form.closure(here.closure)
-        energy = here.energy + jnp.sum(force_change * (closure - softness / 2))
-        closure -= softness
-        squared = jnp.sum(closure**2)
-        along = jnp.sum(rotation * (here.gradient + form.closure_gradient(here, force_change)))
-        if not form.has_potential:  # the "energy" is a sum of squares that a Newton step makes vanish
-            along = -2 * energy
-        weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(squared > 0, squared, jnp.inf))
-
-        status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
-        has_saddle = is_balanced & ~is_stable & (state.pushes >= MAX_PUSHES)
-        status = jnp.where(has_saddle, Status.SADDLE, status)
-        status = jnp.where(is_balanced & is_stable, balanced, status)
-        # A zero-iteration solve ends before its step is known to be finite, or needed.
-        is_finite = jnp.isfinite(here.residual + here.energy)
-        status = jnp.where(is_finite & (is_definite | is_balanced), status, Status.NOT_FINITE)
-        return _State(
-            point=point,
-            bases=here.bases,
-            residual=here.residual,
-            shift=shift,
-            rotation=rotation,
-            force_change=form.force_change(force_change),
-            weight=weight,
-            merit=energy + weight / 2 * squared,
-            slope=along - weight * squared,
-            step=jnp.minimum(1.0, solver.max_rotation / largest),
-            halvings=jnp.zeros((), int),
-            restart=jnp.array(False),
-            is_pushed=is_pushed,
-            pushes=state.pushes + jnp.where(is_pushed, 1, 0),
-            iterations=iterations,
-            evaluations=state.evaluations,
-            status=status.astype(int),
-            is_stable=is_stable,
-        )
-
-    def shortened(state: _State) -> _State:
-        halvings = state.halvings + 1
-        stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
-        reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
-        failed = halvings > MAX_HALVINGS
-        return eqx.tree_at(
-            lambda state: (state.step, state.halvings, state.status),
-            state,
-            (state.step / 2, halvings, jnp.where(failed, reason, state.status).astype(int)),
-        )
-
+def begin(form: MixedForm, point: MixedPoint) -> NewtonState:
+    """Before the first turn, whose trial is the point itself."""
+    dtype = point.tangents.dtype
     zero = jnp.zeros((), dtype)
     bases = form.bases(point.tangents)
     count = jnp.zeros((), int)
     no = jnp.array(False)
-    state = _State(
+    return NewtonState(
         point=point,
         bases=bases,
         residual=zero,
@@ -226,16 +240,11 @@ def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMi
         step=zero,
         halvings=count,
         restart=jnp.array(True),
+        tries=count,
         is_pushed=no,
         pushes=count,
         iterations=count,
         evaluations=count,
         status=jnp.full((), Status.RUNNING, int),
         is_stable=no,
-    )
-    state = jax.lax.while_loop(lambda state: state.status == Status.RUNNING, turn, state)
-    return NewtonMinimum(
-        point=state.point,
-        outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
-        is_stable=state.is_stable & form.has_potential,
     )

@@ -1,0 +1,260 @@
+"""Batches: many independent scenes of one structure, each solved from its own start.
+
+`jax.vmap` of a solve runs every rod until the slowest has converged. Here so many rods as are quick to compute side by
+side, the lanes, make their turns of Newton's method together, and a lane whose rod is done takes the next scene: one
+compiled loop without idle work, until there are no more scenes.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+from tqdm import tqdm
+
+from rodjax.checks import instance, is_known
+from rodjax.compilation import compiled
+from rodjax.discretization.mixed import MixedForm
+from rodjax.equilibrium import (
+    Discretization,
+    Options,
+    Search,
+    Solver,
+    checked_options,
+    first_state,
+    in_units_of,
+    is_finest,
+    solve_from,
+    warn_if_inaccurate,
+)
+from rodjax.guess import Guess
+from rodjax.implicit import differentiable, not_differentiated
+from rodjax.path import path_from, stack_scenes
+from rodjax.refinement import SAFETY, next_size
+from rodjax.result import Equilibrium, SolverState, equilibrium, warn_if_not_converged
+from rodjax.scene import Scene
+from rodjax.solvers.newton import Newton, NewtonMinimum, NewtonState, begin, is_running, minimum, turn
+
+# Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
+LANES = 16
+# Scenes in one call of a compiled program: the least of these that holds all, or as many calls of the last as it takes.
+# What is prepared for a scene takes some 20 kB at 50 segments.
+CHUNKS = (16, 128, 1024)
+
+
+def solve_batch(
+    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+) -> Equilibrium:
+    """The equilibria of independent scenes of one structure, or of independent paths.
+
+    **Arguments:**
+
+    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
+        one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps.
+    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each.
+    - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
+        several processes every one of them passes the same scenes, as many as the devices or a multiple.
+    - `progress`: show a progress bar.
+    - `segments`, `rtol`, `discretization`, `solver`, `planar`: as for `rodjax.solve`. All scenes have one mesh: where
+        the estimated error of any is above `rtol`, all are solved on a finer one.
+
+    Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
+    is marked, and all others are not affected.
+    """
+    stacked = _stacked(scenes)
+    if mesh is not None:
+        instance(mesh, "mesh", Mesh)
+        if len(mesh.axis_names) != 1:
+            raise ValueError(f"mesh must have one axis, got {mesh.axis_names}")
+    given, guess = not_differentiated(stacked, guess)
+    count = given.rod.length.shape[0]
+    if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
+        raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
+    options, rtol = checked_options(given, segments, rtol, discretization, solver, guess, planar)
+    while True:
+        result = _in_chunks(given, guess, options, mesh, progress)
+        if rtol is None or not is_known(result) or not _is_here(result):
+            break
+        errors = np.asarray(result.error_estimate)[np.asarray(result.converged)]
+        error = float(np.max(errors, initial=0.0))
+        if SAFETY * error <= rtol or is_finest(options):
+            warn_if_inaccurate(error, rtol, options)
+            break
+        options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
+        guess = result if result.s.ndim == 2 else guess
+    if _is_here(result):
+        warn_if_not_converged(result)
+    return differentiable(stacked, result)
+
+
+def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Scene:
+    if isinstance(scenes, Scene):
+        return scenes if scenes.rod.length.ndim == 2 else stack_scenes(scenes)
+    rows = [row if isinstance(row, Scene) else stack_scenes(row) for row in scenes]
+    lengths = {row.rod.length.shape for row in rows}
+    if len(lengths) > 1:
+        raise ValueError(f"scenes must be single scenes or paths of one length, got shapes {sorted(lengths)}")
+    return stack_scenes(rows)
+
+
+def _is_here(result: Equilibrium) -> bool:
+    """Whether this process holds all of it."""
+    return not is_known(result) or result.s.is_fully_addressable
+
+
+def _in_chunks(
+    scenes: Scene, guess: Guess | Equilibrium | None, options: Options, mesh: Mesh | None, progress: bool
+) -> Equilibrium:
+    count = scenes.rod.length.shape[0]
+    each = _is_stack(guess)
+    if not is_known(scenes, guess):
+        counts = jnp.full(1 if mesh is None else mesh.size, count // (1 if mesh is None else mesh.size))
+        return _solve_many(scenes, guess, counts, options, mesh)
+    devices = 1 if mesh is None else mesh.size
+    share = -(-count // devices)
+    chunk = next((size for size in CHUNKS if share <= size), CHUNKS[-1])
+    if jax.process_count() > 1 and mesh is not None:
+        if count % devices:
+            raise ValueError(f"scenes must be a multiple of the {devices} devices of several processes, got {count}")
+        chunk = share
+    parts = []
+    for first in tqdm(range(0, count, chunk * devices), disable=not progress, unit="chunk"):
+        last = min(first + chunk * devices, count)
+        part = functools.partial(_part, first=first, last=last, size=chunk * devices)
+        counts = np.clip(last - first - chunk * np.arange(devices), 0, chunk)
+        inputs = jax.tree.map(part, scenes), jax.tree.map(part, guess) if each else guess, counts
+        if mesh is not None:
+            sharding = jax.sharding.NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
+            whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
+            places = (sharding, sharding if each else whole, sharding)
+            inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, places, strict=True))
+        parts.append(_solve_many(*inputs, options, mesh))
+    if count == chunk * devices:
+        return parts[0]
+    return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *parts)
+
+
+def _is_stack(guess: Guess | Equilibrium | None) -> bool:
+    return isinstance(guess, Equilibrium) and guess.s.ndim > 1
+
+
+def _part(x: Array, first: int, last: int, size: int) -> Any:
+    """Entries `first` to `last`, and the last of them again up to `size`."""
+    if last - first == size == len(x):
+        return x
+    return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
+
+
+@functools.partial(compiled, static_argnames=("options", "mesh"))
+def _solve_many(
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    counts: Int[Array, "devices"],
+    options: Options,
+    mesh: Mesh | None,
+) -> Equilibrium:
+    """The first of the scenes, as many as `counts` tells each device; of the rest something without meaning."""
+    solve = functools.partial(_solve_here, options=options)
+    if mesh is None:
+        return solve(scenes, guess, counts)
+    # Not `jit` with sharded inputs, which would ask all devices in each turn whether all are done.
+    shared = PartitionSpec(mesh.axis_names[0])
+    specs = (shared, shared if _is_stack(guess) else PartitionSpec(), shared)
+    return jax.shard_map(solve, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)(scenes, guess, counts)
+
+
+def _solve_here(
+    scenes: Scene, guess: Guess | Equilibrium | None, counts: Int[Array, "1"], options: Options
+) -> Equilibrium:
+    in_axes = (0, 0 if _is_stack(guess) else None)
+    if scenes.rod.length.ndim == 2:
+        return jax.vmap(functools.partial(path_from, options=options), in_axes)(scenes, guess)
+
+    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, Float[Array, ""]]:
+        return first_state(scene, guess, options)
+
+    def search(scene: Scene, start: tuple[SolverState, Float[Array, ""]]) -> Search:
+        return Search.of(*in_units_of(scene, start[0]), start[1], options)
+
+    once = jnp.ones((), int)
+    starts = jax.vmap(state, in_axes)(scenes, guess)
+    if not isinstance(options.solver, Newton):
+        results = jax.vmap(
+            lambda scene, start: equilibrium(scene, solve_from(scene, start[0], start[1], options), once)
+        )
+        return results(scenes, starts)
+    searches = _mapped(search, scenes, starts)
+    found = _minima(searches, counts[0], options.solver)
+    return _mapped(
+        lambda scene, search, minimum: equilibrium(scene, search.found(minimum), once), scenes, searches, found
+    )
+
+
+def _mapped(function: Callable, *stacks: Any) -> Any:
+    """`function` of each entry of the stacks, so many at a time as fit into a processor's cache."""
+    return jax.lax.map(lambda entries: function(*entries), stacks, batch_size=LANES)
+
+
+class _Lanes(eqx.Module):
+    """The lanes: which search each is at, one past the last where none is left; and what has been found."""
+
+    search: Int[Array, "lanes"]
+    forms: MixedForm
+    states: NewtonState
+    following: Int[Array, ""]
+    found: NewtonMinimum
+
+
+def _minima(searches: Search, count: Int[Array, ""], solver: Newton) -> NewtonMinimum:
+    """What the first `count` of the searches find."""
+    total = searches.point.total_twist.shape[0]
+    lanes = min(LANES, total)
+
+    def started(search: Int[Array, "lanes"]) -> tuple[MixedForm, NewtonState]:
+        at = jnp.minimum(search, total - 1)
+        forms, points = jax.tree.map(lambda leaf: leaf[at], (searches.form, searches.point))
+        return forms, jax.vmap(begin)(forms, points)
+
+    def advanced(lanes: _Lanes) -> _Lanes:
+        going = is_running(lanes.states)
+        states = jax.vmap(functools.partial(turn, solver=solver))(lanes.forms, lanes.states)
+        states = _chosen(going, states, lanes.states)
+        lanes = eqx.tree_at(lambda lanes: lanes.states, lanes, states)
+        ended = ~is_running(states) & (lanes.search < count)
+        # Handing over takes longer than a turn of one rod, and so waits for a few.
+        enough = jnp.where(lanes.following < count, len(ended) // 4, jnp.sum(lanes.search < count))
+        return jax.lax.cond(jnp.sum(ended) >= jnp.maximum(enough, 1), handed_over, lambda lanes, _: lanes, lanes, ended)
+
+    def handed_over(lanes: _Lanes, ended: Bool[Array, "lanes"]) -> _Lanes:
+        found = jax.vmap(minimum)(lanes.forms, lanes.states)
+        to = jnp.where(ended, lanes.search, total)
+        found = jax.tree.map(lambda all, new: all.at[to].set(new, mode="drop"), lanes.found, found)
+        following = lanes.following + jnp.cumsum(ended)
+        search = jnp.where(ended, jnp.minimum(following - 1, count), lanes.search)
+        forms, states = _chosen(ended, started(search), (lanes.forms, lanes.states))
+        return _Lanes(search, forms, states, following[-1], found)
+
+    first = jnp.minimum(jnp.arange(lanes), count)
+    forms, states = started(first)
+    nothing = jax.eval_shape(jax.vmap(minimum), searches.form, jax.vmap(begin)(searches.form, searches.point))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), nothing)
+    start = _Lanes(first, forms, states, jnp.minimum(jnp.full_like(count, lanes), count), nothing)
+    return jax.lax.while_loop(lambda lanes: jnp.any(lanes.search < count), advanced, start).found
+
+
+def _chosen(which: Bool[Array, "lanes"], new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -489,9 +489,10 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
             found = measured(problem, segments, truth, arguments.limit, arguments.rounds, arguments.repeats)
             print("\n".join(map(line, found)), flush=True)
             rows += found
+            if arguments.out is not None:
+                save_rows(rows, arguments.out / "work_precision.csv")
     print("\n".join(costs(rows)))
     if arguments.out is not None:
-        save_rows(rows, arguments.out / "work_precision.csv")
         picture(rows, chosen).savefig(arguments.out / "work_precision.png", dpi=110)
     return rows
 

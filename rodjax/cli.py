@@ -21,6 +21,9 @@ from rodjax.files import SUFFIX, save
 from rodjax.result import Equilibrium, NotConvergedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
+from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
+from rodjax.sweep import Summary, merge, sweep
+from rodjax.sweep_cases import SweepError
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -35,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
         return arguments.run(arguments)
-    except (CommandError, SceneFileError) as error:
+    except (CommandError, SceneFileError, SweepError) as error:
         message = str(error)
     except OSError as error:
         message = f"{error.strerror or error}: {error.filename}" if error.filename else str(error)
@@ -57,11 +60,43 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
     solve.set_defaults(run=_solve)
+    _add_sweep(commands)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
     demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
     demo.set_defaults(run=_demo)
     return parser
+
+
+def _add_sweep(commands: Any) -> None:
+    output = dict(
+        metavar=f"SWEEP{SWEEP_SUFFIX}", type=Path, required=True, help="the file to write: pydoc rodjax.sweep"
+    )
+    run = commands.add_parser("sweep", help="solve a scene for all cases of a grid or table, many or few")
+    run.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.scene_file")
+    run.add_argument("--over", metavar="GRID.toml|TABLE.csv", type=Path, required=True, help="pydoc rodjax.sweep")
+    run.add_argument("-o", "--output", **output)
+    run.add_argument("--shard", metavar="i/n", type=_shard, default=(1, 1), help="only part i of n, to be merged")
+    run.add_argument("--resume", action="store_true", help="go on where an earlier run was stopped")
+    run.add_argument("--chunk", metavar="N", type=_chunk, help="cases solved, and written, at a time; 1024")
+    run.set_defaults(run=_sweep)
+    join = commands.add_parser("merge", help="put the shards of a sweep together")
+    join.add_argument("shards", metavar=f"SHARD{SWEEP_SUFFIX}", type=Path, nargs="+")
+    join.add_argument("-o", "--output", **output)
+    join.set_defaults(run=_merge)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (text.isascii() and index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
+        raise argparse.ArgumentTypeError(f"must be i/n with i from 1 to n, such as 2/8, got {text!r}")
+    return int(index), int(count)
+
+
+def _chunk(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) >= 1):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {text!r}")
+    return int(text)
 
 
 def _segments(text: str) -> int:
@@ -107,6 +142,38 @@ def _solve(arguments: argparse.Namespace) -> int:
     steps = f"steps {', '.join(map(str, np.flatnonzero(~np.asarray(result.converged))))}: " if file.is_path else ""
     outcome = rodjax.describe(result).replace("\n", ", ")
     print(f"rodjax: {arguments.scene}: {steps}{outcome}", file=sys.stderr)
+    return 3
+
+
+def _sweep(arguments: argparse.Namespace) -> int:
+    _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
+    summary = sweep(
+        arguments.scene,
+        arguments.over,
+        arguments.output,
+        shard=arguments.shard,
+        chunk=arguments.chunk,
+        resume=arguments.resume,
+        progress=sys.stderr.isatty(),
+        say=lambda line: print(line, flush=True),
+    )
+    return _swept(arguments.output, summary)
+
+
+def _merge(arguments: argparse.Namespace) -> int:
+    _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
+    return _swept(arguments.output, merge(arguments.shards, arguments.output))
+
+
+def _swept(path: Path, summary: Summary) -> int:
+    """Says what a sweep gave."""
+    failed = len(summary.failed)
+    converged = f"{summary.cases - failed} of {summary.cases} cases converged"
+    print(f"{path}: {converged}, error of the shape up to about {summary.error:.0e} of the length")
+    if not failed:
+        return 0
+    first = ", ".join(map(str, summary.failed[:10])) + (", ..." if failed > 10 else "")
+    print(f"rodjax: {path}: {failed} of {summary.cases} cases not converged: {first}", file=sys.stderr)
     return 3
 
 

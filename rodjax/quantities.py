@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 # SI unit (none: a plain number), shape and an example of every key that holds numbers.
-_QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
+QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "length": ("m", (), '"1 m"'),
     "radius": ("m", (), '"5 mm"'),
     "outer_radius": ("m", (), '"5 mm"'),
@@ -43,7 +43,7 @@ _QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "rtol": ("", (), "1e-3"),
     "steps": ("", (), "10"),
 }
-_NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
+NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
 
 
 class SceneFileError(ValueError):
@@ -58,7 +58,7 @@ def named(where: str) -> Iterator[None]:
     except SceneFileError:
         raise
     except (TypeError, ValueError) as error:
-        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in _QUANTITIES
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in QUANTITIES
         raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
 
 
@@ -74,7 +74,7 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
             )
     for key in required:
         if key not in table:
-            example = f"{key} = {_QUANTITIES[key][2]}" if key in _QUANTITIES else f"a table [{key}]"
+            example = f"{key} = {QUANTITIES[key][2]}" if key in QUANTITIES else f"a table [{key}]"
             raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
     return table
 
@@ -104,7 +104,7 @@ def si_values(
 
 def assignment(key: str, value: Any) -> str:
     """The line of TOML from which `si_values` makes the same number to the last bit."""
-    numbers, unit = np.asarray(value, float).tolist(), _QUANTITIES[key][0]
+    numbers, unit = np.asarray(value, float).tolist(), QUANTITIES[key][0]
     return f'{key} = "{numbers} {unit}"' if unit else f"{key} = {numbers}"
 
 
@@ -115,7 +115,7 @@ def _check_table(table: Any, where: str) -> None:
 
 def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
     """A quantity or plain number of the shape that its key has, in SI units; of a direction, the unit vector."""
-    si, shape, example = _QUANTITIES[key]
+    si, shape, example = QUANTITIES[key]
 
     def mistake(allowed: str, got: str = repr(value)) -> ValueError:
         return ValueError(f"{key} must {allowed}, for example {key} = {example}, got {got}")
@@ -124,7 +124,7 @@ def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
     if si:
         if not isinstance(value, str):
             raise mistake("have a unit")
-        match = _NUMBER_AND_UNIT.fullmatch(value)
+        match = NUMBER_AND_UNIT.fullmatch(value)
         if match is None:
             raise mistake("be a number and a unit")
         numbers, unit = _parsed(match[1]), match[2]

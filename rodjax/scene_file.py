@@ -51,18 +51,19 @@ half a turn.
 
 import math
 import os
+import pickle
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, TypeVar, cast, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from rodjax.atomic_write import replace_file
-from rodjax.checks import instance, is_known, whole_number
+from rodjax.checks import instance, is_known, leaf, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.loads import PointForce
 from rodjax.quantities import SceneFileError, assignment, check_keys, choice, named, si_values, table_list
@@ -95,8 +96,12 @@ _SCENE_KEYS = {
     "": "start.support, end.support: ",
 }
 
+# What is read of so many tables a reader keeps at most, about 10 MB.
+MAX_KEPT = 10_000
+
 # SI values of the tables start, end and loads, by table and key.
 Values = dict[str, dict[str, Float[np.ndarray, "..."]]]
+Part = TypeVar("Part")
 
 
 class SceneFile(NamedTuple):
@@ -121,7 +126,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     """As `read_scene`, with the settings of the solve."""
     try:
-        return _scene_file(_toml(Path(path)))
+        return SceneReader().read(toml_tables(read_text(Path(path))))
     except SceneFileError as mistake:
         # Up to here the message is without the file.
         raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
@@ -161,21 +166,64 @@ def _written(module: eqx.Module, keys: Sequence[str]) -> list[str]:
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def _toml(path: Path) -> dict[str, Any]:
+def read_text(path: Path) -> str:
+    """The text of a file; raises `SceneFileError`, without the name of the file."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise SceneFileError(f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise SceneFileError(f"is not valid TOML: {error}") from None
+
+
+def toml_tables(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneFileError(f"is not valid TOML: {error}") from None
 
 
-def _scene_file(content: dict[str, Any]) -> SceneFile:
+class SceneReader:
+    """Makes scenes of the tables of files; what is alike in many of them, such as the cases of a sweep, is read once.
+
+    Errors are `SceneFileError`s without the name of the file.
+    """
+
+    def __init__(self):
+        self._parts: dict[tuple[Callable, bytes], Any] = {}
+
+    def read(self, content: dict[str, Any]) -> SceneFile:
+        return _scene_file(self, content)
+
+    def part(self, make: Callable[..., Part], *arguments: Any) -> Part:
+        """`make(self, *arguments)`, of this or an earlier call with the same arguments. Nobody may change it."""
+        key = make, pickle.dumps(arguments)
+        if key not in self._parts:
+            if len(self._parts) >= MAX_KEPT:
+                self._parts.clear()
+            self._parts[key] = make(self, *arguments)
+        return self._parts[key]
+
+    def si_values(
+        self, table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
+    ) -> dict[str, Float[np.ndarray, "..."]]:
+        """As `quantities.si_values`."""
+        check_keys(table, where, required, (*optional, *other))
+        return {key: self.part(_si_value, where, key, value) for key, value in table.items() if key not in other}
+
+
+def _si_value(reader: SceneReader, where: str, key: str, value: Any) -> Float[np.ndarray, "..."]:
+    return si_values({key: value}, where, (), (key,))[key]
+
+
+def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     check_keys(content, "", ("rod", "start", "end"), ("loads", "solve", "path"))
-    rod = _rod(content["rod"])
+    part = reader.part
+    rod = part(_rod, content["rod"])
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
-    values = {name: _end_values(content[name], name, kind) for name, kind in kinds.items()}
-    values["loads"], point_forces = _loads(content.get("loads", {}))
+    values = {name: dict(part(_end_values, content[name], name, kind)) for name, kind in kinds.items()}
+    loads, point_forces = part(_loads, content.get("loads", {}))
+    values["loads"] = dict(loads)
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
     discretization = cast(
         Discretization | None, choice(solve, "solve", "discretization", list(get_args(Discretization)))
@@ -191,9 +239,10 @@ def _scene_file(content: dict[str, Any]) -> SceneFile:
         raise SceneFileError("end.turns is not allowed together with path: turn the end along the path by end.spin")
 
     def scene(values: Values, where: str = "") -> Scene:
-        start, end = (_support(kind, values[name], f"{where}{name}") for name, kind in kinds.items())
+        gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
+        start, end = (part(_support, kind, values[name], f"{where}{name}") for name, kind in kinds.items())
         try:
-            return Scene(rod, start, end, values["loads"].get("gravity"), point_forces, turns)
+            return Scene(rod, start, end, gravity, point_forces, turns)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -208,10 +257,14 @@ def _scene_file(content: dict[str, Any]) -> SceneFile:
     return SceneFile(scenes, bool(changes), segments, rtol, discretization)
 
 
-def _rod(table: Any) -> Rod:
+def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:
+    return leaf(number)
+
+
+def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
-    values = si_values(table, "rod", required, optional, other=("section",))
+    values = reader.si_values(table, "rod", required, optional, other=("section",))
     with named("rod"):
         return make(**values)
 
@@ -223,11 +276,11 @@ def _support_kind(table: Any, where: str) -> str:
     return kind
 
 
-def _end_values(table: dict[str, Any], where: str, kind: str) -> dict[str, np.ndarray]:
+def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: str) -> dict[str, np.ndarray]:
     required, optional, _ = _SUPPORTS[kind]
     if kind == "clamp" and where == "end":
         optional = (*optional, "turns")
-    values = si_values(table, where, required, optional, other=("support",))
+    values = reader.si_values(table, where, required, optional, other=("support",))
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
@@ -244,13 +297,13 @@ def _end_values(table: dict[str, Any], where: str, kind: str) -> dict[str, np.nd
     return values
 
 
-def _loads(table: Any) -> tuple[dict[str, np.ndarray], list[PointForce]]:
-    values = si_values(table, "loads", (), ("gravity",), other=("point_force",))
+def _loads(reader: SceneReader, table: Any) -> tuple[dict[str, np.ndarray], list[PointForce]]:
+    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force",))
     forces = []
     for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
         where = f"loads.point_force[{k}]"
         with named(where):
-            forces.append(PointForce(**si_values(force, where, ("at", "force"), ())))
+            forces.append(PointForce(**reader.si_values(force, where, ("at", "force"), ())))
     return values, forces
 
 
@@ -278,16 +331,20 @@ def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[s
 # --- supports and paths ----------------------------------------------------------------------------------------------
 
 
-def _support(kind: str, values: dict[str, np.ndarray], where: str) -> Support:
+def _support(reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str) -> Support:
     with named(where):
         if kind == "clamp":
-            placed = values["frame"] if "frame" in values else frame(values["tangent"], values["d2"])
+            placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
             return Clamp(values["position"], _spun(placed, float(values["spin"])))
         if kind == "swivel":
             swivel = Swivel(**values)
             # Swivel divides by the length once more, which may change the last bit of what write_scene wrote.
             return eqx.tree_at(lambda swivel: swivel.tangent, swivel, jnp.asarray(values["tangent"]))
         return Pin(**values) if kind == "pin" else Free(**values)
+
+
+def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    return np.asarray(frame(tangent, d2))
 
 
 def _spun(placed: Any, spin: float) -> Any:

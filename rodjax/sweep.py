@@ -1,0 +1,470 @@
+"""sweep(): one scene file over a grid or table of its values, streamed to one HDF5 file; merge(): shards put together.
+
+A sweep of any size runs in bounded memory, chunk by chunk, and goes on after a kill where it stopped.
+
+**The values.** Keys are those of the scene file with dots, `rod.EI` or `loads.point_force.0.at`; one component of a
+vector goes by its number, `end.position.2`. Values are as the scene file has them, or plain numbers in SI units. A
+grid is TOML; its cases are the product of all keys, the last key fastest:
+
+    "rod.EI" = [0.004, 0.005]
+    "end.position" = ["[70, 0, 0] cm", [0.8, 0, 0]]
+    "rod.length" = { from = "0.9 m", to = 1.2, count = 11 }                      # equal steps
+    "rod.EA" = { from = "80 N", to = "8 kN", count = 3, spacing = "log" }        # equal factors
+
+A table is CSV: a header of keys, then one row a case. Cases count from 0. All are solved on the mesh of
+`[solve] segments`; without it, on as many equal segments as the first case needs for `[solve] rtol`.
+
+**The result**, HDF5, first axis the case: `case` its number, `status`, `converged`, `stable`, `iterations`, `residual`,
+`error_estimate` of the mesh, `energy`, `elastic_energy`, `total_twist`, `start_force`, `start_moment`, `end_force`,
+`end_moment`, `nodes` (cases, segments + 1, 3), as in `rodjax.Equilibrium`, and `parameters/<key>` in SI units; each has
+the attributes `units` and `description`. Attributes of the file: the texts `scene` and `over`, and what is in
+`Manifest`, with its `fingerprint`.
+
+**On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
+solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
+the shard and wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and
+the same bits in the end.
+"""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from rodjax.atomic_write import replace_file
+from rodjax.batch import solve_batch
+from rodjax.equilibrium import DEFAULT_RTOL, solve
+from rodjax.files import FIELDS
+from rodjax.result import NotConvergedWarning
+from rodjax.scene import Scene
+from rodjax.scene_file import SceneFile
+from rodjax.sweep_cases import CaseReader, SweepError, unit_of
+
+SUFFIX = ".h5"
+# Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.
+FORMAT = 1
+# Cases of a chunk: as many as `solve_batch` takes in one call, for which it needs 200 MB at 50 segments.
+DEFAULT_CHUNK = 1024
+
+RESULTS = (
+    *("status", "converged", "stable", "iterations", "residual", "error_estimate", "energy", "elastic_energy"),
+    *("total_twist", "start_force", "start_moment", "end_force", "end_moment", "nodes"),
+)
+DESCRIPTIONS = FIELDS | {
+    "case": ("1", "number of the case, from 0"),
+    "error_estimate": ("1", "of the mesh: largest distance of a node from the continuum, by the length"),
+}
+
+Arrays = Mapping[str, np.ndarray]
+
+
+# --- what is solved --------------------------------------------------------------------------------------------------
+
+
+class Manifest(NamedTuple):
+    """All that the result depends on. `scene_sha256` and `over_sha256` are of the texts; `shard` is i/n."""
+
+    scene_sha256: str
+    over_sha256: str
+    cases: int
+    chunk: int
+    shard: str
+    segments: int
+    discretization: str
+    precision: str
+    format: int
+    version: str
+    jaxlib: str
+    platform: str
+
+    @property
+    def fingerprint(self) -> str:
+        """The same for all shards of a sweep."""
+        return _sha256(json.dumps(self._replace(shard="")._asdict(), sort_keys=True))
+
+    @property
+    def chunks(self) -> range:
+        """Numbers of the chunks of this shard."""
+        index, count = map(int, self.shard.split("/"))
+        return range(index - 1, -(-self.cases // self.chunk), count)
+
+    def cases_of(self, chunk: int) -> Int[np.ndarray, "k"]:
+        return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self.cases))
+
+    @property
+    def rows(self) -> int:
+        """Number of cases of this shard."""
+        return sum(len(self.cases_of(chunk)) for chunk in self.chunks)
+
+    def attributes(self) -> dict[str, Any]:
+        return self._asdict() | {"fingerprint": self.fingerprint}
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any], path: Path) -> "Manifest":
+        try:
+            return cls(**{name: kind(attributes[name]) for name, kind in cls.__annotations__.items()})
+        except (KeyError, TypeError, ValueError):
+            raise SweepError(f"{path} is not of rodjax sweep, or of another version of it") from None
+
+
+NAMES = {
+    "scene_sha256": "the scene file",
+    "over_sha256": "the grid or table",
+    "version": "the version of rodjax",
+    "jaxlib": "the version of jaxlib",
+}
+
+
+def differences(stored: Manifest, wanted: Manifest) -> str:
+    """What differs, in words; empty where nothing does."""
+    pairs = zip(stored._asdict().items(), wanted, strict=True)
+    return ", ".join(
+        NAMES[name] if name.endswith("sha256") else f"{NAMES.get(name, name)} ({old}, not {new})"
+        for (name, old), new in pairs
+        if old != new
+    )
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _manifest(reader: CaseReader, shard: tuple[int, int], chunk: int | None) -> Manifest:
+    """What is to be solved, but for the mesh."""
+    from rodjax import __version__  # here because rodjax/__init__.py sets it last
+
+    count = reader.cases.count
+    return Manifest(
+        scene_sha256=_sha256(reader.scene_text),
+        over_sha256=_sha256(reader.over_text),
+        cases=count,
+        # Of a small sweep one chunk, which need not be filled up.
+        chunk=min(DEFAULT_CHUNK if chunk is None else chunk, count),
+        shard=f"{shard[0]}/{shard[1]}",
+        segments=0,
+        discretization="",
+        precision=str(jnp.zeros(()).dtype),
+        format=FORMAT,
+        version=__version__,
+        jaxlib=importlib.metadata.version("jaxlib"),
+        platform=jax.default_backend(),
+    )
+
+
+def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
+    """The mesh of the scene file, or one on which the first case has the error that is asked for."""
+    if first.segments is not None:
+        return manifest._replace(segments=first.segments, discretization=first.discretization or "hermite")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConvergedWarning)  # as a case of the sweep it is counted
+        result = solve(first.scenes[0], rtol=first.rtol, discretization=first.discretization)
+    return manifest._replace(segments=result.s.shape[-1] - 1, discretization=result.discretization)
+
+
+# --- the run ---------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What a file holds: number of cases, numbers of those that did not converge, largest error of the others."""
+
+    cases: int
+    failed: list[int]
+    error: float
+
+
+def sweep(
+    scene: str | os.PathLike[str],
+    over: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    shard: tuple[int, int] = (1, 1),
+    chunk: int | None = None,
+    resume: bool = False,
+    progress: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> Summary:
+    """Solves a scene file for all cases of a grid or table and writes the results to one HDF5 file.
+
+    This module says what the files are.
+
+    **Arguments:**
+
+    - `scene`: a scene file without `[[path]]`.
+    - `over`: `.toml`, a grid, or `.csv`, a table.
+    - `output`: the `.h5` file to write; it appears when all is done.
+    - `shard`: `(i, n)`: only chunk i of every n, from 1; `merge` puts the n results together.
+    - `chunk`: cases solved at a time; `None` for 1024, or as it was where one resumes.
+    - `resume`: go on with what an earlier call, which was stopped, left.
+    - `progress`: draw a bar on stderr.
+    - `say`: gets a line on the mesh and on what was resumed.
+
+    Raises `SweepError` for what the user can mend: before anything is solved, but for a case that makes no sense though
+    the extreme ones do; `OSError` where a file cannot be written.
+    """
+    output = Path(output)
+    reader = CaseReader(Path(scene), Path(over))
+    parts = output.with_name(output.name + ".parts")
+    if resume and chunk is None:
+        chunk = _earlier_chunk(output, parts)
+    manifest = _manifest(reader, shard, chunk)
+    if not manifest.chunks:
+        raise SweepError(
+            f"shard {manifest.shard} would be empty: {_chunks(manifest)}; take fewer shards or a smaller chunk"
+        )
+    _check_place(output, parts, resume)
+    if output.exists():
+        _check_same(_manifest_of(output), manifest, output)
+        shutil.rmtree(parts, ignore_errors=True)
+        say(f"{output} is complete, nothing is left to do")
+        return summary(output)
+    manifest = _begin(reader, manifest, parts, say)
+    _solve_chunks(reader, manifest, parts, progress)
+    files = (_arrays(_part(parts, chunk)) for chunk in manifest.chunks)
+    texts = {"scene": reader.scene_text, "over": reader.over_text}
+    _assemble(output, parts / "assembled.tmp", manifest, texts, files)
+    shutil.rmtree(parts)
+    return summary(output)
+
+
+def _chunks(manifest: Manifest) -> str:
+    count = -(-manifest.cases // manifest.chunk)
+    return f"{manifest.cases} cases in {count} chunk{'s' if count > 1 else ''} of {manifest.chunk}"
+
+
+def _check_place(output: Path, parts: Path, resume: bool) -> None:
+    if resume:
+        return
+    if output.exists():
+        raise SweepError(f"{output} is there already; remove it or write to another file")
+    if parts.exists():
+        raise SweepError(f"{parts} holds what a stopped sweep had finished; go on with --resume, or remove the folder")
+
+
+def _earlier_chunk(output: Path, parts: Path) -> int | None:
+    if output.exists():
+        return _manifest_of(output).chunk
+    if (parts / "manifest.json").exists():
+        return _manifest_in(parts).chunk
+    return None
+
+
+def _manifest_in(parts: Path) -> Manifest:
+    file = parts / "manifest.json"
+    try:
+        return Manifest.of(json.loads(file.read_text()), file)
+    except ValueError as error:
+        raise error if isinstance(error, SweepError) else SweepError(f"{file} is not of rodjax sweep") from None
+
+
+def _manifest_of(result: Path) -> Manifest:
+    with _opened(result) as file:
+        return Manifest.of(file.attrs, result)
+
+
+def _check_same(stored: Manifest, wanted: Manifest, path: Path) -> None:
+    """Of the mesh nothing is known before a solve, and all that it depends on is compared."""
+    differing = differences(stored, wanted._replace(segments=stored.segments, discretization=stored.discretization))
+    if differing:
+        raise SweepError(f"{path} is of another sweep, different in {differing}; give the same, or another -o")
+
+
+def _begin(reader: CaseReader, manifest: Manifest, parts: Path, say: Callable[[str], None]) -> Manifest:
+    """Makes the folder, or takes over the mesh of the one that is there."""
+    file = parts / "manifest.json"
+    if file.exists():
+        stored = _manifest_in(parts)
+        _check_same(stored, manifest, parts)
+        done = sum(_part(parts, chunk).exists() for chunk in manifest.chunks)
+        say(f"resumed: {done} of {len(manifest.chunks)} chunks are there")
+        return stored
+    # A mistake found after hours would have to be mended in the grid, which would then be another sweep. To read all
+    # cases at once would take minutes.
+    reader.scenes(np.array(reader.cases.extremes()))
+    manifest = _with_mesh(manifest, reader.first)
+    wanted = "" if reader.first.segments else f", as case 0 needs for rtol = {reader.first.rtol or DEFAULT_RTOL:g}"
+    say(f"{_chunks(manifest)}, {manifest.segments} segments ({manifest.discretization}){wanted}")
+    # Without a manifest nobody knows what is in a folder.
+    if parts.exists():
+        shutil.rmtree(parts)
+    parts.mkdir()
+    replace_file(file, json.dumps(manifest.attributes(), indent=1).encode())
+    return manifest
+
+
+def _bar(manifest: Manifest, chunks: Sequence[int], done: int, progress: bool) -> Iterator[int]:
+    """The chunks, with a bar that counts their cases."""
+    from tqdm import tqdm
+
+    with tqdm(total=manifest.rows, initial=done, unit=" cases", disable=not progress, file=sys.stderr) as bar:
+        for chunk in chunks:
+            yield chunk
+            bar.update(len(manifest.cases_of(chunk)))
+
+
+def _part(parts: Path, chunk: int) -> Path:
+    return parts / f"chunk-{chunk:06d}{SUFFIX}"
+
+
+def _solve_chunks(reader: CaseReader, manifest: Manifest, parts: Path, progress: bool) -> None:
+    missing = [chunk for chunk in manifest.chunks if not _part(parts, chunk).exists()]
+    done = manifest.rows - sum(len(manifest.cases_of(chunk)) for chunk in missing)
+    for chunk in _bar(manifest, missing, done, progress):
+        arrays = _solved(reader, manifest, manifest.cases_of(chunk))
+        # Put together in memory, as `rodjax.save` does.
+        image = io.BytesIO()
+        with h5py.File(image, "w") as file:
+            for name, values in arrays.items():
+                file.create_dataset(name, data=values)
+        replace_file(_part(parts, chunk), image.getvalue())
+
+
+def _solved(reader: CaseReader, manifest: Manifest, cases: Int[np.ndarray, "k"]) -> dict[str, np.ndarray]:
+    scenes = reader.scenes(cases)
+    scenes += scenes[-1:] * (manifest.chunk - len(cases))
+    stacked = _stacked(scenes)
+    settings: Any = dict(segments=manifest.segments, discretization=manifest.discretization)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConvergedWarning)  # said in the end, for all together
+        result = solve_batch(stacked, **settings)
+    parameters = {f"parameters/{key}": values for key, values in reader.cases.of(cases).items()}
+    return {"case": cases} | {name: np.asarray(getattr(result, name))[: len(cases)] for name in RESULTS} | parameters
+
+
+def _stacked(scenes: list[Scene]) -> Scene:
+    """One scene with a leading axis on every leaf. What many scenes share is one array, which is looked at once."""
+    known: dict[int, np.ndarray] = {}
+
+    def stacked(*leaves: jax.Array) -> jax.Array:
+        for leaf in leaves:
+            if id(leaf) not in known:
+                known[id(leaf)] = np.asarray(leaf)
+        return jax.device_put(np.stack([known[id(leaf)] for leaf in leaves]))
+
+    return jax.tree.map(stacked, *scenes)
+
+
+# --- the result ------------------------------------------------------------------------------------------------------
+
+
+def merge(shards: Sequence[str | os.PathLike[str]], output: str | os.PathLike[str]) -> Summary:
+    """Puts the results of all shards of a sweep together: the same file as without shards.
+
+    Raises `SweepError` where they are of different sweeps, or one is missing or there twice.
+    """
+    output = Path(output)
+    if output.exists():
+        raise SweepError(f"{output} is there already; remove it or write to another file")
+    paths = _in_order([Path(path) for path in shards])
+    manifest = _manifest_of(paths[0])._replace(shard="1/1")
+    with _opened(paths[0]) as file:
+        texts = {name: str(file.attrs[name]) for name in ("scene", "over")}
+    rows = (_rows(paths[chunk % len(paths)], chunk // len(paths), manifest.chunk) for chunk in manifest.chunks)
+    _assemble(output, output.with_name(output.name + ".tmp"), manifest, texts, rows)
+    return summary(output)
+
+
+def _in_order(paths: list[Path]) -> list[Path]:
+    """The shards from 1 to n."""
+    manifests = {path: _manifest_of(path) for path in paths}
+    first = manifests[paths[0]]
+    count = int(first.shard.split("/")[1])
+    by_shard: dict[str, Path] = {}
+    for path in paths:
+        stored = manifests[path]
+        differing = differences(first, stored._replace(shard=first.shard))
+        if differing:
+            raise SweepError(
+                f"{path} does not belong to {paths[0]}: different in {differing}".replace(" now)", " here)")
+            )
+        if int(stored.shard.split("/")[1]) != count:
+            raise SweepError(f"{path} is shard {stored.shard}, but {paths[0]} is shard {first.shard}")
+        if stored.shard in by_shard:
+            raise SweepError(f"shard {stored.shard} is there twice: {by_shard[stored.shard]} and {path}")
+        by_shard[stored.shard] = path
+    wanted = [f"{k + 1}/{count}" for k in range(count)]
+    missing = [shard for shard in wanted if shard not in by_shard]
+    if missing:
+        raise SweepError(f"all {count} shards are needed, missing: {', '.join(missing)}")
+    return [by_shard[shard] for shard in wanted]
+
+
+def _opened(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError:
+        raise SweepError(f"{path} is not there") from None
+    except OSError:
+        raise SweepError(f"{path} is not a readable HDF5 file") from None
+
+
+def _arrays(path: Path, rows: slice = slice(None)) -> dict[str, np.ndarray]:
+    """The datasets of a part or a result, or some rows of them."""
+    arrays = {}
+
+    def add(name: str, entry: Any) -> None:
+        if isinstance(entry, h5py.Dataset):
+            arrays[name] = entry[rows]
+
+    with _opened(path) as file:
+        file.visititems(add)
+    return arrays
+
+
+def _rows(path: Path, position: int, chunk: int) -> dict[str, np.ndarray]:
+    """A chunk by its position in a shard."""
+    return _arrays(path, slice(position * chunk, (position + 1) * chunk))
+
+
+def _assemble(
+    output: Path, temporary: Path, manifest: Manifest, texts: dict[str, str], chunks: Iterable[Arrays]
+) -> None:
+    """Writes the result chunk by chunk beside its place and then puts it there, in one step."""
+    row = 0
+    datasets: dict[str, h5py.Dataset] = {}
+    with open(temporary, "wb+") as stream:
+        with h5py.File(stream, "w") as file:
+            file.attrs.update(texts | manifest.attributes())
+            for arrays in chunks:
+                for name, values in arrays.items():
+                    if name not in datasets:
+                        datasets[name] = _dataset(file, name, manifest.rows, values)
+                    datasets[name][row : row + len(values)] = values
+                row += len(arrays["case"])
+        stream.flush()
+        os.fsync(stream.fileno())
+    if row != manifest.rows:
+        temporary.unlink()
+        raise SweepError(f"{output} would have {row} of {manifest.rows} cases: the files are damaged")
+    os.replace(temporary, output)
+
+
+def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.Dataset:
+    dataset = file.create_dataset(name, (rows, *values.shape[1:]), values.dtype)
+    if name.startswith("parameters/"):
+        unit = unit_of(name.removeprefix("parameters/"))
+        dataset.attrs["units"], dataset.attrs["description"] = unit, "value of this key of the scene file"
+    else:
+        dataset.attrs["units"], dataset.attrs["description"] = DESCRIPTIONS[name]
+    return dataset
+
+
+def summary(path: Path) -> Summary:
+    with _opened(path) as file:
+        case, converged, error = (np.asarray(file[name]) for name in ("case", "converged", "error_estimate"))
+    largest = float(np.max(error[converged], initial=0.0))
+    return Summary(len(case), case[~converged].tolist(), largest)

@@ -421,7 +421,7 @@ def costs(rows: Sequence[Row]) -> list[str]:
 def picture(rows: Sequence[Row], benchmark: Sequence[Problem]) -> Figure:
     """Time against error; hollow where a run stopped above the tolerance."""
     figure = Figure(figsize=(14, 5.4), layout="constrained")
-    panels = figure.subplots(1, len(benchmark), sharey=True)
+    panels = figure.subplots(1, len(benchmark), sharey=True, squeeze=False)[0]
     for axes, problem in zip(panels, benchmark, strict=True):
         for method, (color, style) in STYLES.items():
             curve = [row for row in rows if (row.problem, row.method) == (problem.name, method)]

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from rodjax import problems
+from rodjax.batch import solve_batch
 from rodjax.compilation import enable_compilation_cache
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
@@ -13,6 +14,7 @@ from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene, write_scene
+from rodjax.sensitivity import end_stiffness, sensitivities
 from rodjax.solvers.line_search import LineSearch
 from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
@@ -42,13 +44,16 @@ __all__ = [
     "Swivel",
     "describe",
     "enable_compilation_cache",
+    "end_stiffness",
     "frame",
     "load",
     "problems",
     "read_scene",
     "rotate",
     "save",
+    "sensitivities",
     "solve",
+    "solve_batch",
     "solve_continuum",
     "solve_path",
     "write_scene",

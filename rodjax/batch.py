@@ -41,7 +41,7 @@ from rodjax.scene import Scene
 from rodjax.solvers.newton import Newton, NewtonMinimum, NewtonState, begin, is_running, minimum, turn
 
 # Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
-LANES = 16
+LANES = 8
 # Scenes in one call of a compiled program: the least of these that holds all, or as many calls of the last as it takes.
 # What is prepared for a scene takes some 20 kB at 50 segments.
 CHUNKS = (16, 128, 1024)

@@ -19,7 +19,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.linalg import factor
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, field_of, form_and_point
 from rodjax.scene import Scene, nondimensional
-from rodjax.stability import Motion, is_critical, neutral_turn
+from rodjax.stability import Motion, examined
 from rodjax.status import Outcome
 
 
@@ -113,12 +113,10 @@ def _change(
     form, begin = form_and_point(scene)
     here = form.linearized(begin)
     factors = factor(form.regular(here.system))
-    fixed = jax.lax.stop_gradient((form, begin, here, factors, residual))
-    neutral = neutral_turn(*fixed[:3])
-    is_regular = is_equilibrium & ~is_critical(*fixed[:4], neutral, fixed[4])
+    is_critical, neutral = examined(*jax.lax.stop_gradient((form, begin, here, factors, residual)))
     _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
     # A factor, as a choice between numbers would leave the transpose without the one that is none.
-    sign = jnp.where(is_regular, -1.0, jnp.nan).astype(f.dtype)
+    sign = jnp.where(is_equilibrium & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
     f, c = sign * f, sign * c
     motion = Motion(*factors.solve(f, c)).without(neutral)
     # The factors are those of a matrix shifted by what neutral motions need: once more, without.

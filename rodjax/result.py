@@ -25,7 +25,7 @@ from rodjax.energy import axial_strain_under
 from rodjax.guess import cubic
 from rodjax.linalg import factor
 from rodjax.scene import Scene, nondimensional
-from rodjax.stability import is_critical, neutral_turn
+from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
@@ -206,8 +206,7 @@ def _is_critical(equilibrium: Equilibrium) -> Bool[Array, ""]:
         return jnp.array(False)
     form, point = form_and_point(equilibrium)
     here = form.linearized(point)
-    neutral = neutral_turn(form, point, here)
-    return is_critical(form, point, here, factor(form.regular(here.system)), neutral, equilibrium.residual)
+    return examined(form, point, here, factor(form.regular(here.system)), equilibrium.residual)[0]
 
 
 @over_leading_axes

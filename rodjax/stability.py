@@ -10,7 +10,7 @@ from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, Mixed
 from rodjax.linalg import Factors
 
 # Steps of the inverse iteration for the softest motion: each brings it out by the ratio of the next stiffness to its.
-INVERSE_ITERATIONS = 3
+INVERSE_ITERATIONS = 2
 # At a fold the residual is the square of the softest stiffness, over twice its change along that motion: up to this
 # multiple of the residual the square may be nothing but what was left unsolved.
 CRITICAL = 100.0
@@ -29,14 +29,34 @@ class Motion(eqx.Module):
         return Motion(self.rotation - share * other.rotation, self.multipliers - share * other.multipliers)
 
 
+def examined(
+    form: MixedForm, point: MixedPoint, here: Linearization, factors: Factors, residual: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Motion]:
+    """Whether an equilibrium is critical, and its neutral turn, or no motion where it has none.
+
+    Critical: a motion other than the neutral one has no stiffness left, as far as the residual allows to tell.
+    `factors` are those of the system of the linearisation, made regular.
+    """
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+
+    def is_soft(neutral: Motion) -> Bool[Array, ""]:
+        stiffness = _softest(point, here, factors, neutral)
+        least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
+        return (stiffness**2 <= least) | ~jnp.isfinite(stiffness)
+
+    def closer() -> tuple[Bool[Array, ""], Motion]:
+        # Under a dead moment, without symmetry of the system, no turn is looked for.
+        neutral = neutral_turn(form, point, here) if form.has_potential else nothing
+        return is_soft(neutral), neutral
+
+    return jax.lax.cond(is_soft(nothing), closer, lambda: (jnp.array(False), nothing))
+
+
 def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Motion:
     """The turn of the whole rod about an axis that leaves it in equilibrium, or no motion where there is none.
 
-    So turns a rod between coaxial clamps, or between pins without weight, about the line through its ends. Under a dead
-    moment, without symmetry, none is looked for.
+    So turns a rod between coaxial clamps, or between pins without weight, about the line through its ends.
     """
-    if not form.has_potential:
-        return Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
 
     def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
         rotation = components(here.bases, jnp.cross(axis[:, None], point.tangents, axis=0))
@@ -55,23 +75,14 @@ def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Mot
     return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)
 
 
-def is_critical(
-    form: MixedForm,
-    point: MixedPoint,
-    here: Linearization,
-    factors: Factors,
-    neutral: Motion,
-    residual: Float[Array, ""],
-) -> Bool[Array, ""]:
-    """Whether a motion other than a neutral one has no stiffness, as far as the residual allows to tell."""
+def _softest(point: MixedPoint, here: Linearization, factors: Factors, neutral: Motion) -> Float[Array, ""]:
+    """The least stiffness [EI/L^2 per rad and length] of a motion other than the neutral one, by inverse iteration."""
     no_gap = jnp.zeros_like(here.closure)
     motion = Motion(components(here.bases, generic_field(point.tangents)), no_gap).without(neutral)
     h = 1 / point.tangents.shape[1]
-    stiffness = jnp.zeros_like(residual)
+    stiffness = jnp.zeros_like(h * point.total_twist)
     for _ in range(INVERSE_ITERATIONS):
         softer = Motion(*factors.solve(h * motion.rotation, no_gap)).without(neutral)
-        squared = jnp.sum(motion.rotation**2)
-        stiffness = squared / jnp.sum(motion.rotation * softer.rotation)
+        stiffness = jnp.sum(motion.rotation**2) / jnp.sum(motion.rotation * softer.rotation)
         motion = jax.tree.map(lambda x, size=jnp.max(jnp.abs(softer.rotation)): x / size, softer)
-    is_soft = stiffness**2 <= CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
-    return is_soft | ~jnp.isfinite(stiffness)
+    return stiffness

@@ -220,3 +220,51 @@ def test_tolerance(capsys):
     # Of the 200 scenes 90 % lie between 0.95 and 1.16.
     assert 0.9 < row.estimate[0] <= row.estimate[1] < 1.2
     assert "2 of 2" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_derivative_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    table = script("derivative_table")
+    monkeypatch.setattr(table, "REPEATS", 2)
+    rows, costs = table.main(["--only", "cantilever", "--no-cost", "--out", str(tmp_path)])
+    assert len(rows) == 6
+    assert costs == []
+    assert all(row.is_within for row in rows)
+    # Seen: 1e-11.
+    assert max(row.beside_differences for row in rows) < 1e-9
+    # Of second order on 50 segments and of fourth on 16; seen: 3.7e-4 and 2.3e-6.
+    errors = {kind: max(row.beside_exact for row in rows if row.mesh.discretization == kind) for kind in table.ORDERS}
+    assert errors["finite_difference"] < 5e-4
+    assert errors["hermite"] < 3e-6
+    assert "rod.length" in capsys.readouterr().out
+    lines = (tmp_path / "derivatives.md").read_text().splitlines()
+    assert sum(line.startswith("| ") for line in lines) == 2 + 6
+
+    mesh = table.Mesh("finite_difference", 6)
+    alone, both, ratio, iterations = table.timed(mesh, table.of_many, np.full(10, 0.1), None, 1)
+    assert min(alone, both, ratio) > 0
+    assert iterations > 0
+    costs = [table.Cost("EI", mesh, start, iterations, alone, both, ratio) for start in ("cold", "warm")]
+    assert "| EI | finite difference, 6 | cold |" in table.costs_markdown(costs, 1)
+
+
+@pytest.mark.slow
+def test_batch(capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    rows = script("batch").main(["--count", "50", "--segments", "6", "--repeats", "1", "--lbfgs", "1"])
+    assert len(rows) == 7
+    easy, mixed = rows[:3], rows[3:6]
+    assert all(row.converged == 1.0 for row in rows[:6])
+    assert len({row.turns for row in easy}) == 1  # the same work, whoever does it
+    assert mixed[0].turns > easy[0].turns
+    assert "solve_batch" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_sweep_stress(tmp_path, capsys):
+    runs = script("sweep_stress").main(
+        ["--cases", "20", "--segments", "4", "--chunk", "8", "--kills", "1", "--out", str(tmp_path)]
+    )
+    assert not runs[-1].was_killed
+    assert runs[-1].done == 3

@@ -103,6 +103,7 @@ def _run(folder: Path, output: str, chunk: int, kill: Kill | None = None, resume
     with open(folder / "said.txt", "w+") as said:
         process = subprocess.Popen(command, cwd=folder, stdout=said)
         status, peak = _ended(process.pid, parts, kill)
+        process.returncode = status  # it has been waited for
         said.seek(0)
         resumed = re.search(r"resumed: (\d+) of", said.read())
     if status not in (0, 3, -signal.SIGKILL):

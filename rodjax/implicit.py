@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import is_known
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.shape import Shape
-from rodjax.linalg import factor
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, field_of, form_and_point
 from rodjax.scene import Scene, nondimensional
 from rodjax.stability import Motion, examined
@@ -112,17 +111,12 @@ def _change(
 
     form, begin = form_and_point(scene)
     here = form.linearized(begin)
-    factors = factor(form.regular(here.system))
-    is_critical, neutral = examined(*jax.lax.stop_gradient((form, begin, here, factors, residual)))
+    factors, is_critical, neutral = examined(form, begin, here, residual)
     _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
     # A factor, as a choice between numbers would leave the transpose without the one that is none.
     sign = jnp.where(is_equilibrium & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
     f, c = sign * f, sign * c
     motion = Motion(*factors.solve(f, c)).without(neutral)
-    # The factors are those of a matrix shifted by what neutral motions need: once more, without.
-    left = here.system.times(motion.rotation, motion.multipliers)
-    correction = Motion(*factors.solve(f - left[0], c - left[1])).without(neutral)
-    motion = jax.tree.map(jnp.add, motion, correction)
     nothing = jax.tree.map(jnp.zeros_like, motion)
     _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
     return changes

@@ -23,7 +23,6 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under
 from rodjax.guess import cubic
-from rodjax.linalg import factor
 from rodjax.scene import Scene, nondimensional
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
@@ -206,7 +205,7 @@ def _is_critical(equilibrium: Equilibrium) -> Bool[Array, ""]:
         return jnp.array(False)
     form, point = form_and_point(equilibrium)
     here = form.linearized(point)
-    return examined(form, point, here, factor(form.regular(here.system)), equilibrium.residual)[0]
+    return examined(form, point, here, equilibrium.residual)[1]
 
 
 @over_leading_axes

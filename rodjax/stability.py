@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.joints import components, generic_field
 from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
-from rodjax.linalg import Factors
+from rodjax.linalg import Factors, factor_and_solve
 
-# Steps of the inverse iteration for the softest motion: each brings it out by the ratio of the next stiffness to its.
-INVERSE_ITERATIONS = 2
+# Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
+SHIFT_ROUNDINGS = 100.0
 # At a fold the residual is the square of the softest stiffness, over twice its change along that motion: up to this
 # multiple of the residual the square may be nothing but what was left unsolved.
 CRITICAL = 100.0
@@ -30,26 +30,44 @@ class Motion(eqx.Module):
 
 
 def examined(
-    form: MixedForm, point: MixedPoint, here: Linearization, factors: Factors, residual: Float[Array, ""]
-) -> tuple[Bool[Array, ""], Motion]:
-    """Whether an equilibrium is critical, and its neutral turn, or no motion where it has none.
+    form: MixedForm, point: MixedPoint, here: Linearization, residual: Float[Array, ""]
+) -> tuple[Factors, Bool[Array, ""], Motion]:
+    """The factors at an equilibrium, whether it is critical, and its neutral turn, or no motion where it has none.
 
     Critical: a motion other than the neutral one has no stiffness left, as far as the residual allows to tell.
-    `factors` are those of the system of the linearisation, made regular.
     """
+    places = point.tangents.shape[1]
+    # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
+    shift = jnp.asarray(SHIFT_ROUNDINGS * jnp.finfo(residual.dtype).eps * 4 * places**2, residual.dtype)
+    generic = components(here.bases, generic_field(point.tangents))
     nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+    # The first step of the inverse iteration in one sweep with the factorisation.
+    factors, *softer = factor_and_solve(here.system.shifted(shift / places), generic / places, nothing.multipliers)
+    stiffness, softer = jax.lax.stop_gradient((_stiffness(generic, softer[0]), Motion(*softer)))
+    least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
 
-    def is_soft(neutral: Motion) -> Bool[Array, ""]:
-        stiffness = _softest(point, here, factors, neutral)
-        least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
+    def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
         return (stiffness**2 <= least) | ~jnp.isfinite(stiffness)
 
-    def closer() -> tuple[Bool[Array, ""], Motion]:
+    def closer(fixed: tuple[MixedForm, MixedPoint, Linearization, Factors]) -> tuple[Bool[Array, ""], Motion]:
+        form, point, here, factors = fixed
         # Under a dead moment, without symmetry of the system, no turn is looked for.
         neutral = neutral_turn(form, point, here) if form.has_potential else nothing
-        return is_soft(neutral), neutral
+        other = Motion(generic, nothing.multipliers).without(neutral).rotation
+        softest = Motion(*factors.solve(other / places, nothing.multipliers)).without(neutral)
+        return is_soft(_stiffness(other, softest.rotation)), neutral
 
-    return jax.lax.cond(is_soft(nothing), closer, lambda: (jnp.array(False), nothing))
+    fixed = jax.lax.stop_gradient((form, point, here, factors))
+    critical, neutral = jax.lax.cond(is_soft(stiffness), closer, lambda _: (jnp.array(False), nothing), fixed)
+    return factors, critical, neutral
+
+
+def _stiffness(generic: Float[Array, "b m"], softer: Float[Array, "b m"]) -> Float[Array, ""]:
+    """Rayleigh's quotient [EI/L^2 per rad and length] of what a generic motion becomes by a step of inverse iteration.
+
+    That of the softest motion, where this is much softer than all others; never less.
+    """
+    return jnp.sum(generic * softer) / jnp.sum(softer**2)
 
 
 def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Motion:
@@ -73,16 +91,3 @@ def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Mot
     least = NEUTRAL * size / point.tangents.shape[1]
     is_neutral = (size > jnp.sqrt(NEUTRAL)) & (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)
     return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)
-
-
-def _softest(point: MixedPoint, here: Linearization, factors: Factors, neutral: Motion) -> Float[Array, ""]:
-    """The least stiffness [EI/L^2 per rad and length] of a motion other than the neutral one, by inverse iteration."""
-    no_gap = jnp.zeros_like(here.closure)
-    motion = Motion(components(here.bases, generic_field(point.tangents)), no_gap).without(neutral)
-    h = 1 / point.tangents.shape[1]
-    stiffness = jnp.zeros_like(h * point.total_twist)
-    for _ in range(INVERSE_ITERATIONS):
-        softer = Motion(*factors.solve(h * motion.rotation, no_gap)).without(neutral)
-        stiffness = jnp.sum(motion.rotation**2) / jnp.sum(motion.rotation * softer.rotation)
-        motion = jax.tree.map(lambda x, size=jnp.max(jnp.abs(softer.rotation)): x / size, softer)
-    return stiffness

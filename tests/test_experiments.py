@@ -252,10 +252,10 @@ def test_derivative_table(tmp_path, capsys, monkeypatch):
 @pytest.mark.slow
 def test_batch(capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
-    rows = script("batch").main(["--count", "50", "--segments", "6", "--repeats", "1", "--lbfgs", "1"])
-    assert len(rows) == 7
-    easy, mixed = rows[:3], rows[3:6]
-    assert all(row.converged == 1.0 for row in rows[:6])
+    rows = script("batch").main(["--count", "50", "--segments", "6", "--repeats", "1", "--lbfgs", "0"])
+    easy, mixed = rows[:3], rows[3:]
+    assert len(mixed) == 3
+    assert all(row.converged == 1.0 for row in rows)
     assert len({row.turns for row in easy}) == 1  # the same work, whoever does it
     assert mixed[0].turns > easy[0].turns
     assert "solve_batch" in capsys.readouterr().out
@@ -267,4 +267,4 @@ def test_sweep_stress(tmp_path, capsys):
         ["--cases", "20", "--segments", "4", "--chunk", "8", "--kills", "1", "--out", str(tmp_path)]
     )
     assert not runs[-1].was_killed
-    assert runs[-1].done == 3
+    assert "the same to the last bit" in capsys.readouterr().out

@@ -5,10 +5,12 @@ from typing import TYPE_CHECKING
 from rodjax import problems
 from rodjax.batch import solve_batch
 from rodjax.compilation import enable_compilation_cache
+from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import PointForce
+from rodjax.modes import Mode, lowest_mode
 from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Rod
@@ -20,6 +22,7 @@ from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel, frame, rotate
+from rodjax.tracing import BranchEnd
 
 if TYPE_CHECKING:
     from rodjax.continuum import solve_continuum
@@ -27,11 +30,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Branch",
+    "BranchEnd",
     "Clamp",
+    "CriticalPoint",
     "Equilibrium",
     "Free",
     "Guess",
     "LineSearch",
+    "Mode",
     "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
@@ -42,11 +49,15 @@ __all__ = [
     "SceneFileError",
     "Status",
     "Swivel",
+    "critical_point",
+    "critical_points",
     "describe",
     "enable_compilation_cache",
     "end_stiffness",
+    "follow",
     "frame",
     "load",
+    "lowest_mode",
     "problems",
     "read_scene",
     "rotate",
@@ -56,6 +67,7 @@ __all__ = [
     "solve_batch",
     "solve_continuum",
     "solve_path",
+    "switch_branch",
     "write_scene",
 ]
 

@@ -17,7 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
-from rodjax.checks import instance, is_known
+from rodjax.checks import instance, is_known, sequence
 from rodjax.compilation import compiled
 from rodjax.discretization.mixed import MixedForm
 from rodjax.equilibrium import (
@@ -28,17 +28,16 @@ from rodjax.equilibrium import (
     checked_options,
     first_state,
     in_units_of,
-    is_finest,
+    is_here,
+    refined_together,
     solve_from,
-    warn_if_inaccurate,
 )
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.path import path_from, stack_scenes
-from rodjax.refinement import SAFETY, next_size
 from rodjax.result import Equilibrium, SolverState, equilibrium, warn_if_not_converged
 from rodjax.scene import Scene
-from rodjax.solvers.newton import Newton, NewtonMinimum, NewtonState, begin, is_running, minimum, turn
+from rodjax.solvers.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
 
 # Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
 LANES = 8
@@ -56,6 +55,7 @@ def solve_batch(
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
+    find: Find = "minimum",
     mesh: Mesh | None = None,
     progress: bool = False,
 ) -> Equilibrium:
@@ -69,13 +69,14 @@ def solve_batch(
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `progress`: show a progress bar.
-    - `segments`, `rtol`, `discretization`, `solver`, `planar`: as for `rodjax.solve`. All scenes have one mesh: where
-        the estimated error of any is above `rtol`, all are solved on a finer one.
+    - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`: as for `rodjax.solve`. All scenes have one mesh:
+        where the estimated error of any is above `rtol`, all are solved on a finer one.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
     is marked, and all others are not affected.
     """
     stacked = _stacked(scenes)
+    instance(progress, "progress", bool)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
         if len(mesh.axis_names) != 1:
@@ -84,19 +85,15 @@ def solve_batch(
     count = given.rod.length.shape[0]
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
-    options, rtol = checked_options(given, segments, rtol, discretization, solver, guess, planar)
-    while True:
-        result = _in_chunks(given, guess, options, mesh, progress)
-        if rtol is None or not is_known(result) or not _is_here(result):
-            break
-        errors = np.asarray(result.error_estimate)[np.asarray(result.converged)]
-        error = float(np.max(errors, initial=0.0))
-        if SAFETY * error <= rtol or is_finest(options):
-            warn_if_inaccurate(error, rtol, options)
-            break
-        options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
-        guess = result if result.s.ndim == 2 else guess
-    if _is_here(result):
+    options, rtol = checked_options(given, segments, rtol, discretization, solver, guess, planar, find)
+
+    def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
+        # A path has one guess, for its first scene.
+        begin = guess if last is None or last.s.ndim > 2 else last
+        return _in_chunks(given, begin, options, mesh, progress)
+
+    result = refined_together(solve, options, rtol)
+    if is_here(result):
         warn_if_not_converged(result)
     return differentiable(stacked, result)
 
@@ -104,16 +101,14 @@ def solve_batch(
 def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Scene:
     if isinstance(scenes, Scene):
         return scenes if scenes.rod.length.ndim == 2 else stack_scenes(scenes)
-    rows = [row if isinstance(row, Scene) else stack_scenes(row) for row in scenes]
+    rows = sequence(scenes, "scenes", "Scene, or of lists of them")
+    for k, row in enumerate(rows):
+        instance(row, f"scenes[{k}]", (Scene, Sequence))
+    rows = [row if isinstance(row, Scene) else stack_scenes(row) for row in rows]
     lengths = {row.rod.length.shape for row in rows}
     if len(lengths) > 1:
         raise ValueError(f"scenes must be single scenes or paths of one length, got shapes {sorted(lengths)}")
     return stack_scenes(rows)
-
-
-def _is_here(result: Equilibrium) -> bool:
-    """Whether this process holds all of it."""
-    return not is_known(result) or result.s.is_fully_addressable
 
 
 def _in_chunks(
@@ -121,16 +116,19 @@ def _in_chunks(
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     each = _is_stack(guess)
-    if not is_known(scenes, guess):
-        counts = jnp.full(1 if mesh is None else mesh.size, count // (1 if mesh is None else mesh.size))
-        return _solve_many(scenes, guess, counts, options, mesh)
     devices = 1 if mesh is None else mesh.size
     share = -(-count // devices)
     chunk = next((size for size in CHUNKS if share <= size), CHUNKS[-1])
-    if jax.process_count() > 1 and mesh is not None:
+    is_traced = not is_known(scenes, guess)
+    if mesh is not None and (is_traced or jax.process_count() > 1):
         if count % devices:
-            raise ValueError(f"scenes must be a multiple of the {devices} devices of several processes, got {count}")
+            raise ValueError(
+                f"scenes must be a multiple of the {devices} devices of mesh, inside jit or over several processes; "
+                f"got {count}"
+            )
         chunk = share
+    if is_traced:
+        return _solve_many(scenes, guess, jnp.full(devices, share), options, mesh)
     parts = []
     for first in tqdm(range(0, count, chunk * devices), disable=not progress, unit="chunk"):
         last = min(first + chunk * devices, count)
@@ -198,10 +196,8 @@ def _solve_here(
         )
         return results(scenes, starts)
     searches = _mapped(search, scenes, starts)
-    found = _minima(searches, counts[0], options.solver)
-    return _mapped(
-        lambda scene, search, minimum: equilibrium(scene, search.found(minimum), once), scenes, searches, found
-    )
+    ends = _ends(searches, counts[0], options.solver, options.find)
+    return _mapped(lambda scene, search, end: equilibrium(scene, search.found(end), once), scenes, searches, ends)
 
 
 def _mapped(function: Callable, *stacks: Any) -> Any:
@@ -216,11 +212,11 @@ class _Lanes(eqx.Module):
     forms: MixedForm
     states: NewtonState
     following: Int[Array, ""]
-    found: NewtonMinimum
+    ends: NewtonEnd
 
 
-def _minima(searches: Search, count: Int[Array, ""], solver: Newton) -> NewtonMinimum:
-    """What the first `count` of the searches find."""
+def _ends(searches: Search, count: Int[Array, ""], solver: Newton, find: Find) -> NewtonEnd:
+    """Where the first `count` of the searches end."""
     total = searches.point.total_twist.shape[0]
     lanes = min(LANES, total)
 
@@ -231,29 +227,29 @@ def _minima(searches: Search, count: Int[Array, ""], solver: Newton) -> NewtonMi
 
     def advanced(lanes: _Lanes) -> _Lanes:
         going = is_running(lanes.states)
-        states = jax.vmap(functools.partial(turn, solver=solver))(lanes.forms, lanes.states)
+        states = jax.vmap(functools.partial(turn, solver=solver, find=find))(lanes.forms, lanes.states)
         states = _chosen(going, states, lanes.states)
         lanes = eqx.tree_at(lambda lanes: lanes.states, lanes, states)
-        ended = ~is_running(states) & (lanes.search < count)
+        done = ~is_running(states) & (lanes.search < count)
         # Handing over takes longer than a turn of one rod, and so waits for a few.
-        enough = jnp.where(lanes.following < count, len(ended) // 4, jnp.sum(lanes.search < count))
-        return jax.lax.cond(jnp.sum(ended) >= jnp.maximum(enough, 1), handed_over, lambda lanes, _: lanes, lanes, ended)
+        enough = jnp.where(lanes.following < count, len(done) // 4, jnp.sum(lanes.search < count))
+        return jax.lax.cond(jnp.sum(done) >= jnp.maximum(enough, 1), handed_over, lambda lanes, _: lanes, lanes, done)
 
-    def handed_over(lanes: _Lanes, ended: Bool[Array, "lanes"]) -> _Lanes:
-        found = jax.vmap(minimum)(lanes.forms, lanes.states)
-        to = jnp.where(ended, lanes.search, total)
-        found = jax.tree.map(lambda all, new: all.at[to].set(new, mode="drop"), lanes.found, found)
-        following = lanes.following + jnp.cumsum(ended)
-        search = jnp.where(ended, jnp.minimum(following - 1, count), lanes.search)
-        forms, states = _chosen(ended, started(search), (lanes.forms, lanes.states))
-        return _Lanes(search, forms, states, following[-1], found)
+    def handed_over(lanes: _Lanes, done: Bool[Array, "lanes"]) -> _Lanes:
+        ends = jax.vmap(ended)(lanes.forms, lanes.states)
+        to = jnp.where(done, lanes.search, total)
+        ends = jax.tree.map(lambda all, new: all.at[to].set(new, mode="drop"), lanes.ends, ends)
+        following = lanes.following + jnp.cumsum(done)
+        search = jnp.where(done, jnp.minimum(following - 1, count), lanes.search)
+        forms, states = _chosen(done, started(search), (lanes.forms, lanes.states))
+        return _Lanes(search, forms, states, following[-1], ends)
 
     first = jnp.minimum(jnp.arange(lanes), count)
     forms, states = started(first)
-    nothing = jax.eval_shape(jax.vmap(minimum), searches.form, jax.vmap(begin)(searches.form, searches.point))
+    nothing = jax.eval_shape(jax.vmap(ended), searches.form, jax.vmap(begin)(searches.form, searches.point))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), nothing)
     start = _Lanes(first, forms, states, jnp.minimum(jnp.full_like(count, lanes), count), nothing)
-    return jax.lax.while_loop(lambda lanes: jnp.any(lanes.search < count), advanced, start).found
+    return jax.lax.while_loop(lambda lanes: jnp.any(lanes.search < count), advanced, start).ends
 
 
 def _chosen(which: Bool[Array, "lanes"], new: Any, old: Any) -> Any:

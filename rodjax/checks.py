@@ -5,7 +5,9 @@ Values are checked where they are known. Inside `jax.jit`, `vmap` or `grad` they
 Plain numbers are NumPy's until a module stores them: JAX would compile a program for each operation on them.
 """
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -16,6 +18,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 Numbers = Array | np.ndarray
+
+# Characters of a value in a message; more of it would hide what the message says.
+MOST_SHOWN = 200
 
 
 def is_known(*values: Any) -> bool:
@@ -34,28 +39,59 @@ def leaf(numbers: Float[Numbers, "*shape"]) -> Float[Array, "*shape"]:
     return numbers if isinstance(numbers, Array) else jax.device_put(numbers)
 
 
+def shown(value: Any) -> str:
+    """`value` as a message shows it."""
+    try:
+        return line(repr(value))
+    except Exception:  # Python shows no whole number of more than 4300 digits
+        return f"a {type(value).__name__}"
+
+
+def line(text: str) -> str:
+    """`text` on one line, and cut where it is long."""
+    text = " ".join(text.split())
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
 def number_array(value: Any, name: str, shape: tuple[int, ...] = ()) -> Float[Numbers, "..."]:
     """`value` as floating-point numbers of the given shape, of JAX's precision, finite where they are known."""
     kind = "a number" if shape == () else f"numbers of shape {shape}"
     try:
         array = value if isinstance(value, Array) else namespace(value).asarray(value)
-        is_whole = jnp.issubdtype(array.dtype, jnp.integer)
-        if not (is_whole or jnp.issubdtype(array.dtype, jnp.floating)):
+        if not any(jnp.issubdtype(array.dtype, numbers) for numbers in (jnp.integer, jnp.floating)):
             raise TypeError
+        dtype = array.dtype if array.dtype in (np.float32, np.float64) else float
         # Strong type: a weakly typed leaf would compile a second program for the same scene.
-        array = array.astype(jax.dtypes.canonicalize_dtype(float if is_whole else array.dtype))
+        with np.errstate(over="ignore"):  # said below
+            array = array.astype(jax.dtypes.canonicalize_dtype(dtype))
     except (TypeError, ValueError):
-        raise TypeError(f"{name} must be {kind}, got {value!r}") from None
+        raise TypeError(f"{name} must be {kind}, got {shown(value)}") from None
     if array.shape != shape:
         raise ValueError(f"{name} must be {kind}, got an array of shape {array.shape}")
     if is_known(array) and not np.all(np.isfinite(array)):
-        raise ValueError(f"{name} must be finite, got {value!r}")
+        raise ValueError(f"{name} must be finite, got {shown(value)}")
     return array
+
+
+def number_list(value: Any, name: str) -> Float[Numbers, "k"]:
+    """`value` as one or more numbers."""
+    try:
+        shape = np.shape(value)
+    except ValueError:  # rows of several lengths
+        raise TypeError(f"{name} must be a number or a list of them, got {shown(value)}") from None
+    if len(shape) > 1 or shape == (0,):
+        raise ValueError(f"{name} must be a number or a list of them, got an array of shape {shape}")
+    return number_array(value, name, shape).reshape(-1)
 
 
 def plain_number(name: str) -> Callable[[Any], float]:
     """What makes Python's number of an option of that name: a solver is part of what a program is compiled for."""
-    return lambda value: float(number_array(value, name))
+
+    def number(value: Any) -> float:
+        number_array(value, name)
+        return float(value)  # of Python's precision, whatever that of JAX is when it is made
+
+    return number
 
 
 def positive(value: Any, name: str) -> Float[Numbers, ""]:
@@ -94,8 +130,9 @@ def rotation(value: Any, name: str) -> Float[Numbers, "3 3"]:
         # Loose enough for frames typed in with 6 digits or held in float32, tight enough to catch a left-handed one.
         tolerance = 1e-5
         matrix = np.asarray(array)
-        error = np.max(np.abs(matrix.T @ matrix - np.eye(3)))
-        if error > tolerance:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.max(np.abs(matrix.T @ matrix - np.eye(3)))
+        if not error <= tolerance:
             raise ValueError(
                 f"{name} must be a rotation (columns d1, d2, t of unit length at right angles), "
                 f"got one that is off by {error:.1e}; tangent and d2 make one, in Python by rodjax.frame(tangent, d2)"
@@ -107,10 +144,15 @@ def rotation(value: Any, name: str) -> Float[Numbers, "3 3"]:
 
 def whole_number(value: Any, name: str, least: int, most: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be a whole number from {least} to {most}, got {value!r}")
+        raise TypeError(f"{name} must be a whole number from {least} to {most}, got {shown(value)}")
     if not least <= value <= most:
-        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {value}")
+        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {shown(int(value))}")
     return int(value)
+
+
+def one_of(value: Any, name: str, allowed: Sequence[str]) -> None:
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))}, got {shown(value)}")
 
 
 def instance(value: Any, name: str, kinds: type | Sequence[type]) -> None:
@@ -118,4 +160,21 @@ def instance(value: Any, name: str, kinds: type | Sequence[type]) -> None:
     if not isinstance(value, kinds):
         allowed = " or ".join(kind.__name__ for kind in kinds)
         article = "an" if allowed[0] in "AEIOU" else "a"
-        raise TypeError(f"{name} must be {article} {allowed}, got {value!r}")
+        raise TypeError(f"{name} must be {article} {allowed}, got {shown(value)}")
+
+
+def sequence(value: Any, name: str, kind: str) -> tuple[Any, ...]:
+    if not isinstance(value, Iterable):
+        raise TypeError(f"{name} must be a list of {kind}, got {shown(value)}")
+    return tuple(value)
+
+
+def file_path(value: Any, name: str, suffix: str = "") -> Path:
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name} must be the name of a file, got {shown(value)}")
+    path = Path(value)
+    if "\0" in str(path):
+        raise ValueError(f"{name} must be the name of a file, without null characters, got {shown(str(path))}")
+    if suffix and path.suffix != suffix:
+        raise ValueError(f"{name} must end in {suffix}, got {str(path)!r}")
+    return path

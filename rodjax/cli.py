@@ -4,6 +4,7 @@ Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did no
 """
 
 import argparse
+import io
 import os
 import sys
 import warnings
@@ -16,6 +17,7 @@ import jax
 import numpy as np
 
 import rodjax
+from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, save
 from rodjax.result import Equilibrium, NotConvergedWarning
@@ -37,13 +39,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
-        return arguments.run(arguments)
+        code = arguments.run(arguments)
+        sys.stdout.flush()
+        return code
     except (CommandError, SceneFileError, SweepError) as error:
         message = str(error)
     except OSError as error:
         message = f"{error.strerror or error}: {error.filename}" if error.filename else str(error)
+        _drop_what_cannot_be_printed()
     print(f"rodjax: {' '.join(message.split())}", file=sys.stderr)
     return 2
+
+
+def _drop_what_cannot_be_printed() -> None:
+    """Where stdout goes to a full disk Python would try again as it ends, and fail with lines and a code of its own."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
@@ -195,7 +208,10 @@ def _plot(equilibrium: Equilibrium, path: Path) -> None:
         return
     from rodjax.plot import plot_rod
 
-    plot_rod(equilibrium).savefig(path)
+    # Put together in memory, so that a full disk leaves the picture that was there.
+    image = io.BytesIO()
+    plot_rod(equilibrium).savefig(image, format=path.suffix[1:])
+    replace_file(path, image.getvalue())
 
 
 def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:

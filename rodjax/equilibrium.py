@@ -3,6 +3,7 @@
 import functools
 import typing
 import warnings
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.checks import instance, is_known, positive, whole_number
+from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.hermite import Curve, HermiteElements
@@ -32,7 +33,7 @@ from rodjax.result import (
     warn_if_not_converged,
 )
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
-from rodjax.solvers.newton import Newton, NewtonMinimum, find_minimum, is_stable
+from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Status
 from rodjax.units import Units
@@ -47,6 +48,7 @@ DEFAULT_SOLVER = Newton()
 DEFAULT_RTOL = 1e-3
 # A smaller error than this drowns in the residual of 1e-8 EI/L^2 at which a solve stops.
 LEAST_RTOL = 1e-10
+LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
@@ -61,7 +63,8 @@ class Options(NamedTuple):
     segments: int
     discretization: Discretization
     solver: Solver
-    planar: bool
+    planar: bool = False
+    find: Find = "minimum"
 
 
 def solve(
@@ -73,6 +76,7 @@ def solve(
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
+    find: Find = "minimum",
 ) -> Equilibrium:
     """The equilibrium of a scene.
 
@@ -93,6 +97,9 @@ def solve(
         supports and gravity.
     - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
         motions out of the plane too.
+    - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that would
+        rather leave its plane, is left along it, always to the same side. `"equilibrium"`: what the steps of Newton's
+        method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
@@ -104,7 +111,8 @@ def solve(
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
     fixed_scene, guess = not_differentiated(scene, guess)
-    options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar)
+    check_single(guess)
+    options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), options)
     if rtol is not None and is_known(result):
         result = _refined(result, options, rtol)
@@ -119,7 +127,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
         failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
         error = float(np.max(np.linalg.norm(errors.nodes, axis=1)))
-        if (bool(result.converged) and SAFETY * error <= rtol) or is_finest(options) or failures == MOST_FAILURES:
+        if (bool(result.converged) and SAFETY * error <= rtol) or _is_finest(options) or failures == MOST_FAILURES:
             break
         options = options._replace(
             segments=next_size(options.segments, error if result.converged else np.nan, rtol, options.discretization)
@@ -131,15 +139,39 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
             (finer.iterations + result.iterations, finer.evaluations + result.evaluations),
         )
     if result.converged:
-        warn_if_inaccurate(error, rtol, options)
+        _warn_if_inaccurate(error, rtol, options)
     return result
 
 
-def is_finest(options: Options) -> bool:
+def refined_together(
+    solve: Callable[[Options, Equilibrium | None], Equilibrium], options: Options, rtol: float | None
+) -> Equilibrium:
+    """Many equilibria on one mesh: all solved again until the estimated error of those that converged is below `rtol`.
+
+    `solve` is given the options and what it found with the last ones.
+    """
+    result = solve(options, None)
+    while rtol is not None and is_here(result):
+        errors = np.asarray(result.error_estimate)[np.asarray(result.converged)]
+        error = float(np.max(errors, initial=0.0))
+        if SAFETY * error <= rtol or _is_finest(options):
+            _warn_if_inaccurate(error, rtol, options)
+            break
+        options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
+        result = solve(options, result)
+    return result
+
+
+def is_here(result: Equilibrium) -> bool:
+    """Whether its numbers are known, and this process holds all of them."""
+    return is_known(result) and result.s.is_fully_addressable
+
+
+def _is_finest(options: Options) -> bool:
     return options.segments >= SIZES[options.discretization][-1]
 
 
-def warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
+def _warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
     if not error <= rtol:
         warnings.warn(
             f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh, of {options.segments} "
@@ -170,6 +202,7 @@ def checked_options(
     solver: Solver | None,
     guess: Guess | Equilibrium | None,
     planar: bool,
+    find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
     if guess is not None:
@@ -179,9 +212,7 @@ def checked_options(
     instance(solver, "solver", typing.get_args(Solver))
     if discretization is None:
         discretization = _discretization(guess, segments, solver)
-    if discretization not in typing.get_args(Discretization):
-        allowed = " or ".join(map(repr, typing.get_args(Discretization)))
-        raise ValueError(f"discretization must be {allowed}, got {discretization!r}")
+    one_of(discretization, "discretization", typing.get_args(Discretization))
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
@@ -193,19 +224,30 @@ def checked_options(
     elif segments is None:
         rtol = DEFAULT_RTOL
     if segments is not None:
-        segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
+        segments = whole_number(segments, "segments", LEAST_SEGMENTS[discretization], MAX_SEGMENTS)
     elif isinstance(guess, Equilibrium):
         segments = guess.s.shape[-1] - 1
     elif rtol is not None and is_known(scene, guess):
         segments = first_size(rtol, discretization)
     else:
         segments = TRACED_SEGMENTS[discretization]
+    one_of(find, "find", typing.get_args(Find))
+    if find == "equilibrium" and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton where find is 'equilibrium': NonlinearCG only goes down")
     instance(planar, "planar", bool)
     if planar:
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton where planar is True")
         check_planar(scene, 0.0 if guess is None else guess.total_twist)
-    return Options(segments, discretization, solver, planar), rtol
+    return Options(segments, discretization, solver, planar, find), rtol
+
+
+def check_single(guess: Guess | Equilibrium | None) -> None:
+    if isinstance(guess, Equilibrium) and guess.s.ndim > 1:
+        raise ValueError(
+            f"guess must be a single equilibrium, got a stack of shape {guess.s.shape[:-1]}; take one of it, such as "
+            "jax.tree.map(lambda leaf: leaf[-1], guess)"
+        )
 
 
 def checked_rtol(rtol: Any) -> float:
@@ -264,7 +306,8 @@ def _first_state(
 
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
-    return _found(*in_units_of(scene, state), twist, options)
+    # To the same bits, whatever is made of it in the same program.
+    return jax.lax.optimization_barrier(_found(*in_units_of(scene, state), twist, options))
 
 
 def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
@@ -296,8 +339,8 @@ class Search(eqx.Module):
         within = is_planar(scene, twist)
         return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
 
-    def found(self, minimum: NewtonMinimum) -> Found:
-        point, outcome, stable = minimum.point, minimum.outcome, minimum.is_stable
+    def found(self, end: NewtonEnd) -> Found:
+        point, outcome, stable = end.point, end.outcome, end.is_stable
         start, reached = self.shape, self.shape.reached(self.form, point)
         # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
         is_same = start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps
@@ -315,7 +358,7 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     solver = options.solver
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, twist, options)
-        return search.found(find_minimum(search.form, search.point, solver))
+        return search.found(find_equilibrium(search.form, search.point, solver, options.find))
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, twist)
     minimum = minimize(problem, start, solver)

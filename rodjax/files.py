@@ -2,7 +2,8 @@
 
 The file is HDF5 with two groups. `/VTKHDF` holds the picture: the centerline as one polyline, with the point data of
 `point_data`, over time steps for a path. `/rodjax` holds every field of `Equilibrium` under its own name, each with
-the attributes `units` and `description`, so that `load` needs no pickle and other programs need no rodjax.
+the attributes `units` and `description`, so that `load` needs no pickle and other programs need no rodjax. A hash
+follows after the end of the HDF5 file, by which `load` finds damage.
 """
 
 import dataclasses
@@ -20,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.atomic_write import replace_file
-from rodjax.checks import instance, is_known
+from rodjax.atomic_write import has_seal, replace_file, seal
+from rodjax.checks import file_path, instance, is_known, one_of
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
@@ -86,6 +87,7 @@ FIELDS = {
         )
     },
 }
+DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
 KINDS = {kind.__name__: kind for kind in (Clamp, Swivel, Pin, Free, Polyline, Curve)}
 
@@ -99,7 +101,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
     Raises `ValueError` or `TypeError` for what cannot be saved, `OSError` where the file cannot be written.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
-    path = _checked(path)
+    path = file_path(path, "path", SUFFIX)
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
     leading = equilibrium.s.shape[:-1]
@@ -118,6 +120,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
         from rodjax import __version__
 
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
+    seal(image)
     replace_file(path, image.getvalue())
 
 
@@ -127,14 +130,19 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
     Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
     rodjax, and where it holds float64 while JAX is set to float32, which would round it.
     """
-    path = _checked(path)
-    image = path.read_bytes()
+    path = file_path(path, "path", SUFFIX)
+    image = io.BytesIO(path.read_bytes())
     try:
-        with h5py.File(io.BytesIO(image), "r") as file:
+        has_seal(image)
+    except ValueError as error:
+        raise ValueError(f"{path} is not a readable HDF5 file: {error}") from None
+    try:
+        with h5py.File(image, "r") as file:
             _group(file, "VTKHDF", path)
             group = _group(file, "rodjax", path)
             _check_format(group, path)
-            equilibrium = _read(group, Equilibrium, path)
+            points = group.get("s")
+            equilibrium = _read(group, Equilibrium, path, points.shape if isinstance(points, h5py.Dataset) else ())
     # What h5py raises for a file that is not HDF5, is cut short or damaged.
     except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
@@ -151,13 +159,6 @@ def point_data(equilibrium: Equilibrium) -> dict[str, Float[Array, "..."]]:
         "Frame d2": equilibrium.frames[..., 1],
         "Tangent": equilibrium.tangents,
     }
-
-
-def _checked(path: str | os.PathLike[str]) -> Path:
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise ValueError(f"path must end in {SUFFIX}, got {str(path)!r}")
-    return path
 
 
 def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
@@ -201,32 +202,51 @@ def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
             dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place + name]
 
 
-def _read(group: h5py.Group, kind: Any, path: Path) -> Any:
-    """A module of class `kind`, or of the one that the group names, with NumPy arrays for leaves."""
+def _read(group: h5py.Group, kind: Any, path: Path, shape: tuple[int, ...]) -> Any:
+    """A module of class `kind`, or of the one that the group names, with NumPy arrays for leaves.
+
+    `shape`: of the arclengths of the nodes.
+    """
     if kind in (Shape, Support):
         name = group.attrs.get("kind")
-        if name not in KINDS:
+        if not isinstance(name, str) or not issubclass(KINDS.get(name, object), kind):
             raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(KINDS)}")
         kind = KINDS[name]
     # As it was written, without the checks of its constructor, which take a single scene of sensible numbers.
     module = object.__new__(kind)
     for field in dataclasses.fields(kind):
         entry = group.get(field.name)
+        is_group = dataclasses.is_dataclass(field.type) or typing.get_origin(field.type) is tuple
         if field.metadata.get("static"):
             value = group.attrs[field.name]
+            one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
         elif isinstance(entry, h5py.Group) and typing.get_origin(field.type) is tuple:
             item = typing.get_args(field.type)[0]
-            value = tuple(_read(_group(entry, str(k), path), item, path) for k in range(len(entry)))
-        elif isinstance(entry, h5py.Group):
-            value = _read(entry, field.type, path)
-        elif isinstance(entry, h5py.Dataset):
-            value = entry[()]
-        elif types.NoneType in typing.get_args(field.type):
+            value = tuple(_read(_group(entry, str(k), path), item, path, shape) for k in range(len(entry)))
+        elif isinstance(entry, h5py.Group) and is_group:
+            value = _read(entry, field.type, path, shape)
+        elif isinstance(entry, h5py.Dataset) and not is_group:
+            value = _array(entry, field.type, path, shape)
+        elif entry is None and types.NoneType in typing.get_args(field.type):
             value = None
         else:
             raise ValueError(f"{path} lacks {group.name}/{field.name}: it is damaged, or rodjax.save did not write it")
         object.__setattr__(module, field.name, value)
     return module
+
+
+def _array(dataset: h5py.Dataset, annotation: Any, path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """The numbers of a dataset, which are of the kind and shape with which the field is annotated."""
+    kind = next(iter(typing.get_args(annotation)), annotation)  # of one that may be None
+    *leading, nodes = shape or (0,)
+    sizes = {"n+1": nodes, "n": nodes - 1, "m": 2 * nodes - 1, "3": 3}
+    wanted = (*leading, *(sizes[size] for size in kind.dim_str.split() if size != "..."))
+    if dataset.shape != wanted or dataset.dtype.name not in kind.dtypes:
+        raise ValueError(
+            f"{path} is damaged: {dataset.name} must be {kind.dtype.__name__} of shape {wanted}, "
+            f"got {dataset.dtype.name} of shape {dataset.shape}"
+        )
+    return dataset[()]
 
 
 def _as_jax(values: Any, path: Path) -> Array:

@@ -8,10 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import leaf, number_array
+from rodjax.checks import leaf, number_array, shown
+from rodjax.discretization.joints import generic_field
 from rodjax.scene import Scene
 from rodjax.supports import Directed, Free, Held, Support
 from rodjax.units import Units
+
+# Cosine between neighbouring edges below which a guess counts as folded, and by how much of an edge it is unfolded.
+FOLDED = -0.99
+ASIDE = 0.05
 
 
 class Guess(eqx.Module):
@@ -25,7 +30,10 @@ class Guess(eqx.Module):
     total_twist: Float[Array, ""]
 
     def __init__(self, points: Any, total_twist: Any = 0.0):
-        shape = np.shape(points)
+        try:
+            shape = np.shape(points)
+        except ValueError:
+            raise TypeError(f"points must be numbers of shape (m, 3), got {shown(points)}") from None
         if len(shape) != 2 or shape[0] < 2 or shape[1] != 3:
             raise ValueError(f"points must have the shape (m, 3) with m >= 2, got {shape}")
         self.points = leaf(number_array(points, "points", shape))
@@ -33,7 +41,19 @@ class Guess(eqx.Module):
 
     def nodes(self, units: Units, segments: int) -> Float[Array, "n+1 3"]:
         """The nodes of a mesh on this shape, nondimensional."""
-        return resampled((self.points - units.origin[None]) / units.length, segments)
+        return _unfolded(resampled((self.points - units.origin[None]) / units.length, segments))
+
+
+def _unfolded(nodes: Float[Array, "n+1 3"]) -> Float[Array, "n+1 3"]:
+    """Where an edge runs back along the last one, or has no length, all edges a little aside: such have no torsion."""
+    edges = jnp.diff(nodes, axis=0)
+    lengths = jnp.sqrt(jnp.sum(edges**2, axis=1))
+    least = ASIDE * jnp.maximum(jnp.mean(lengths), ASIDE / len(edges))
+    aside = edges + least * generic_field(edges.T).T
+    cosines = jnp.sum(edges[1:] * edges[:-1], axis=1) / jnp.maximum(lengths[1:] * lengths[:-1], least**2)
+    is_folded = jnp.any(cosines < FOLDED) | jnp.any(lengths < least)
+    unfolded = nodes[:1] + jnp.concatenate([jnp.zeros((1, 3), nodes.dtype), jnp.cumsum(aside, axis=0)])
+    return jnp.where(is_folded, unfolded, nodes)
 
 
 def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:

@@ -47,9 +47,10 @@ def _(primals, tangents):
         scene,
         is_leaf=lambda change: change is None,
     )
-    # The value stays what the search found, whatever XLA makes of the same numbers beside the derivatives.
-    inputs = jax.lax.optimization_barrier((scene, _differentiable(scene, result)))
-    return result, _change_of_result(*inputs, scene_change)
+    # With derivatives of its own, for second ones of what is made of it.
+    value = _differentiable(scene, result)
+    # It stays what the search found, whatever XLA makes of the same numbers beside the derivatives.
+    return value, _change_of_result(*jax.lax.optimization_barrier((scene, value)), scene_change)
 
 
 @jax.jit
@@ -76,6 +77,24 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
+def carried_to(
+    scene: Scene, shape: Shape, point: MixedPoint, motion: Motion | None = None
+) -> tuple[MixedForm, MixedPoint]:
+    """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
+
+    The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
+    carried there.
+    """
+    form = MixedForm.of(scene, field_of(scene, shape))
+    tangents = form.field.as_held(scene, point.tangents)
+    begin = MixedPoint(tangents, point.end_force, form.twist_near(tangents, point.total_twist))
+    if motion is None:
+        return form, begin
+    bases = form.field.basis(scene, form.bases(form.field.with_held(scene, tangents)))
+    force_change = form.force_change(form.closure(motion.multipliers))
+    return form, form.moved(begin, bases, motion.rotation, force_change)
+
+
 def _change(
     scene: Scene,
     scene_change: Scene,
@@ -89,27 +108,16 @@ def _change(
     Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
     """
 
-    def form_and_point(scene: Scene, motion: Motion | None = None) -> tuple[MixedForm, MixedPoint]:
-        """The point under other numbers of the scene, the tangents that supports hold with it."""
-        form = MixedForm.of(scene, field_of(scene, shape))
-        tangents = form.field.as_held(scene, point.tangents)
-        begin = MixedPoint(tangents, point.end_force, form.twist_near(tangents, point.total_twist))
-        if motion is None:
-            return form, begin
-        bases = form.field.basis(scene, form.bases(form.field.with_held(scene, tangents)))
-        force_change = form.force_change(form.closure(motion.multipliers))
-        return form, form.moved(begin, bases, motion.rotation, force_change)
-
     def gradient(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        form, here = form_and_point(scene)
+        form, here = carried_to(scene, shape, point)
         linearization = form.linearized(here)
         return linearization.gradient, linearization.closure
 
     def reached(scene: Scene, motion: Motion) -> tuple[Shape, MixedPoint]:
-        form, there = form_and_point(scene, motion)
+        form, there = carried_to(scene, shape, point, motion)
         return shape.reached(form, there), there
 
-    form, begin = form_and_point(scene)
+    form, begin = carried_to(scene, shape, point)
     here = form.linearized(begin)
     factors, is_critical, neutral = examined(form, begin, here, residual)
     _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))

@@ -60,10 +60,11 @@ class SaddlePointSystem(eqx.Module):
         rows = self.border if self.rows is None else self.rows
         return f, jnp.sum(rows * x[:, None], axis=(0, 2)) - self.compliance @ y
 
-    def shifted(self, shift: Float[Array, ""]) -> "SaddlePointSystem":
-        """H + shift I in the place of H."""
+    def shifted(self, shift: Float[Array, ""] | Float[Array, "n"]) -> "SaddlePointSystem":
+        """H + shift I in the place of H, with one shift or one for each block."""
         identity = jnp.eye(self.diagonal.shape[0], dtype=shift.dtype)[..., None]
-        return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift * identity)
+        shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
+        return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
 
 
 class Factors(eqx.Module):

@@ -1,34 +1,40 @@
 """Quasistatic paths: a sequence of scenes, each solved from the last, in one compiled scan."""
 
 import functools
+import math
+import typing
 from collections.abc import Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import instance, is_known, leaf, namespace
+from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.compilation import compiled
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Discretization,
     Options,
     Solver,
+    check_single,
     checked_options,
     first_state,
-    is_finest,
+    refined_together,
     solve_from,
-    warn_if_inaccurate,
 )
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
-from rodjax.refinement import SAFETY, next_size
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, warn_if_not_converged
-from rodjax.scene import Scene, between, nondimensional
+from rodjax.scene import Scene, between, dead_end_moment, nondimensional
+from rodjax.solvers.newton import Find
 from rodjax.status import Outcome, is_converged
+from rodjax.tracing import DEFAULT_STEPS, trace
+
+# What a path does where its branch of equilibria loses its stability.
+AtCritical = Literal["jump", "stop"]
 
 # A step is halved at most so often, to a sixty-fourth of it.
 MAX_SPLITS = 6
@@ -46,6 +52,8 @@ def solve_path(
     solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
+    find: Find = "minimum",
+    at_critical: AtCritical = "jump",
     progress: bool = False,
 ) -> Equilibrium:
     """The equilibria of a sequence of scenes, each solved from the last; turns are carried along.
@@ -54,32 +62,55 @@ def solve_path(
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames may turn by
       less than pi from one to the next.
+    - `at_critical`: `"jump"`: where the branch of equilibria loses its stability the path goes on with the minimum
+        found beyond, as a cable does. `"stop"`: it ends with the last scene before the first critical point of the
+        branch, see `rodjax.follow`; eager only.
     - `progress`: show a progress bar.
 
     A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
     step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
 
-    - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`: as for `rodjax.solve`. The guess is for the
-        first scene; where the estimated error of any step is above `rtol`, the whole path is solved on a finer mesh of
-        equal segments.
+    - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`, `find`: as for `rodjax.solve`. The guess is for
+        the first scene; where the estimated error of any step is above `rtol`, the whole path is solved on a finer mesh
+        of equal segments.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
+    instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)
-    options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar)
-    while True:
-        path = path_from(fixed_scenes, guess, options, progress)
-        if rtol is None or not is_known(path):
-            break
-        errors = np.asarray(path.error_estimate)[np.asarray(path.converged)]
-        error = float(np.max(errors, initial=0.0))
-        if SAFETY * error <= rtol or is_finest(options):
-            warn_if_inaccurate(error, rtol, options)
-            break
-        options = options._replace(segments=next_size(options.segments, error, rtol, options.discretization))
+    check_single(guess)
+    options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar, find)
+    one_of(at_critical, "at_critical", typing.get_args(AtCritical))
+    if at_critical == "stop":
+        _check_stop(fixed_scenes)
+
+    def solve(options: Options, _: Equilibrium | None) -> Equilibrium:
+        return path_from(fixed_scenes, guess, options, progress)
+
+    path = refined_together(solve, options, rtol)
     warn_if_not_converged(path)
+    if at_critical == "stop":
+        count = _before_critical(fixed_scenes, path)
+        stacked, path = jax.tree.map(lambda leaf: leaf[:count], (stacked, path))
     return differentiable(stacked, path)
+
+
+def _check_stop(scenes: Scene) -> None:
+    if not is_known(scenes):
+        raise ValueError("at_critical must be 'jump' inside jax.jit or vmap: how many scenes a path has must be known")
+    if dead_end_moment(scenes) is not None:
+        raise ValueError("at_critical must be 'jump' for a dead moment on a free end, which has no potential")
+
+
+def _before_critical(scenes: Scene, path: Equilibrium) -> int:
+    """How many scenes of a path come before the first critical point of its branch."""
+    count = scenes.rod.length.shape[0]
+    if count == 1:
+        return 1
+    first = jax.tree.map(lambda leaf: leaf[0], path)
+    crossings = trace(scenes, 0.0, first, 1.0, DEFAULT_STEPS, only_first=True).crossings
+    return math.floor(crossings[0].station.parameter) + 1 if crossings else count
 
 
 def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
@@ -90,7 +121,7 @@ def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
                 "scenes must be a list, or one Scene with a leading axis on every leaf; got a single scene"
             )
         return scenes
-    scenes = list(scenes)
+    scenes = sequence(scenes, "scenes", "Scene")
     if not scenes:
         raise ValueError("scenes must hold at least one scene, got none")
     for k, scene in enumerate(scenes):

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from rodjax.checks import line, shown
+
 # SI unit (none: a plain number), shape and an example of every key that holds numbers.
 QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "length": ("m", (), '"1 m"'),
@@ -43,7 +45,11 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "rtol": ("", (), "1e-3"),
     "steps": ("", (), "10"),
 }
-NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I)
+NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I | re.S)
+
+
+# A power of a number is no unit, and one such as 9**9**9 would take forever.
+NUMBER_TO_A_POWER = re.compile(r"[\d⁰¹²³⁴-⁹]\s*(\*\*|\^|[⁰¹²³⁴-⁹])")
 
 
 class SceneFileError(ValueError):
@@ -70,7 +76,7 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
     for key in table:
         if key not in allowed:
             raise SceneFileError(
-                f"{prefix}{' '.join(key.split())} is not allowed here; allowed are {', '.join(allowed)}"
+                f"{prefix}{line(key) or shown(key)} is not allowed here; allowed are {', '.join(allowed)}"
             )
     for key in required:
         if key not in table:
@@ -81,7 +87,7 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
 
 def table_list(value: Any, where: str) -> list[Any]:
     if not isinstance(value, list):
-        raise SceneFileError(f"{where} must be a list of tables, each [[{where}]], got {value!r}")
+        raise SceneFileError(f"{where} must be a list of tables, each [[{where}]], got {shown(value)}")
     return value
 
 
@@ -89,7 +95,7 @@ def choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
     """The one of the allowed names that the table has under the key; `None` where it has no such key."""
     _check_table(table, where)
     if key in table and table[key] not in allowed:
-        raise SceneFileError(f"{where}.{key} must be one of {', '.join(allowed)}, got {table[key]!r}")
+        raise SceneFileError(f"{where}.{key} must be one of {', '.join(allowed)}, got {shown(table[key])}")
     return table.get(key)
 
 
@@ -110,14 +116,14 @@ def assignment(key: str, value: Any) -> str:
 
 def _check_table(table: Any, where: str) -> None:
     if not isinstance(table, dict):
-        raise SceneFileError(f"{where} must be a table, [{where}], got {table!r}")
+        raise SceneFileError(f"{where} must be a table, [{where}], got {shown(table)}")
 
 
 def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
     """A quantity or plain number of the shape that its key has, in SI units; of a direction, the unit vector."""
     si, shape, example = QUANTITIES[key]
 
-    def mistake(allowed: str, got: str = repr(value)) -> ValueError:
+    def mistake(allowed: str, got: str = shown(value)) -> ValueError:
         return ValueError(f"{key} must {allowed}, for example {key} = {example}, got {got}")
 
     numbers, unit = value, ""
@@ -135,13 +141,14 @@ def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
         raise mistake("have a unit")
     factor = _factor(unit, si)
     if factor is None:
-        raise mistake(f"be in {si} or a like unit", f"the unit {unit!r}")
+        raise mistake(f"be in {si} or a like unit", f"the unit {shown(unit)}")
     try:
-        array = np.array(numbers, float) * factor
+        with np.errstate(over="ignore"):  # said below
+            array = np.array(numbers, float) * factor
     except OverflowError:
         array = np.array(math.inf)
     if not np.all(np.isfinite(array)):
-        raise ValueError(f"{key} must be finite, got {value!r}")
+        raise ValueError(f"{key} must be finite, got {shown(value)}")
     if key not in ("tangent", "d2"):
         return array
     if not np.any(array):
@@ -176,6 +183,8 @@ def _factor(unit: str, si: str) -> float | None:
     """How many SI units a unit is; `None` where it is no unit of this dimension."""
     if unit == si:
         return 1.0
+    if NUMBER_TO_A_POWER.search(unit):
+        return None
     units = _unit_registry()
     try:
         return float(units.Quantity(1.0, units.Unit(unit)).to(units.Unit(si)).magnitude)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import is_known
+from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.compilation import compiled
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.edges import EdgeTangents
@@ -23,6 +23,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under
 from rodjax.guess import cubic
+from rodjax.linalg import factor
 from rodjax.scene import Scene, nondimensional
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
@@ -70,6 +71,10 @@ class Equilibrium(eqx.Module):
       is asked for
     - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
+    - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
+      examined, under a dead moment and in the continuum. Computed when asked for
+    - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
+      line. Computed when asked for
     - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
     - `state`: what a solve that begins from here takes over
     """
@@ -110,7 +115,15 @@ class Equilibrium(eqx.Module):
 
     @property
     def critical(self) -> Bool[Array, "..."]:
-        return _is_critical(self)
+        return _examination(self).critical
+
+    @property
+    def index(self) -> Int[Array, "..."]:
+        return _examination(self).index
+
+    @property
+    def neutral(self) -> Bool[Array, "..."]:
+        return _examination(self).neutral
 
     def position_at(self, s: Any) -> Float[Array, "... k 3"]:
         """Centerline at arclengths `s` (k,) [m] from 0 to L, [..., k, 3].
@@ -120,7 +133,7 @@ class Equilibrium(eqx.Module):
 
         Raises `ValueError` where an arclength lies beyond the rod.
         """
-        s = jnp.atleast_1d(jnp.asarray(s, self.s.dtype))
+        s = leaf(number_list(s, "s")).astype(self.s.dtype)
         if is_known(s, self.s):
             length = float(np.min(self.s[..., -1]))
             if np.any(s < 0) or np.any(s > length):
@@ -147,6 +160,8 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
     elastic_energy = form.elastic_energy(point)
     potential = elastic_energy + form.load_energy(point)
     converged = is_converged(outcome.status)
+    axial_strain = axial_strain_under(scaled.rod, results.tension)
+    is_collapsed = ~converged & (jnp.min(axial_strain) <= -1)
     return Equilibrium(
         s=form.field.s * scene.rod.length,
         nodes=units.origin[None] + units.length * nodes,
@@ -155,7 +170,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         twist=results.twist / units.length,
         total_twist=point.total_twist,
         tension=results.tension * units.force,
-        axial_strain=axial_strain_under(scaled.rod, results.tension),
+        axial_strain=axial_strain,
         energy=units.energy * potential + energy_of_origin(scaled, units),
         elastic_energy=units.energy * elastic_energy,
         start_force=results.start_force * units.force,
@@ -164,7 +179,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         end_moment=results.end_moment * units.energy,
         converged=converged,
         stable=converged & found.is_stable,
-        status=outcome.status,
+        status=jnp.where(is_collapsed, Status.COLLAPSED, outcome.status),
         iterations=outcome.iterations,
         evaluations=outcome.evaluations,
         substeps=substeps,
@@ -199,13 +214,23 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
     return errors_of_differences(*form_and_point(equilibrium), state.shape.nodes, equilibrium.tangents.T)
 
 
+class _Examination(eqx.Module):
+    critical: Bool[Array, "..."]
+    index: Int[Array, "..."]
+    neutral: Bool[Array, "..."]
+
+
 @over_leading_axes
-def _is_critical(equilibrium: Equilibrium) -> Bool[Array, ""]:
+def _examination(equilibrium: Equilibrium) -> _Examination:
+    nothing = _Examination(jnp.array(False), jnp.full((), -1), jnp.array(False))
     if equilibrium.discretization == "continuum":
-        return jnp.array(False)
+        return nothing
     form, point = form_and_point(equilibrium)
     here = form.linearized(point)
-    return examined(form, point, here, equilibrium.residual)[1]
+    _, critical, turn = examined(form, point, here, equilibrium.residual)
+    if not form.has_potential:
+        return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
+    return _Examination(critical, factor(form.regular(here.system)).negative, jnp.any(turn.rotation != 0))
 
 
 @over_leading_axes
@@ -233,13 +258,21 @@ def field_of(scene: Scene, shape: Shape) -> TangentField:
 
 
 def describe(equilibrium: Equilibrium) -> str:
-    """How a solve ended, in words, and whether derivatives exist; for several, each outcome with its count."""
-    critical = np.asarray(equilibrium.critical & equilibrium.converged)
-    without = "critical (a motion has no stiffness left), so that derivatives are not numbers"
-    outcome = _outcome(equilibrium)
-    if critical.ndim == 0:
-        return f"{outcome}; {without}" if critical else outcome
-    return f"{outcome}\n{np.sum(critical)} {without}" if np.any(critical) else outcome
+    """How a solve ended, in words, and what is special about the equilibrium; for several, each with its count."""
+    instance(equilibrium, "equilibrium", Equilibrium)
+    examination = _examination(equilibrium)
+    converged = np.asarray(equilibrium.converged)
+    remarks = {
+        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
+        "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
+        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(equilibrium.axial_strain, -1)
+        <= -1,
+    }
+    counts = {remark: int(np.sum(np.asarray(holds) & converged)) for remark, holds in remarks.items()}
+    if converged.ndim == 0:
+        return "; ".join([_outcome(equilibrium), *(remark for remark, count in counts.items() if count)])
+    return "\n".join([_outcome(equilibrium), *(f"{count} {remark}" for remark, count in counts.items() if count)])
 
 
 def _outcome(equilibrium: Equilibrium) -> str:

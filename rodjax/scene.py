@@ -9,7 +9,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, is_known, leaf, number_array, vector
+from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
 from rodjax.loads import PointForce
 from rodjax.rod import Rod
 from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
@@ -56,16 +56,24 @@ class Scene(eqx.Module):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
         instance(end, "end", Support)
+        point_forces = sequence(point_forces, "point_forces", "PointForce")
         for k, force in enumerate(point_forces):
             instance(force, f"point_forces[{k}]", PointForce)
-        self.rod = rod
-        self.start = start
-        self.end = end
-        self.gravity = None if gravity is None else leaf(vector(gravity, "gravity"))
-        self.point_forces = tuple(point_forces)
-        self.turns = None if turns is None else leaf(number_array(turns, "turns"))
+        gravity = None if gravity is None else leaf(vector(gravity, "gravity"))
+        turns = None if turns is None else leaf(number_array(turns, "turns"))
+        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns = _of_one_precision(
+            (rod, start, end, gravity, point_forces, turns)
+        )
         _check_supports(self)
         _check_numbers(self)
+
+
+def _of_one_precision(parts: Any) -> Any:
+    """With all numbers of the highest precision among them: a compiled program takes no mixture."""
+    dtypes = {leaf.dtype for leaf in jax.tree.leaves(parts)}
+    if len(dtypes) == 1:
+        return parts
+    return jax.tree.map(lambda leaf: leaf.astype(max(dtypes, key=lambda dtype: dtype.itemsize)), parts)
 
 
 def _check_supports(scene: Scene) -> None:
@@ -96,7 +104,8 @@ def _check_numbers(scene: Scene) -> None:
             raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
     start, end = scene.start, scene.end
     if isinstance(start, Held) and isinstance(end, Held):
-        span = float(np.linalg.norm(np.subtract(end.position, start.position)))
+        with np.errstate(over="ignore"):
+            span = float(np.linalg.norm(np.subtract(end.position, start.position)))
         if span > MAX_SPAN * length:
             raise ValueError(
                 f"the ends are {span:g} m apart, but a rod of length {length:g} m "

@@ -63,7 +63,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.atomic_write import replace_file
-from rodjax.checks import instance, is_known, leaf, whole_number
+from rodjax.checks import file_path, instance, is_known, leaf, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.loads import PointForce
 from rodjax.quantities import SceneFileError, assignment, check_keys, choice, named, si_values, table_list
@@ -125,8 +125,9 @@ def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
 
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     """As `read_scene`, with the settings of the solve."""
+    path = file_path(path, "path")
     try:
-        return SceneReader().read(toml_tables(read_text(Path(path))))
+        return SceneReader().read(toml_tables(read_text(path)))
     except SceneFileError as mistake:
         # Up to here the message is without the file.
         raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
@@ -139,6 +140,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
     file cannot be written.
     """
     instance(scene, "scene", Scene)
+    path = file_path(path, "path")
     if not is_known(scene):
         raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
     if scene.rod.length.ndim:
@@ -154,7 +156,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
-    replace_file(Path(path), "\n".join([*lines, ""]).encode())
+    replace_file(path, "\n".join([*lines, ""]).encode())
 
 
 def _written(module: eqx.Module, keys: Sequence[str]) -> list[str]:
@@ -178,7 +180,9 @@ def read_text(path: Path) -> str:
 
 def toml_tables(text: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        tables = tomllib.loads(text)
+        pickle.dumps(tables)  # what is nested too deeply for this is so for all that follows
+        return tables
     except (ValueError, RecursionError) as error:
         raise SceneFileError(f"is not valid TOML: {error}") from None
 

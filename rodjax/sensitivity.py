@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance
+from rodjax.checks import instance, sequence
 from rodjax.compilation import compiled
 from rodjax.equilibrium import solve
 from rodjax.implicit import differentiable
@@ -136,7 +136,9 @@ def _is_frame(name: str) -> bool:
 def _checked_names(argument: str, names: Any, allowed: Sequence[str], kind: str) -> tuple[str, ...]:
     if isinstance(names, str):
         raise TypeError(f"{argument} must be a list of names, such as [{names!r}], got {names!r} alone")
-    names = tuple(names)
+    names = sequence(names, argument, "names")
+    if not names:
+        raise ValueError(f"{argument} must hold at least one name, got none; allowed are {', '.join(allowed)}")
     for name in names:
         if name not in allowed:
             raise ValueError(f"{argument} must be names of {kind}, got {name!r}; allowed are {', '.join(allowed)}")

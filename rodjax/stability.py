@@ -7,13 +7,21 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.joints import components, generic_field
 from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
-from rodjax.linalg import Factors, factor_and_solve
+from rodjax.linalg import Factors, factor, factor_and_solve
 
 # Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
 SHIFT_ROUNDINGS = 100.0
+# The most of it, in single precision: a thousandth of the softest bending mode's pi^2.
+MOST_SHIFT = 0.01
 # At a fold the residual is the square of the softest stiffness, over twice its change along that motion: up to this
 # multiple of the residual the square may be nothing but what was left unsolved.
 CRITICAL = 100.0
+# The lowest eigenvalue is bracketed by powers of this factor, by so many at most, halved so often, and then found by
+# so many inverse iterations.
+BRACKET_GROWTH = 4.0
+MAX_BRACKETS = 30
+HALVINGS = 16
+INVERSE_ITERATIONS = 4
 
 
 class Motion(eqx.Module):
@@ -38,12 +46,15 @@ def examined(
     """
     places = point.tangents.shape[1]
     # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
-    shift = jnp.asarray(SHIFT_ROUNDINGS * jnp.finfo(residual.dtype).eps * 4 * places**2, residual.dtype)
+    shift = min(SHIFT_ROUNDINGS * float(jnp.finfo(residual.dtype).eps) * 4 * places**2, MOST_SHIFT)
+    shift = jnp.asarray(shift, residual.dtype)
     generic = components(here.bases, generic_field(point.tangents))
     nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
     # The first step of the inverse iteration in one sweep with the factorisation.
-    factors, *softer = factor_and_solve(here.system.shifted(shift / places), generic / places, nothing.multipliers)
-    stiffness, softer = jax.lax.stop_gradient((_stiffness(generic, softer[0]), Motion(*softer)))
+    factors, softer, _ = factor_and_solve(here.system.shifted(shift / places), generic / places, nothing.multipliers)
+    # Which motions are soft is a matter of the point alone; only the factors are differentiated.
+    form, point, here, residual, generic = jax.lax.stop_gradient((form, point, here, residual, generic))
+    stiffness = _stiffness(generic, jax.lax.stop_gradient(softer))
     least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
 
     def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
@@ -57,7 +68,7 @@ def examined(
         softest = Motion(*factors.solve(other / places, nothing.multipliers)).without(neutral)
         return is_soft(_stiffness(other, softest.rotation)), neutral
 
-    fixed = jax.lax.stop_gradient((form, point, here, factors))
+    fixed = (form, point, here, jax.lax.stop_gradient(factors))
     critical, neutral = jax.lax.cond(is_soft(stiffness), closer, lambda _: (jnp.array(False), nothing), fixed)
     return factors, critical, neutral
 
@@ -91,3 +102,48 @@ def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Mot
     least = NEUTRAL * size / point.tangents.shape[1]
     is_neutral = (size > jnp.sqrt(NEUTRAL)) & (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)
     return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)
+
+
+def softest(form: MixedForm, point: MixedPoint, here: Linearization) -> tuple[Float[Array, ""], Motion]:
+    """The lowest eigenvalue [EI/L^2] of the Hessian under the constraints, by the length of rod, and its motion.
+
+    The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion.
+    """
+    # None where a support holds the tangent.
+    mass = form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+    one = jnp.ones((), mass.dtype)
+
+    def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
+        return factor(here.system.shifted(-value * mass)).negative > 0
+
+    # Outwards from zero until the sign changes, then by halves.
+    sign = jnp.where(lies_below(0 * one), -1.0, 1.0).astype(one.dtype)
+    width = jax.lax.while_loop(
+        lambda width: (lies_below(sign * width) == (sign < 0)) & (width < BRACKET_GROWTH**MAX_BRACKETS),
+        lambda width: BRACKET_GROWTH * width,
+        one,
+    )
+    inner = jnp.where(width > 1, width / BRACKET_GROWTH, 0.0)
+    bounds = jnp.minimum(sign * inner, sign * width), jnp.maximum(sign * inner, sign * width)
+
+    def halved(_, bounds: tuple[Float[Array, ""], Float[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        low, high = bounds
+        middle = (low + high) / 2
+        is_below = lies_below(middle)
+        return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
+
+    low, high = jax.lax.fori_loop(0, HALVINGS, halved, bounds)
+    low -= high - low
+    factors = factor(here.system.shifted(-low * mass))
+    generic = components(here.bases, generic_field(point.tangents))
+    first = Motion(generic, jnp.zeros_like(here.closure)), low
+
+    def closer(_, found: tuple[Motion, Float[Array, ""]]) -> tuple[Motion, Float[Array, ""]]:
+        motion, _ = found
+        motion = Motion(*factors.solve(mass[None] * motion.rotation, jnp.zeros_like(here.closure)))
+        size = jnp.sqrt(jnp.sum(mass[None] * motion.rotation**2))
+        share = jnp.sum(mass[None] * motion.rotation * found[0].rotation)
+        return Motion(motion.rotation / size, motion.multipliers / size), low + share / size**2
+
+    motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
+    return stiffness, motion

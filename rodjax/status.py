@@ -17,6 +17,7 @@ class Status(enum.IntEnum):
     RUNNING = 5
     SADDLE = 6
     NOT_PLANAR = 7
+    COLLAPSED = 8
 
     @property
     def message(self) -> str:
@@ -29,6 +30,7 @@ class Status(enum.IntEnum):
             Status.RUNNING: "not finished",
             Status.SADDLE: "not converged: an equilibrium was found that is not a minimum, and no way down from it",
             Status.NOT_PLANAR: "not converged: planar is True, but supports, loads or twist leave the plane",
+            Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
         }[self]
 
 

@@ -5,9 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import direction, is_known, leaf, namespace, rotation, vector
+from rodjax.checks import direction, is_known, leaf, namespace, rotation, shown, vector
 from rodjax.units import Units
 
 
@@ -94,13 +95,19 @@ class Free(Support):
 Held = Clamp | Swivel | Pin
 Directed = Clamp | Swivel
 
+# Of a rotation vector [rad], a number of turns beyond which single precision does not tell the angle.
+LARGEST_TURN = 1e6
+
 
 def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
     """A frame (3, 3) turned about the axis of a rotation vector (3,) by its length [rad], global axes.
 
     The derivative of a solve by a frame is meant for rotations: take it by this vector, at zero.
     """
-    x, y, z = vector(rotation_vector, "rotation_vector")
+    turned = jnp.asarray(rotation(frame, "frame"))
+    x, y, z = checked = vector(rotation_vector, "rotation_vector")
+    if is_known(checked) and not np.max(np.abs(checked)) < LARGEST_TURN:
+        raise ValueError(f"rotation_vector must be shorter than {LARGEST_TURN:g} rad, got {shown(rotation_vector)}")
     squared = x * x + y * y + z * z
     # Series near zero, where the derivatives of the length are infinite.
     is_small = squared < 1e-4
@@ -109,7 +116,6 @@ def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
     b = jnp.where(is_small, 0.5 - squared / 24 + squared**2 / 720 - squared**3 / 40320, (1 - jnp.cos(angle)) / angle**2)
     zero = jnp.zeros_like(squared)
     cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    turned = jnp.asarray(rotation(frame, "frame"))
     return turned + a * (cross @ turned) + b * (cross @ (cross @ turned))
 
 

@@ -36,6 +36,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,14 +46,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from rodjax.atomic_write import replace_file
+from rodjax.atomic_write import has_seal, replace_file, seal
 from rodjax.batch import solve_batch
-from rodjax.equilibrium import DEFAULT_RTOL, solve
+from rodjax.checks import file_path, whole_number
+from rodjax.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.files import FIELDS
 from rodjax.result import NotConvergedWarning
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
-from rodjax.sweep_cases import CaseReader, SweepError, unit_of
+from rodjax.sweep_cases import MAX_CASES, CaseReader, SweepError, unit_of
 
 SUFFIX = ".h5"
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.
@@ -116,9 +118,14 @@ class Manifest(NamedTuple):
     @classmethod
     def of(cls, attributes: Mapping[str, Any], path: Path) -> "Manifest":
         try:
-            return cls(**{name: kind(attributes[name]) for name, kind in cls.__annotations__.items()})
+            manifest = cls(**{name: kind(attributes[name]) for name, kind in cls.__annotations__.items()})
+            index, count = map(int, manifest.shard.split("/"))
         except (KeyError, TypeError, ValueError):
             raise SweepError(f"{path} is not of rodjax sweep, or of another version of it") from None
+        is_sweep = min(manifest.chunk, manifest.cases) > 0 and manifest.cases <= MAX_CASES and 1 <= index <= count
+        if not is_sweep or not manifest.chunks or not 2 <= manifest.segments <= MAX_SEGMENTS:
+            raise SweepError(f"{path} is damaged: no sweep is like what it says")
+        return manifest
 
 
 NAMES = {
@@ -216,8 +223,15 @@ def sweep(
     Raises `SweepError` for what the user can mend: before anything is solved, but for a case that makes no sense though
     the extreme ones do; `OSError` where a file cannot be written.
     """
-    output = Path(output)
-    reader = CaseReader(Path(scene), Path(over))
+    output = file_path(output, "output")
+    try:
+        index, count = shard
+        whole_number(index, "shard[0]", 1, whole_number(count, "shard[1]", 1, MAX_CASES))
+        if chunk is not None:
+            whole_number(chunk, "chunk", 1, sys.maxsize)
+    except (TypeError, ValueError) as error:
+        raise SweepError(str(error)) from None
+    reader = CaseReader(file_path(scene, "scene"), file_path(over, "over"))
     parts = output.with_name(output.name + ".parts")
     if resume and chunk is None:
         chunk = _earlier_chunk(output, parts)
@@ -234,7 +248,7 @@ def sweep(
         return summary(output)
     manifest = _begin(reader, manifest, parts, say)
     _solve_chunks(reader, manifest, parts, progress)
-    files = (_arrays(_part(parts, chunk)) for chunk in manifest.chunks)
+    files = (_arrays(_part(parts, chunk), manifest, chunk) for chunk in manifest.chunks)
     texts = {"scene": reader.scene_text, "over": reader.over_text}
     _assemble(output, parts / "assembled.tmp", manifest, texts, files)
     shutil.rmtree(parts)
@@ -267,11 +281,12 @@ def _manifest_in(parts: Path) -> Manifest:
     file = parts / "manifest.json"
     try:
         return Manifest.of(json.loads(file.read_text()), file)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise error if isinstance(error, SweepError) else SweepError(f"{file} is not of rodjax sweep") from None
 
 
 def _manifest_of(result: Path) -> Manifest:
+    _is_sealed(result)
     with _opened(result) as file:
         return Manifest.of(file.attrs, result)
 
@@ -289,7 +304,9 @@ def _begin(reader: CaseReader, manifest: Manifest, parts: Path, say: Callable[[s
     if file.exists():
         stored = _manifest_in(parts)
         _check_same(stored, manifest, parts)
-        done = sum(_part(parts, chunk).exists() for chunk in manifest.chunks)
+        if stored.fingerprint != json.loads(file.read_text()).get("fingerprint"):
+            raise SweepError(f"{file} is damaged; remove {parts} to begin anew")
+        done = sum(_is_there(_part(parts, chunk)) for chunk in manifest.chunks)
         say(f"resumed: {done} of {len(manifest.chunks)} chunks are there")
         return stored
     # A mistake found after hours would have to be mended in the grid, which would then be another sweep. To read all
@@ -320,8 +337,26 @@ def _part(parts: Path, chunk: int) -> Path:
     return parts / f"chunk-{chunk:06d}{SUFFIX}"
 
 
+def _is_there(part: Path) -> bool:
+    """Whether a finished chunk is there; a damaged one is solved again."""
+    try:
+        return part.exists() and _is_sealed(part)
+    except SweepError:
+        return False
+
+
+def _is_sealed(path: Path) -> bool:
+    try:
+        with open(path, "rb") as file:
+            return has_seal(file)
+    except FileNotFoundError:
+        raise SweepError(f"{path} is not there") from None
+    except ValueError as error:
+        raise SweepError(f"{path} is not a readable HDF5 file: {error}") from None
+
+
 def _solve_chunks(reader: CaseReader, manifest: Manifest, parts: Path, progress: bool) -> None:
-    missing = [chunk for chunk in manifest.chunks if not _part(parts, chunk).exists()]
+    missing = [chunk for chunk in manifest.chunks if not _is_there(_part(parts, chunk))]
     done = manifest.rows - sum(len(manifest.cases_of(chunk)) for chunk in missing)
     for chunk in _bar(manifest, missing, done, progress):
         arrays = _solved(reader, manifest, manifest.cases_of(chunk))
@@ -330,6 +365,7 @@ def _solve_chunks(reader: CaseReader, manifest: Manifest, parts: Path, progress:
         with h5py.File(image, "w") as file:
             for name, values in arrays.items():
                 file.create_dataset(name, data=values)
+        seal(image)
         replace_file(_part(parts, chunk), image.getvalue())
 
 
@@ -366,14 +402,14 @@ def merge(shards: Sequence[str | os.PathLike[str]], output: str | os.PathLike[st
 
     Raises `SweepError` where they are of different sweeps, or one is missing or there twice.
     """
-    output = Path(output)
+    output = file_path(output, "output")
     if output.exists():
         raise SweepError(f"{output} is there already; remove it or write to another file")
-    paths = _in_order([Path(path) for path in shards])
+    paths = _in_order([file_path(path, "shards") for path in shards])
     manifest = _manifest_of(paths[0])._replace(shard="1/1")
     with _opened(paths[0]) as file:
         texts = {name: str(file.attrs[name]) for name in ("scene", "over")}
-    rows = (_rows(paths[chunk % len(paths)], chunk // len(paths), manifest.chunk) for chunk in manifest.chunks)
+    rows = (_arrays(paths[chunk % len(paths)], manifest, chunk, chunk // len(paths)) for chunk in manifest.chunks)
     _assemble(output, output.with_name(output.name + ".tmp"), manifest, texts, rows)
     return summary(output)
 
@@ -399,22 +435,29 @@ def _in_order(paths: list[Path]) -> list[Path]:
     wanted = [f"{k + 1}/{count}" for k in range(count)]
     missing = [shard for shard in wanted if shard not in by_shard]
     if missing:
-        raise SweepError(f"all {count} shards are needed, missing: {', '.join(missing)}")
+        first = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+        raise SweepError(f"all {count} shards are needed, missing: {first}")
     return [by_shard[shard] for shard in wanted]
 
 
-def _opened(path: Path) -> h5py.File:
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file to read; makes errors in words of those of a file that is none, or is damaged."""
     try:
-        return h5py.File(path, "r")
+        with h5py.File(path, "r") as file:
+            yield file
     except FileNotFoundError:
         raise SweepError(f"{path} is not there") from None
-    except OSError:
-        raise SweepError(f"{path} is not a readable HDF5 file") from None
+    except SweepError:
+        raise
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, OverflowError) as error:
+        raise SweepError(f"{path} is not a readable HDF5 file: {error}") from None
 
 
-def _arrays(path: Path, rows: slice = slice(None)) -> dict[str, np.ndarray]:
-    """The datasets of a part or a result, or some rows of them."""
-    arrays = {}
+def _arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> dict[str, np.ndarray]:
+    """The datasets of a chunk, by its position in a shard."""
+    cases, arrays = manifest.cases_of(chunk), {}
+    rows = slice(position * manifest.chunk, position * manifest.chunk + len(cases))
 
     def add(name: str, entry: Any) -> None:
         if isinstance(entry, h5py.Dataset):
@@ -422,12 +465,26 @@ def _arrays(path: Path, rows: slice = slice(None)) -> dict[str, np.ndarray]:
 
     with _opened(path) as file:
         file.visititems(add)
+    missing = [name for name in ("case", *RESULTS) if name not in arrays]
+    if missing:
+        raise SweepError(f"{path} is damaged: it lacks {', '.join(missing)}")
+    if not np.array_equal(arrays["case"], cases):
+        raise SweepError(f"{path} is damaged: it does not hold the cases {cases[0]} to {cases[-1]}")
+    for name, values in arrays.items():
+        kind, shape = _kind_and_shape(name, values, manifest)
+        if values.dtype.kind != kind or values.shape != (len(cases), *shape):
+            raise SweepError(f"{path} is damaged: {name} has {values.dtype} of shape {values.shape[1:]} for each case")
     return arrays
 
 
-def _rows(path: Path, position: int, chunk: int) -> dict[str, np.ndarray]:
-    """A chunk by its position in a shard."""
-    return _arrays(path, slice(position * chunk, (position + 1) * chunk))
+def _kind_and_shape(name: str, values: np.ndarray, manifest: Manifest) -> tuple[str, tuple[int, ...]]:
+    """What NumPy calls the numbers of a dataset, and their shape for each case."""
+    if name.startswith("parameters/"):
+        return "f", values.shape[1:]
+    kind = "b" if name in ("converged", "stable") else "i" if name in ("case", "status", "iterations") else "f"
+    if name == "nodes":
+        return kind, (manifest.segments + 1, 3)
+    return kind, (3,) if name.endswith(("_force", "_moment")) else ()
 
 
 def _assemble(
@@ -436,21 +493,27 @@ def _assemble(
     """Writes the result chunk by chunk beside its place and then puts it there, in one step."""
     row = 0
     datasets: dict[str, h5py.Dataset] = {}
-    with open(temporary, "wb+") as stream:
-        with h5py.File(stream, "w") as file:
-            file.attrs.update(texts | manifest.attributes())
-            for arrays in chunks:
-                for name, values in arrays.items():
-                    if name not in datasets:
-                        datasets[name] = _dataset(file, name, manifest.rows, values)
-                    datasets[name][row : row + len(values)] = values
-                row += len(arrays["case"])
-        stream.flush()
-        os.fsync(stream.fileno())
-    if row != manifest.rows:
-        temporary.unlink()
-        raise SweepError(f"{output} would have {row} of {manifest.rows} cases: the files are damaged")
-    os.replace(temporary, output)
+    try:
+        with open(temporary, "wb+") as stream:
+            with h5py.File(stream, "w") as file:
+                file.attrs.update(texts | manifest.attributes())
+                for arrays in chunks:
+                    if not datasets:
+                        datasets = {name: _dataset(file, name, manifest.rows, arrays[name]) for name in arrays}
+                    if {name: values.shape[1:] for name, values in arrays.items()} != {
+                        name: dataset.shape[1:] for name, dataset in datasets.items()
+                    }:
+                        raise SweepError(f"{output} cannot be put together: its parts are damaged, they differ in kind")
+                    for name, values in arrays.items():
+                        datasets[name][row : row + len(values)] = values
+                    row += len(arrays["case"])
+            seal(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, output)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.Dataset:

@@ -9,19 +9,25 @@ import io
 import itertools
 import json
 import math
+import re
+import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from rodjax.checks import line, shown
 from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, si_values
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile, SceneReader, read_text, toml_tables
 
 # More than a grid of ten keys has; to read them takes a second.
 MAX_CORNERS = 1024
+# More cases than this are taken for a mistake: their results would fill 100 GB.
+MAX_CASES = 100_000_000
 
 Place = tuple[str | int, ...]
 
@@ -83,7 +89,10 @@ def read_cases(path: Path) -> tuple[Cases, str]:
         if path.suffix == ".csv":
             return Cases(_table(text), False), text
         if path.suffix == ".toml":
-            return Cases(_grid(toml_tables(text)), True), text
+            cases = Cases(_grid(toml_tables(text)), True)
+            if cases.count > MAX_CASES:
+                raise SceneFileError(f"must have at most {MAX_CASES} cases, got {cases.count:.1e}")
+            return cases, text
         raise SceneFileError("a grid ends in .toml, a table in .csv")
     except SceneFileError as mistake:
         raise SweepError(f"{path}: {mistake}") from None
@@ -110,7 +119,9 @@ def _grid_values(value: Any, key: str) -> list[Any] | np.ndarray:
     if isinstance(value, dict):
         return _range(value, key)
     if not isinstance(value, list) or not value:
-        raise SceneFileError(f"{key} must be a list of values or {{ from = 1, to = 2, count = 11 }}, got {value!r}")
+        raise SceneFileError(
+            f"{key} must be a list of values or {{ from = 1, to = 2, count = 11 }}, got {shown(value)}"
+        )
     return value
 
 
@@ -119,13 +130,16 @@ def _range(table: dict[str, Any], key: str) -> Float[np.ndarray, "rows ..."]:
     if not set(allowed[:3]) <= set(table) <= set(allowed):
         raise SceneFileError(f"{key} must have from, to, count and optionally spacing, got {', '.join(table)}")
     count, spacing = table["count"], table.get("spacing", "linear")
-    if isinstance(count, bool) or not isinstance(count, int) or count < 2:
-        raise SceneFileError(f"{key}.count must be a whole number from 2, got {count!r}")
+    if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= MAX_CASES:
+        raise SceneFileError(f"{key}.count must be a whole number from 2 to {MAX_CASES}, got {shown(count)}")
     first, last = (_si_number(table[name], *_target(key)) for name in ("from", "to"))
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(last - first)):
+            raise SceneFileError(f"{key}.from and {key}.to must not be further apart than numbers reach")
     if spacing == "linear":
         return np.linspace(first, last, count)
     if spacing != "log":
-        raise SceneFileError(f"{key}.spacing must be one of linear, log, got {spacing!r}")
+        raise SceneFileError(f"{key}.spacing must be one of linear, log, got {shown(spacing)}")
     if np.any(first <= 0) or np.any(last <= 0):
         raise SceneFileError(f"{key}.from and {key}.to must be positive for a spacing of log")
     return np.geomspace(first, last, count)
@@ -174,11 +188,11 @@ def _check_keys(keys: list[str]) -> None:
 def _target(key: str) -> tuple[Place, tuple[int, ...]]:
     """Where a key is in the tables, and which component of its numbers is meant."""
     names = key.split(".")
-    numbers = [int(name) if name.isascii() and name.isdigit() else None for name in names]
+    numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
     end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
     if names[0] not in ("rod", "start", "end", "loads") or names[end - 1] not in QUANTITIES:
         raise SceneFileError(
-            f"{key} cannot be swept; allowed are the keys of rod, start, end and loads that hold numbers, "
+            f"{line(key)} cannot be swept; allowed are the keys of rod, start, end and loads that hold numbers, "
             "such as rod.EI, end.position.2, loads.point_force.0.at"
         )
     place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
@@ -210,7 +224,7 @@ def _si_number(value: Any, place: Place, component: tuple[int, ...]) -> Float[np
     unit, shape, _ = QUANTITIES[name]
     is_scalar = not shape or bool(component)
     # The bulk of a large table, which must not wait for the parsing of text.
-    if is_scalar and type(value) in (int, float) and math.isfinite(value):
+    if is_scalar and type(value) in (int, float) and abs(value) <= sys.float_info.max:
         return np.asarray(value, float)
     if unit and not isinstance(value, str):
         value = f"{value} {unit}"
@@ -221,7 +235,7 @@ def _si_number(value: Any, place: Place, component: tuple[int, ...]) -> Float[np
     match = NUMBER_AND_UNIT.fullmatch(value) if unit else None
     if match is None or match[1].startswith("["):
         raise SceneFileError(
-            f"a component of {_dotted(place)} must be a number{' and a unit' if unit else ''}, got {value!r}"
+            f"a component of {_dotted(place)} must be a number{' and a unit' if unit else ''}, got {shown(value)}"
         )
     same = np.full(shape, float(match[1])).tolist()
     return si_values({name: f"{same} {match[2]}"}, where, (), (name,))[name][component]
@@ -235,7 +249,7 @@ class CaseReader:
 
     def __init__(self, scene: Path, over: Path):
         self.cases, self.over_text = read_cases(over)
-        self._over, self._reader = over, SceneReader()
+        self._scene, self._over, self._reader = scene, over, SceneReader()
         try:
             self.scene_text = read_text(scene)
             self._content = toml_tables(self.scene_text)
@@ -262,7 +276,7 @@ class CaseReader:
         try:
             return self._reader.read(content)
         except SceneFileError as mistake:
-            raise SweepError(f"{self._over}: case {case}: {mistake}") from None
+            raise SweepError(f"{self._over}: case {case}: {mistake} (in {self._scene} with these values)") from None
 
 
 def _template(content: dict[str, Any], parameter: Parameter) -> Float[np.ndarray, "..."]:
@@ -273,6 +287,8 @@ def _template(content: dict[str, Any], parameter: Parameter) -> Float[np.ndarray
     table: Any = content
     for depth in range(1, len(place)):
         table = _entry(table, place[:depth], key)
+    if not isinstance(table, dict):
+        raise SceneFileError(f"{_dotted(place[:-1])} must be a table, got {shown(table)}")
     name = str(place[-1])
     if not parameter.component:
         return np.zeros(QUANTITIES[name][1])
@@ -318,7 +334,8 @@ def _in_si(table: Any) -> Any:
 
     def value(key: str, value: Any) -> Any:
         if isinstance(value, str) and key in QUANTITIES:
-            return _as_text(si_values({key: value}, "", (), (key,))[key], key)
+            with suppress(SceneFileError):  # each case has another value in its place
+                return _as_text(si_values({key: value}, "", (), (key,))[key], key)
         return _in_si(value)
 
     return {key: value(key, entry) for key, entry in table.items()}

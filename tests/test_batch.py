@@ -160,10 +160,19 @@ for ours, theirs in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=
 if processes == 1:
     odd = rj.solve_batch(scenes[:-3], mesh=mesh, **OPTIONS)
     assert_same(odd.nodes, alone.nodes[:-3])
+    stacked = rj.path.stack_scenes(scenes)
+    nodes = jax.jit(lambda scenes: rj.solve_batch(scenes, mesh=mesh, **OPTIONS).nodes)
+    assert_same(nodes(stacked), alone.nodes)
+    try:
+        nodes(jax.tree.map(lambda leaf: leaf[:-3], stacked))
+    except ValueError as error:
+        assert "scenes must be a multiple of the 4 devices of mesh" in str(error)
+    else:
+        raise AssertionError("scenes that the devices cannot share were taken")
     options = batch.checked_options(scenes[0], 8, None, "finite_difference", None, None, False)[0]
     counts = np.full(jax.device_count(), len(scenes) // jax.device_count())
     program = jax.jit(batch._solve_many, static_argnames=("options", "mesh"))
-    text = program.lower(rj.path.stack_scenes(scenes), None, counts, options=options, mesh=mesh).compile().as_text()
+    text = program.lower(stacked, None, counts, options=options, mesh=mesh).compile().as_text()
     assert "while(" in text
     for collective in ("all-reduce", "all-gather", "all-to-all", "collective-permute"):
         assert collective + "(" not in text, collective

@@ -259,9 +259,9 @@ def test_the_rounding_floor_is_stated_and_not_chased():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (dict(segments=1), "segments must be a whole number from 2 to 100000, got 1"),
+        (dict(segments=0), "segments must be a whole number from 1 to 100000, got 0"),
         (dict(segments=10.0), "segments must be a whole number"),
-        (dict(segments=10**6), "segments must be a whole number from 2 to 100000"),
+        (dict(segments=10**6), "segments must be a whole number from 1 to 100000"),
         (dict(discretization="spectral"), "discretization must be 'finite_difference' or 'hermite', got 'spectral'"),
         (dict(solver="cg"), "solver must be a Newton or NonlinearCG, got 'cg'"),
         (dict(guess=np.zeros((5, 3))), "guess must be a Guess or Equilibrium"),

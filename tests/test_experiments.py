@@ -268,3 +268,44 @@ def test_sweep_stress(tmp_path, capsys):
     )
     assert not runs[-1].was_killed
     assert "the same to the last bit" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_critical_values(tmp_path, capsys):
+    options = ["--segments", "16", "--only", "euler", "arch", "--out", str(tmp_path)]
+    rows, loops, branches = script("critical_values").main(options)
+    assert loops == []
+    assert [row.kind for row in rows] == ["branch"] * 4
+    # Fourth order on 16 elements.
+    assert max(row.error for row in rows) < 1e-4
+    (arch,) = branches.values()
+    assert sum(point.kind == "fold" for point in arch.branch.critical_points) == 2
+    assert arch.gap < 0.02
+    assert "it reached the end of the scenes" in capsys.readouterr().out
+    with open(tmp_path / "critical_values.csv", newline="") as file:
+        assert [float(row["found"]) for row in csv.DictReader(file)] == pytest.approx([row.found for row in rows])
+    assert (tmp_path / "critical_values.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_stress(monkeypatch, capsys):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = ["--scenes", "180", "--only", "clamp-clamp", "pin-swivel", "free-clamp", "--sample", "30"]
+    groups = script("stress").main(options)
+    assert len(groups) == 9
+    assert sum(len(group.is_minimum) for group in groups) == 36
+    # Of 20025 scenes all but 6 end in a minimum; none of these is among the first four of a group.
+    assert all(np.all(group.is_minimum) for group in groups)
+    printed = capsys.readouterr().out
+    assert "36 of 36 ended in a verified minimum" in printed
+    assert "0 claims of convergence that are no minimum" in printed
+    assert "index" not in printed.split("dense eigenvalues")[0].split("verified minimum")[1]
+
+
+@pytest.mark.slow
+def test_float32(monkeypatch, capsys):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    rows = script("float32").main(["--slenderness", "10", "1e6", "--segments", "8"])
+    assert [row.status for row in rows] == 4 * ["ROUNDING_FLOOR"]
+    assert all(row.shape < 1e-5 and row.force < 1e-5 for row in rows)
+    assert capsys.readouterr().out.count("\n") == 6

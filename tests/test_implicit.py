@@ -109,6 +109,31 @@ def test_second_derivatives_and_batches():
     assert jax.hessian(height)(loads[0]) == pytest.approx(float(bends[0]), rel=1e-9)  # the other way, roundings
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_second_derivatives_forward_and_reverse(name):
+    """Of a nonlinear function of a result, on a scene of each kind, along two changes of its numbers."""
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), changes(6), changes(7))
+    EI = float(SCENES[name].rod.EI)
+    x, v, w = jnp.array([0.3, -0.2]), jnp.array([1.0, 0.5]), jnp.array([-0.4, 1.0])
+
+    def one_number(x):
+        scene = moved(SCENES[name], jax.tree.map(lambda leaf: x @ leaf, both))
+        result = rj.solve(scene, segments=SEGMENTS, solver=TIGHT, discretization="finite_difference")
+        found = jnp.concatenate([jnp.ravel(result.nodes), result.start_force / EI, result.start_moment / EI])
+        return jnp.sum(jnp.cos(jnp.arange(found.size)) * found**2)
+
+    def along(x):
+        return jax.jvp(one_number, (x,), (v,))[1]
+
+    h = 1e-4
+    first = jax.jit(along)
+    expected = float(first(x + h * w) - first(x - h * w)) / (2 * h)
+    # The difference is good to h^2 times the fourth derivative.
+    assert float(jax.jit(lambda x: jax.jvp(along, (x,), (w,))[1])(x)) == pytest.approx(expected, rel=1e-5)
+    assert float(jax.jit(lambda x: jax.grad(along)(x) @ w)(x)) == pytest.approx(expected, rel=1e-5)
+
+
 def test_paths_both_ways():
     rod = problems.cable()
 

@@ -11,8 +11,7 @@ iterations nor the rounding depend on EA: the mixed treatment of stretch (Magisa
 through. Steps are rotations, in which bending is nearly quadratic even where new end tangents kink the rod.
 
 A dead moment M on a free end has no potential. There the virtual work M . (rotation of the end) enters the gradient:
-the tangent t turns by t x dt, and the section spins about it by as much as keeps the torque M . t along the rod. Half
-the squared gradient takes the place of the energy.
+the tangent t turns by t x dt, and the section spins about it by as much as keeps the torque M . t along the rod.
 
 The second derivatives couple neighbouring edges only, two numbers each; the closure and the torsion, which all edges
 share, are a border of four columns (`linalg.SaddlePointSystem`). Arrays along the rod have the components first.
@@ -65,7 +64,7 @@ class Linearization(eqx.Module):
     """First and second derivatives of L at a point, by rotations of the tangents in `bases`, by F and by the torque.
 
     `gradient`: by the rotations; `closure`: by F, what the polyline lacks of the span, and a zero for the torque;
-    `residual`: largest force left on a node; `energy`: L, or without a potential half the squared gradient.
+    `residual`: largest force left on a node; `energy`: L, without the work of a dead moment.
     """
 
     bases: Float[Array, "3 b n"]
@@ -275,7 +274,6 @@ class MixedForm(eqx.Module):
             torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
             rows = jnp.concatenate([torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))], axis=1)
             closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
-            energy = jnp.sum(gradient**2 / weights[None]) / 2
         return Linearization(
             bases=bases,
             gradient=gradient,
@@ -295,6 +293,11 @@ class MixedForm(eqx.Module):
     def regular(self, system: SaddlePointSystem) -> SaddlePointSystem:
         """The system of a linearisation, neutral modes held."""
         return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
+
+    @property
+    def multipliers(self) -> int:
+        """How many columns the border of the system has, where the scene has a potential."""
+        return int(self.has_torsion) + self._closures
 
     @property
     def _closures(self) -> int:
@@ -319,15 +322,33 @@ class MixedForm(eqx.Module):
             return jnp.zeros(3, closure.dtype)
         return closure if self.axes is None else self.axes @ closure
 
-    def closure_softness(self, here: Linearization, change: Float[Array, "c"]) -> Float[Array, "c"]:
-        """By how much less the polyline lacks of its span under another end force, the tangents being the same."""
-        first = len(here.closure) - self._closures
-        return here.system.compliance[first:, first:] @ change
+    def under_force(
+        self, point: MixedPoint, bases: Float[Array, "3 b n"], rotation: Float[Array, "b n"], change: Float[Array, "3"]
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        """With another end force: what the rod lacks of its span and the rate of that as the tangents begin to turn;
+        by how much L differs, and by how much the rate of L does.
+        """
+        start, end = self.scene.start, self.scene.end
+        if not (isinstance(start, Held) and isinstance(end, Held)):
+            nothing = jnp.zeros(0, change.dtype)
+            return nothing, nothing, jnp.zeros_like(change[0]), jnp.zeros_like(change[0])
+        span = end.position - start.position
+        weights = self.field.weights
 
-    def closure_gradient(self, here: Linearization, change: Float[Array, "c"]) -> Float[Array, "b n"]:
-        """What another end force adds to the gradient by the rotations."""
-        first = len(here.closure) - self._closures
-        return short_sum(here.system.border[:, first:] * change[None, :, None], axis=1)
+        def parts(tangents: Float[Array, "3 n"], force: Float[Array, "3"]) -> tuple[Array, Array]:
+            tension = dot(force[:, None] + self.forces_beyond, tangents)
+            strain = axial_strain_under(self.scene.rod, tension)
+            stretching = weights * (density(self.scene.rod, axial_strain=strain) - tension * (1 + strain))
+            return jnp.sum(stretching) + force @ span, span - tangents @ (weights * (1 + strain))
+
+        turning = short_sum(bases * rotation[None], axis=1)
+
+        def rates(force: Float[Array, "3"]):
+            return jax.jvp(lambda tangents: parts(tangents, force), (point.tangents,), (turning,))
+
+        (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
+        (before, _), (rate_before, _) = rates(point.end_force)
+        return self.of_force(closure), self.of_force(closure_rate), energy - before, rate - rate_before
 
     def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

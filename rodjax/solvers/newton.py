@@ -1,5 +1,7 @@
 """Newton's method on the mixed form: independent of mesh and slenderness, and safeguarded to end in a minimum."""
 
+from typing import Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,7 @@ class Newton(eqx.Module):
     """
 
     tolerance: float = eqx.field(default=1e-8, converter=plain_number("tolerance"))
-    max_iterations: int = 200
+    max_iterations: int = 100
     max_rotation: float = eqx.field(default=1.0, converter=plain_number("max_rotation"))
 
     def __check_init__(self):
@@ -36,6 +38,9 @@ class Newton(eqx.Module):
         if not 0.0 < self.max_rotation < 3.0:
             raise ValueError(f"max_rotation must lie between 0 and 3 rad, got {self.max_rotation!r}")
 
+
+# What is sought: a minimum of the energy, or the equilibrium that Newton's steps lead to, whatever its stability.
+Find = Literal["minimum", "equilibrium"]
 
 # Where the shift by NEUTRAL is not enough, it starts with FIRST_SHIFT and grows by SHIFT_GROWTH until the Hessian is
 # definite.
@@ -47,15 +52,19 @@ CLOSURE_WEIGHT = 100.0
 # A step is accepted when this fraction of the fall that its slope promises comes true, up to the rounding of energies.
 SUFFICIENT_DECREASE = 1e-4
 ENERGY_ROUNDING = 1e-9
-MAX_HALVINGS = 20
+MAX_HALVINGS = 12
+# A step that finds no better point in so many halvings is sought anew with a larger shift, below this one.
+MAX_SHIFT = 1e8
 # A saddle, such as a planar shape in a symmetric scene, is left along its negative curvature by a push of this size
-# [rad], at most so many times. A search that fails within STAGNATION times the rounding floor has met that floor.
+# [rad], at most so many times, where the residual is below NEAR times the shift: with a shift Newton's method crawls. A
+# search that fails within STAGNATION times the rounding floor has met that floor.
 PUSH = 0.03
+NEAR = 1e-3
 MAX_PUSHES = 5
 STAGNATION = 10.0
 
 
-class NewtonMinimum(eqx.Module):
+class NewtonEnd(eqx.Module):
     """Where the method stopped. `is_stable`: whether the energy has no negative curvature there."""
 
     point: MixedPoint
@@ -94,48 +103,60 @@ def is_stable(form: MixedForm, point: MixedPoint) -> Bool[Array, ""]:
     return factor(form.regular(form.linearized(point).system)).is_minimum
 
 
-def find_minimum(form: MixedForm, point: MixedPoint, solver: Newton) -> NewtonMinimum:
-    """The stable equilibrium reached from `point`."""
-    state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver), begin(form, point))
-    return minimum(form, state)
+def find_equilibrium(form: MixedForm, point: MixedPoint, solver: Newton, find: Find = "minimum") -> NewtonEnd:
+    """The equilibrium reached from `point`."""
+    state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver, find), begin(form, point))
+    return ended(form, state)
 
 
 def is_running(state: NewtonState) -> Bool[Array, ""]:
     return state.status == Status.RUNNING
 
 
-def minimum(form: MixedForm, state: NewtonState) -> NewtonMinimum:
-    return NewtonMinimum(
+def ended(form: MixedForm, state: NewtonState) -> NewtonEnd:
+    return NewtonEnd(
         point=state.point,
         outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
         is_stable=state.is_stable & form.has_potential,
     )
 
 
-def turn(form: MixedForm, state: NewtonState, solver: Newton) -> NewtonState:
+def turn(form: MixedForm, state: NewtonState, solver: Newton, find: Find) -> NewtonState:
     """One evaluation of all derivatives, at most one factorisation, and so the same work for every rod of a batch.
 
     The trial is accepted, factorised and gives the next step; or the step is halved; or, where the Hessian has negative
-    curvature, it is shifted, and factorised again in the next turn.
+    curvature on the way to a minimum, it is shifted, and factorised again in the next turn.
     """
+    descends = _descends(form, find)
     rotation = state.step * state.rotation
-    moved = form.moved(state.point, state.bases, rotation, state.force_change)
+    force_change = state.force_change if descends else state.step * state.force_change
+    moved = form.moved(state.point, state.bases, rotation, force_change)
     trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
     linearization = form.linearized(trial)
     closure = form.closure(linearization.closure)
-    merit = linearization.energy + state.weight / 2 * jnp.sum(closure**2)
+    objective = linearization.energy if descends else _half_square(form, linearization)
+    merit = objective + state.weight / 2 * jnp.sum(closure**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
     state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
     return jax.lax.cond(
         state.restart | state.is_pushed | (merit <= bound),
-        lambda: _advanced(form, state, trial, linearization, solver),
-        lambda: _shortened(form, state),
+        lambda: _advanced(form, state, trial, linearization, solver, find),
+        lambda: _shortened(form, state, find),
     )
 
 
+def _descends(form: MixedForm, find: Find) -> bool:
+    """Whether steps are judged by the energy; else by the square of what is out of balance, which a step makes less."""
+    return form.has_potential and find == "minimum"
+
+
+def _half_square(form: MixedForm, here: Linearization) -> Float[Array, ""]:
+    return jnp.sum(here.gradient**2 / form.field.weights[None]) / 2
+
+
 def _advanced(
-    form: MixedForm, state: NewtonState, point: MixedPoint, here: Linearization, solver: Newton
+    form: MixedForm, state: NewtonState, point: MixedPoint, here: Linearization, solver: Newton, find: Find
 ) -> NewtonState:
     dtype = point.tangents.dtype
     h = 1 / point.tangents.shape[1]
@@ -153,7 +174,8 @@ def _advanced(
     least = jnp.asarray(NEUTRAL, dtype)
     first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
     shift = jnp.where(state.tries == 0, first, jnp.maximum(SHIFT_GROWTH * state.shift, FIRST_SHIFT))
-    may_push = (state.pushes == 0) | is_balanced
+    is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
+    may_push = (state.pushes == 0) | is_near
     pattern = components(here.bases, generic_field(point.tangents))
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
     factors, rotation, multipliers = factor_and_solve(
@@ -161,29 +183,39 @@ def _advanced(
     )
     is_definite = factors.is_minimum
     is_finite = jnp.isfinite(here.residual + here.energy)
-    again = ~is_definite & is_finite & (state.tries < MAX_FACTORS)
     is_stable = is_definite & (shift <= least)
-    is_pushed = is_definite & ~is_stable & may_push
-    force_change = form.closure(multipliers)
+    if find == "minimum":
+        again = ~is_definite & is_finite & (state.tries < MAX_FACTORS)
+        is_pushed = is_definite & ~is_stable & may_push
+        is_sought, may_go_on = is_stable, is_definite
+    else:
+        again = is_pushed = jnp.array(False)
+        is_sought = may_go_on = jnp.array(True)
+    force_change = form.force_change(form.closure(multipliers))
     largest = jnp.max(jnp.abs(rotation))
+    step = jnp.minimum(1.0, solver.max_rotation / largest)
+    if _descends(form, find):
+        force_change = step * force_change
 
-    # With the new force in place of the old one; L is quadratic in the force, up to the curvature of w.
-    softness = form.closure_softness(here, force_change)
-    closure = form.closure(here.closure)
-    energy = here.energy + jnp.sum(force_change * (closure - softness / 2))
-    closure -= softness
-    squared = jnp.sum(closure**2)
-    along = jnp.sum(rotation * (here.gradient + form.closure_gradient(here, force_change)))
-    if not form.has_potential:  # the "energy" is a sum of squares that a Newton step makes vanish
-        along = -2 * energy
-    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(squared > 0, squared, jnp.inf))
+    if _descends(form, find):
+        # With the new force in place of the old one.
+        closure, closure_rate, change, along = form.under_force(point, here.bases, rotation, force_change)
+        objective = here.energy + change
+        along += jnp.sum(rotation * here.gradient)
+    else:
+        closure = form.closure(here.closure)
+        closure_rate = -closure
+        objective = _half_square(form, here)
+        along = -2 * objective
+    falls = -jnp.sum(closure * closure_rate)
+    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(falls > 0, falls, jnp.inf))
 
     status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
-    has_saddle = is_balanced & ~is_stable & (state.pushes >= MAX_PUSHES)
+    has_saddle = is_balanced & ~is_sought & (state.pushes >= MAX_PUSHES)
     status = jnp.where(has_saddle, Status.SADDLE, status)
-    status = jnp.where(is_balanced & is_stable, balanced, status)
+    status = jnp.where(is_balanced & is_sought, balanced, status)
     # A zero-iteration solve ends before its step is known to be finite, or needed.
-    status = jnp.where(is_finite & (is_definite | is_balanced), status, Status.NOT_FINITE)
+    status = jnp.where(is_finite & (may_go_on | is_balanced), status, Status.NOT_FINITE)
     status = jnp.where(again, Status.RUNNING, status)
     return NewtonState(
         point=point,
@@ -191,11 +223,11 @@ def _advanced(
         residual=jnp.where(again, state.residual, here.residual),
         shift=shift,
         rotation=rotation,
-        force_change=form.force_change(force_change),
+        force_change=force_change,
         weight=weight,
-        merit=energy + weight / 2 * squared,
-        slope=along - weight * squared,
-        step=jnp.minimum(1.0, solver.max_rotation / largest),
+        merit=objective + weight / 2 * jnp.sum(closure**2),
+        slope=along - weight * falls,
+        step=step,
         halvings=jnp.zeros((), int),
         restart=again,
         tries=jnp.where(again, state.tries + 1, 0),
@@ -208,15 +240,23 @@ def _advanced(
     )
 
 
-def _shortened(form: MixedForm, state: NewtonState) -> NewtonState:
+def _shortened(form: MixedForm, state: NewtonState, find: Find) -> NewtonState:
     halvings = state.halvings + 1
+    failed = halvings > MAX_HALVINGS
     stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
     reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
-    failed = halvings > MAX_HALVINGS
+    # On the way to a minimum a larger shift gives a shorter step in a direction that goes down more surely.
+    again = failed & ~stagnated & (state.shift < MAX_SHIFT) & _descends(form, find)
     return eqx.tree_at(
-        lambda state: (state.step, state.halvings, state.status),
+        lambda state: (state.step, state.halvings, state.restart, state.tries, state.status),
         state,
-        (state.step / 2, halvings, jnp.where(failed, reason, state.status).astype(int)),
+        (
+            state.step / 2,
+            jnp.where(again, 0, halvings),
+            again,
+            jnp.where(again, 1, state.tries),
+            jnp.where(failed & ~again, reason, state.status).astype(int),
+        ),
     )
 
 

@@ -3,17 +3,18 @@
 from typing import TYPE_CHECKING
 
 from rodjax import problems
+from rodjax.along import Smooth, Steps
 from rodjax.batch import solve_batch
 from rodjax.compilation import enable_compilation_cache
 from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
 from rodjax.guess import Guess
-from rodjax.loads import PointForce
-from rodjax.modes import Mode, lowest_mode
+from rodjax.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.modes import Mode, lowest_mode, squared_frequencies
 from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
-from rodjax.rod import Rod
+from rodjax.rod import Law, Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene, write_scene
 from rodjax.sensitivity import end_stiffness, sensitivities
@@ -34,9 +35,12 @@ __all__ = [
     "BranchEnd",
     "Clamp",
     "CriticalPoint",
+    "DistributedCouple",
+    "DistributedForce",
     "Equilibrium",
     "Free",
     "Guess",
+    "Law",
     "LineSearch",
     "Mode",
     "Newton",
@@ -47,7 +51,9 @@ __all__ = [
     "Rod",
     "Scene",
     "SceneFileError",
+    "Smooth",
     "Status",
+    "Steps",
     "Swivel",
     "critical_point",
     "critical_points",
@@ -67,6 +73,7 @@ __all__ = [
     "solve_batch",
     "solve_continuum",
     "solve_path",
+    "squared_frequencies",
     "switch_branch",
     "write_scene",
 ]

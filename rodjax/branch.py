@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.compilation import compiled
-from rodjax.discretization.joints import components, generic_field
-from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.joints import generic_field
 from rodjax.implicit import carried_to
-from rodjax.linalg import Factors, SaddlePointSystem, factor, short_sum
+from rodjax.linalg import AnyFactors, SaddlePointSystem, factor, short_sum
 from rodjax.modes import Mode, mode_of
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.scene import Scene, between, nondimensional
@@ -30,6 +30,7 @@ from rodjax.solvers.newton import STAGNATION
 from rodjax.stability import Motion, neutral_turn
 from rodjax.status import Outcome, Status
 from rodjax.supports import Clamp, rotate
+from rodjax.vectors import components
 
 # A point lies on the branch when no force larger than this is left on a node [EI/L^2], or rounding allows no less.
 TOLERANCE = 1e-9
@@ -106,7 +107,7 @@ class Problem(eqx.Module):
     equilibrium: Equilibrium
 
     @property
-    def point(self) -> MixedPoint:
+    def point(self) -> Point:
         return form_and_point(self.equilibrium)[1]
 
     @property
@@ -114,15 +115,11 @@ class Problem(eqx.Module):
         """The change of the parameter that counts as much as one radian all along the rod."""
         return float(self.scenes.rod.length.shape[0] - 1)
 
-    def at(
-        self, parameter: Float[Array, ""], point: MixedPoint, motion: Motion | None = None
-    ) -> tuple[MixedForm, MixedPoint]:
+    def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
         scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
         return carried_to(scaled, self.equilibrium.state.shape, point, motion)
 
-    def linearized(
-        self, parameter: Float[Array, ""], point: MixedPoint
-    ) -> tuple[MixedForm, MixedPoint, Linearization, Motion]:
+    def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
         """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
 
         def residual(parameter):
@@ -136,12 +133,16 @@ class Problem(eqx.Module):
 
 def no_motion(result: Equilibrium) -> Motion:
     """A motion of an equilibrium that leaves it where it is."""
-    dtype, places = result.s.dtype, result.state.shape.unknown_tangents.shape[1]
-    border = jax.eval_shape(lambda result: jnp.zeros(form_and_point(result)[0].multipliers), result)
-    return Motion(jnp.zeros((2, places), dtype), jnp.zeros(border.shape, dtype))
+
+    def unbalanced(result: Equilibrium) -> Motion:
+        form, point = form_and_point(result)
+        here = form.linearized(point)
+        return Motion(here.gradient, here.closure)
+
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(unbalanced, result))
 
 
-def mass(form: MixedForm, here: Linearization) -> Float[Array, "m"]:
+def mass(form: Form, here: Linearization) -> Float[Array, "m"]:
     """The length of rod that each tangent stands for; none where a support holds it."""
     return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
 
@@ -167,7 +168,7 @@ def added(motion: Motion, other: Motion, share: Float[Array, ""]) -> Motion:
 class Firm(eqx.Module):
     """The factors of a linearisation that has its springs."""
 
-    factors: Factors
+    factors: AnyFactors
     holds: int = eqx.field(static=True)
 
     @property
@@ -180,7 +181,7 @@ class Firm(eqx.Module):
         return Motion(rotation, multipliers[: len(motion.multipliers)])
 
 
-def firm(form: MixedForm, here: Linearization, neutral: Motion) -> Firm:
+def firm(form: Form, here: Linearization, neutral: Motion) -> Firm:
     """The factors of a linearisation with a spring against its neutral turn, where this turns a tangent most.
 
     What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
@@ -215,7 +216,7 @@ def firm(form: MixedForm, here: Linearization, neutral: Motion) -> Firm:
 
 
 def nearest_to_zero(
-    form: MixedForm, point: MixedPoint, here: Linearization, neutral: Motion, others: tuple[Motion, ...] = ()
+    form: Form, point: Point, here: Linearization, neutral: Motion, others: tuple[Motion, ...] = ()
 ) -> tuple[Float[Array, ""], Motion]:
     """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
     weights = mass(form, here)
@@ -236,7 +237,7 @@ def nearest_to_zero(
     return times(motion, Motion(*here.system.times(motion.rotation, motion.multipliers))), motion
 
 
-def neutral_motion(form: MixedForm, point: MixedPoint, here: Linearization) -> Motion:
+def neutral_motion(form: Form, point: Point, here: Linearization) -> Motion:
     """The turn of the whole rod that leaves it in equilibrium, of length 1, or no motion."""
     turn, weights = neutral_turn(form, point, here), mass(form, here)
     squared = inner(weights, turn, turn)
@@ -247,7 +248,7 @@ class _Correction(eqx.Module):
     """Where a correction is: what was found at the point, and the point to look at next."""
 
     parameter: Float[Array, ""]
-    point: MixedPoint
+    point: Point
     here: Linearization
     change: Motion  # of the residual with the parameter
     follows: Motion  # how the equilibrium follows the parameter
@@ -275,8 +276,7 @@ def stepped(
     far = jax.tree.map(lambda x: distance * x, along)
     first = jnp.where(is_given, target, parameter + far.rate)
     form, begin = problem.at(parameter, problem.point)
-    bases = form.field.basis(form.scene, form.bases(form.field.with_held(form.scene, begin.tangents)))
-    normal = short_sum(bases * along.motion.rotation[None], axis=1)
+    normal = short_sum(form.bases_at(begin) * along.motion.rotation[None], axis=1)
     _, predicted = problem.at(first, problem.point, far.motion)
 
     def corrected(state: _Correction) -> _Correction:

@@ -76,6 +76,7 @@ def number_array(value: Any, name: str, shape: tuple[int, ...] = ()) -> Float[Nu
 def number_list(value: Any, name: str) -> Float[Numbers, "k"]:
     """`value` as one or more numbers."""
     try:
+        value = value if is_known(value) else jnp.asarray(value)  # a list of traced ones has no shape
         shape = np.shape(value)
     except ValueError:  # rows of several lengths
         raise TypeError(f"{name} must be a number or a list of them, got {shown(value)}") from None

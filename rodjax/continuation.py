@@ -23,7 +23,7 @@ from rodjax.implicit import not_differentiated
 from rodjax.modes import Mode
 from rodjax.path import stack_scenes
 from rodjax.result import Equilibrium
-from rodjax.scene import Scene, dead_end_moment
+from rodjax.scene import Scene, has_potential
 from rodjax.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
 
 # Where the parameter turns round at a fold, a change of the scene does work in the critical motion: more than this part
@@ -281,7 +281,7 @@ def _checked(scenes: Any, name: str) -> Scene:
     count = stacked.rod.length.shape[0]
     if count < 2:
         raise ValueError(f"scenes must be at least two, between which the parameter runs, got {count}")
-    if dead_end_moment(stacked) is not None:
+    if not has_potential(stacked):
         raise ValueError("scenes must have a potential: a dead moment on a free end has none")
     return stacked
 

@@ -6,12 +6,14 @@ do not meet, or a support is missed, there is a residual.
 
 In a straight isotropic rod the torque m.t is constant between two stations. So the frame is carried along without
 twist (its Darboux vector is the bending part of m/EI) and then spun by the angle (m.t) h/GJ: any number of turns is
-as easy as none, and the total twist (m.t) L/GJ is never reduced.
+as easy as none, and the total twist (m.t) L/GJ is never reduced. Other rods, and loads that follow the rod, are in
+`continuum_frames`.
 """
 
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -24,16 +26,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, positive, whole_number
+from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve, HermiteElements
-from rodjax.discretization.joints import root
 from rodjax.energy import axial_strain_under, dead_load_energy, density
 from rodjax.equilibrium import MAX_SEGMENTS, solve
 from rodjax.result import Equilibrium, NotConvergedWarning, SolverState, warn_if_not_converged
 from rodjax.rod import Rod
-from rodjax.scene import Scene, nondimensional
+from rodjax.scene import Scene, needs_frames, nondimensional
 from rodjax.status import Status, is_converged
 from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
+from rodjax.vectors import root
 
 # The residual at which stations and supports count as met: positions in L, rotations in rad, forces and moments in
 # EI/L^2 and EI/L, or where they are larger than these, relative to the largest in the rod. The rounding floor of
@@ -114,16 +117,24 @@ def solve_continuum(
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)
-    if intervals is None:
-        intervals = _chosen_intervals(fixed_scene, guess)
-    result = _solve(scene, guess, rtol, intervals, segments)
+    if needs_frames(scene):
+        from rodjax.continuum_frames import growth, solve_frames  # which itself imports from here
+
+        if intervals is None:
+            intervals = _chosen_intervals(growth, fixed_scene, guess)
+        result = solve_frames(scene, guess, rtol, intervals, segments)
+    else:
+        if intervals is None:
+            intervals = _chosen_intervals(_growth, fixed_scene, guess)
+        result = _solve(scene, guess, rtol, intervals, segments)
     warn_if_not_converged(result)
     return result
 
 
 def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
-    """A guess with the turns that the scene states."""
-    if guess is not None and scene.turns is None:
+    """A guess with the turns that the scene states, and with frames where the scene needs them."""
+    has_frames = guess is not None and isinstance(guess.state.shape, FramedCurve)
+    if guess is not None and scene.turns is None and (has_frames or not needs_frames(scene)):
         return guess
     with warnings.catch_warnings():
         # Whether the continuum converges from there is what the caller is told.
@@ -176,7 +187,7 @@ class Start(eqx.Module):
 
     def sections(self, stations: Stations) -> Section:
         """The cross sections at the stations, each just beyond its point force."""
-        frames = self.reference @ jax.vmap(_from_rodrigues)(stations.turn)
+        frames = self.reference @ jax.vmap(from_rodrigues)(stations.turn)
         return Section(
             stations.position, frames, self.force_scale * stations.force, self.moment_scale * stations.moment
         )
@@ -215,7 +226,7 @@ def _integrated(rtol: float, piece: Piece) -> FarEnd:
     def slope(u, y, _):
         end = unravel(y)
         force = piece.force if piece.gravity is None else piece.force - u * piece.length * piece.gravity
-        t = _rotation(end.quaternion)[:, 2]
+        t = rotation_of(end.quaternion)[:, 2]
         bending = end.moment - jnp.sum(end.moment * t) * t
         curvature = bending / rod.EI
         axial_strain = axial_strain_under(rod, jnp.sum(force * t))
@@ -278,7 +289,7 @@ def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEn
     spin = section.torque / scene.rod.GJ * length
     return Section(
         position=section.position + section.frame @ end.position,
-        frame=section.frame @ _rotation(end.quaternion) @ _about_tangent(spin),
+        frame=section.frame @ rotation_of(end.quaternion) @ _about_tangent(spin),
         force=section.force if scene.gravity is None else section.force - length * scene.gravity,
         moment=section.frame @ end.moment,
     )
@@ -325,35 +336,46 @@ def _residual(
 ) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
     """What intervals that end in `ends` miss the next stations by, and the ends of the rod their supports."""
     sections = start.sections(stations)
-    before, after = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], sections) for cut in (slice(-1), slice(1, None)))
+    before = jax.tree.map(lambda leaf: leaf[:-1], sections)
     reached = jax.vmap(functools.partial(_beyond, scene))(before, jnp.diff(start.s), ends)
+    gaps, at_start, at_end = misses(scene, start, sections, reached)
+    if not any(isinstance(end, Clamp) for end in (scene.start, scene.end)):
+        # Both ends ask for no torque, which is constant along the rod, and none fixes the spin: it stays the guess's.
+        at_start = at_start.at[5].set(stations.turn[0, 2])
+    return gaps, at_start, at_end
+
+
+def misses(
+    scene: Scene, start: Start, sections: Section, reached: Section
+) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
+    """What is missed between the sections at the stations and those `reached` from each before, and at the supports."""
+    after = jax.tree.map(lambda leaf: leaf[1:], sections)
     gaps = Stations(
         position=after.position - reached.position,
-        turn=jax.vmap(_turn)(reached.frame, after.frame),
+        turn=jax.vmap(turn_between)(reached.frame, after.frame),
         force=(after.force + start.force_steps[1:] - reached.force) / start.force_scale,
         moment=(after.moment - reached.moment) / start.moment_scale,
     )
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
-    at_start = _missed_support(scene.start, start, first, -1.0)
-    if not any(isinstance(end, Clamp) for end in (scene.start, scene.end)):
-        # Both ends ask for no torque, which is constant along the rod, and none fixes the spin: it stays the guess's.
-        at_start = at_start.at[5].set(stations.turn[0, 2])
-    return gaps, at_start, _missed_support(scene.end, start, last, 1.0)
+    return gaps, _missed_support(scene.start, start, first, -1.0), _missed_support(scene.end, start, last, 1.0)
 
 
 def _missed_support(end: Support, start: Start, section: Section, sign: float) -> Float[Array, "6"]:
     """What a support asks of its cross section; `sign`: of a load on a free end in n and m there. Torque comes last."""
     moment = section.moment
     if isinstance(end, Free):
-        force = section.force if end.force is None else section.force - sign * end.force
-        moment = moment if end.moment is None else moment - sign * end.moment
+        loads = (end.force, end.moment)
+        if end.follower:
+            loads = tuple(None if load is None else section.frame @ load for load in loads)
+        force = section.force if loads[0] is None else section.force - sign * loads[0]
+        moment = moment if loads[1] is None else moment - sign * loads[1]
         position_or_force = force / start.force_scale
     else:
         assert isinstance(end, Held)
         position_or_force = section.position - end.position
     turn_or_moment = section.frame.T @ moment / start.moment_scale
     if isinstance(end, Clamp):
-        turn_or_moment = _turn(end.frame, section.frame)
+        turn_or_moment = turn_between(end.frame, section.frame)
     elif isinstance(end, Swivel):
         # No part of the support's tangent along d1 and d2.
         turn_or_moment = turn_or_moment.at[:2].set(section.frame[:, :2].T @ end.tangent)
@@ -380,10 +402,12 @@ def _growth(scene: Scene, guess: Equilibrium) -> Float[Array, ""]:
     return _growth_along(scaled, guess, units)[1][-1]
 
 
-def _chosen_intervals(scene: Scene, guess: Equilibrium) -> int:
+def _chosen_intervals(
+    growth: Callable[[Scene, Equilibrium], Float[Array, ""]], scene: Scene, guess: Equilibrium
+) -> int:
     if not is_known(scene, guess):
         return DEFAULT_INTERVALS
-    needed = float(_growth(scene, guess)) / GROWTH
+    needed = float(growth(scene, guess)) / GROWTH
     if not math.isfinite(needed):
         return DEFAULT_INTERVALS
     return min(max(2 ** math.ceil(math.log2(needed)), MIN_INTERVALS), MAX_INTERVALS)
@@ -434,7 +458,7 @@ def _frames_between(
         before = frames[cell] @ _about_tangent(-twist * x[cell])
         after = frames[cell + 1] @ _about_tangent(-twist * x[cell + 1])
         fraction = (s - x[cell]) / (x[cell + 1] - x[cell])
-        return before @ _from_rodrigues(fraction * _turn(before, after)) @ _about_tangent(twist * s)
+        return before @ from_rodrigues(fraction * turn_between(before, after)) @ _about_tangent(twist * s)
 
     return jax.vmap(between)(cell, s)
 
@@ -525,7 +549,7 @@ def _norm(vector: Float[Array, "3"]) -> Float[Array, ""]:
     return root(jnp.sum(vector**2))
 
 
-def _rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
+def rotation_of(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation of a quaternion (w, x, y, z) of any length."""
     w, x, y, z = quaternion
     matrix = jnp.array(
@@ -544,12 +568,12 @@ def _quaternion_rate(quaternion: Float[Array, "4"], rate: Float[Array, "3"]) -> 
     return jnp.concatenate([-jnp.sum(rate * v)[None], w * rate + jnp.cross(rate, v)]) / 2
 
 
-def _from_rodrigues(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def from_rodrigues(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The rotation of a Rodrigues vector 2 tan(angle/2) axis."""
-    return _rotation(jnp.concatenate([jnp.full_like(turn[:1], 2.0), turn]))
+    return rotation_of(jnp.concatenate([jnp.full_like(turn[:1], 2.0), turn]))
 
 
-def _turn(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def turn_between(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Rodrigues vector of the rotation from frame a to frame b, in the axes of a."""
     R = a.T @ b
     return 2 * jnp.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (1 + jnp.trace(R))

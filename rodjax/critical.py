@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rodjax.branch import Firm, Problem, added, firm, less, mass, nearest_to_zero, neutral_motion, times
 from rodjax.compilation import compiled
-from rodjax.discretization.mixed import Linearization
+from rodjax.discretization.form import Linearization
 from rodjax.result import Equilibrium, form_and_point
 from rodjax.scene import Scene
 from rodjax.stability import Motion

@@ -15,6 +15,10 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.form import Form, Point
+from rodjax.discretization.forms import field_of, form_of
+from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.shape import Shape
@@ -29,10 +33,9 @@ from rodjax.result import (
     SolverState,
     equilibrium,
     estimated_errors,
-    field_of,
     warn_if_not_converged,
 )
-from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, nondimensional
+from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, needs_frames, nondimensional
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Status
@@ -186,7 +189,13 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
     """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
     state = coarse.state
     shape = state.shape
-    if isinstance(shape, Curve) and defects is not None:
+    if isinstance(shape, FramedCurve):
+        s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=shape.s.dtype)
+        if defects is not None:
+            is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
+            s = graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments)
+        shape = shape.on(s, shape.is_of_joints)
+    elif isinstance(shape, Curve) and defects is not None:
         is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
         shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
     else:
@@ -215,6 +224,11 @@ def checked_options(
     one_of(discretization, "discretization", typing.get_args(Discretization))
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
+    if needs_frames(scene):
+        if isinstance(solver, NonlinearCG):
+            raise ValueError("solver must be a Newton for a rod or loads that need frames along the rod")
+        if planar:
+            raise ValueError("planar must be False for a rod or loads that need frames along the rod")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     if rtol is not None:
@@ -261,27 +275,34 @@ def _discretization(guess: Guess | Equilibrium | None, segments: int | None, sol
     """The one to take where none is asked for."""
     if isinstance(solver, NonlinearCG):
         return "finite_difference"
-    if segments is None and isinstance(guess, Equilibrium) and isinstance(guess.state.shape, Polyline):
+    if segments is None and isinstance(guess, Equilibrium) and _is_by_differences(guess.state.shape):
         return "finite_difference"
     return "hermite"
+
+
+def _is_by_differences(shape: Shape) -> bool:
+    return isinstance(shape, Polyline) or (isinstance(shape, FramedCurve) and shape.is_of_joints)
 
 
 def first_state(
     scene: Scene, guess: Guess | Equilibrium | None, options: Options
 ) -> tuple[SolverState, Float[Array, ""]]:
     """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
-    kind = _kind(options)
-    if (
-        isinstance(guess, Equilibrium)
-        and isinstance(guess.state.shape, kind)
-        and guess.s.shape[-1] - 1 == options.segments
-    ):
+    if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
         return guess.state, guess.total_twist
     return _first_state(scene, guess, options)
 
 
 def _kind(options: Options) -> type[Polyline] | type[Curve]:
     return Polyline if options.discretization == "finite_difference" else Curve
+
+
+def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
+    """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
+    shape = guess.state.shape
+    if needs_frames(scene):
+        return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
+    return isinstance(shape, _kind(options))
 
 
 @functools.partial(compiled, static_argnames=("options",))
@@ -292,16 +313,41 @@ def _first_state(
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
     no_force = jnp.zeros(3, scene.rod.length.dtype)
+    if needs_frames(scene):
+        return _first_frames(scaled, units, guess, options)
     if guess is None:
         return SolverState(kind.through(first_shape(scaled, pieces)), no_force, units), jnp.zeros_like(no_force[0])
     if isinstance(guess, Guess):
         return SolverState(kind.through(guess.nodes(units, pieces)), no_force, units), guess.total_twist
     state = guess.state
-    if isinstance(state.shape, Curve) and kind is Curve:
+    if isinstance(state.shape, FramedCurve):
+        shape = kind.through(state.shape.points(pieces))
+    elif isinstance(state.shape, Curve) and kind is Curve:
         shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
     else:
         shape = kind.through(state.shape.points(pieces))
     return SolverState(shape, state.end_force, state.units), guess.total_twist
+
+
+def _first_frames(
+    scene: Scene, units: Units, guess: Guess | Equilibrium | None, options: Options
+) -> tuple[SolverState, Float[Array, ""]]:
+    """The same for a nondimensional scene that needs frames."""
+    of_joints = options.discretization == "finite_difference"
+    pieces = options.segments if of_joints else 2 * options.segments
+    s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
+    no_force = jnp.zeros(3, s.dtype)
+    if isinstance(guess, Equilibrium):
+        shape, twist = guess.state.shape, guess.total_twist
+        if isinstance(shape, FramedCurve):
+            return SolverState(shape.on(s, of_joints), guess.state.end_force, guess.state.units), twist
+        points = _in_units(guess.state, units).shape.points(pieces)
+        return SolverState(framed_through(scene, points, of_joints), no_force, units), twist
+    if guess is not None:
+        return SolverState(
+            framed_through(scene, guess.nodes(units, pieces), of_joints), no_force, units
+        ), guess.total_twist
+    return SolverState(first_frames(scene, s, of_joints), no_force, units), rest_twist(scene)
 
 
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
@@ -322,8 +368,8 @@ class Search(eqx.Module):
     `normal`: of the plane in which it stays, if it does.
     """
 
-    form: MixedForm
-    point: MixedPoint
+    form: Form
+    point: Point
     shape: Shape
     units: Units
     is_within_plane: Bool[Array, ""] | None
@@ -331,22 +377,25 @@ class Search(eqx.Module):
 
     @staticmethod
     def of(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> "Search":
-        form = MixedForm.of(scene, field_of(scene, guess.shape))
+        form = form_of(scene, guess.shape)
         shape, point = _first_point(form, guess, twist)
         if not options.planar:
             return Search(form, point, shape, guess.units, None, None)
+        assert isinstance(form, MixedForm)
+        assert isinstance(point, MixedPoint)
         normal, axes = plane(scene, point.tangents)
         within = is_planar(scene, twist)
         return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
 
     def found(self, end: NewtonEnd) -> Found:
-        point, outcome, stable = end.point, end.outcome, end.is_stable
+        point, outcome, stable = self.form.settled(end.point), end.outcome, end.is_stable
         start, reached = self.shape, self.shape.reached(self.form, point)
         # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
         is_same = start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps
         is_start = (outcome.iterations == 0) & is_same
         shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
         if self.normal is not None and self.is_within_plane is not None:
+            assert isinstance(self.form, MixedForm)
             stable &= is_stable(self.form.along(self.normal[:, None]), point)
             # Inside a user's own jit the scene could not be checked before.
             status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
@@ -367,14 +416,20 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
 
 
-def _first_point(form: MixedForm, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, MixedPoint]:
+def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, Point]:
     """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
     scene, shape, field = form.scene, guess.shape, form.field
+    if isinstance(form, FrameForm):
+        assert isinstance(shape, FramedCurve)
+        quaternions = shape.turned_to_ends(scene, form.field.places, twist)
+        end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
+        return shape, form.holding(FramePoint(quaternions, end_force, twist))
     if isinstance(shape, Polyline):
         problem, start = FiniteDifference.begin(scene, shape, twist)
         return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
     assert isinstance(field, HermiteElements)
     assert isinstance(shape, Curve)
+    assert isinstance(form, MixedForm)
     tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
     total_twist = form.twist_near(tangents, twist, scene.turns)
     end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)

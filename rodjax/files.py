@@ -21,18 +21,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.along import Smooth, Steps
 from rodjax.atomic_write import has_seal, replace_file, seal
-from rodjax.checks import file_path, instance, is_known, one_of
+from rodjax.checks import file_path, instance, is_known, one_of, shown
 from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
-from rodjax.discretization.shape import Shape
+from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.result import Equilibrium
 from rodjax.status import Status
-from rodjax.supports import Clamp, Free, Pin, Support, Swivel
+from rodjax.supports import Clamp, Free, Pin, Swivel
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 4
+FORMAT = 5
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -60,7 +62,8 @@ FIELDS = {
     "state/shape/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
     "state/shape/edges": ("1", "finite differences: differences of these nodes, free of the rounding of the positions"),
     "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
-    "state/shape/s": ("1", "Hermite elements: arclength of the nodes as a part of the length"),
+    "state/shape/quaternions": ("1", "frames of a general rod, at nodes and middles of the elements, or by joints"),
+    "state/shape/s": ("1", "Hermite elements and frames: arclength of the nodes as a part of the length"),
     "state/end_force": ("1", "force at s = L between held ends, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
@@ -68,28 +71,55 @@ FIELDS = {
     "scene/gravity": ("m/s^2", "gravity"),
     "scene/turns": ("1", "whole turns of the end frame beyond the total twist of the initial shape"),
     "scene/rod/length": ("m", "length of the rod"),
-    "scene/rod/EI": ("N m^2", "bending stiffness"),
-    "scene/rod/GJ": ("N m^2", "torsional stiffness"),
-    "scene/rod/EA": ("N", "axial stiffness"),
-    "scene/rod/mass_per_length": ("kg/m", "mass per length"),
+    **{
+        f"scene/rod/{place}{leaf}": (leaf_unit or unit, description + what)
+        for place, unit, description in (
+            ("EI", "N m^2", "bending stiffness"),
+            ("EI/*", "N m^2", "bending stiffness about d1 and d2"),
+            ("GJ", "N m^2", "torsional stiffness"),
+            ("EA", "N", "axial stiffness"),
+            ("mass_per_length", "kg/m", "mass per length"),
+            ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
+            ("rest_twist", "rad/m", "twist without stress"),
+        )
+        for leaf, leaf_unit, what in (
+            ("", "", ""),
+            ("/jumps", "m", ": arclengths at which it jumps"),
+            ("/s", "m", ": arclengths of the values of a cubic spline"),
+            ("/values", "", ": values between the jumps, or at the arclengths s"),
+        )
+    },
     "scene/rod/radius": ("m", "radius of the rod, for pictures"),
+    "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
+    "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
+    "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
     "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
     "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
+    "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
-        f"scene/{end}/{name}": (unit, f"{description} at s = {place}, global axes")
+        f"scene/{end}/{name}": (unit, f"{description} at s = {place}, {axes}")
         for end, place in (("start", "0"), ("end", "L"))
-        for name, unit, description in (
-            ("position", "m", "position that the support holds"),
-            ("frame", "1", "frame that the support holds, columns d1, d2, t,"),
-            ("tangent", "1", "tangent that the support holds"),
-            ("force", "N", "dead force on the rod"),
-            ("moment", "N m", "dead moment on the rod"),
+        for name, unit, description, axes in (
+            ("position", "m", "position that the support holds", "global axes"),
+            ("frame", "1", "frame that the support holds, columns d1, d2, t,", "global axes"),
+            ("tangent", "1", "tangent that the support holds", "global axes"),
+            ("force", "N", "force on the rod", "global axes or, of a follower, the frame there"),
+            ("moment", "N m", "moment on the rod", "global axes or, of a follower, the frame there"),
         )
     },
 }
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
-KINDS = {kind.__name__: kind for kind in (Clamp, Swivel, Pin, Free, Polyline, Curve)}
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        *(Clamp, Swivel, Pin, Free),
+        *(Polyline, Curve, FramedCurve),
+        *(Steps, Smooth),
+        *(DistributedForce, DistributedCouple),
+    )
+}
 
 
 def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
@@ -104,6 +134,11 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
     path = file_path(path, "path", SUFFIX)
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
+    if equilibrium.scene.rod.law is not None:
+        raise ValueError(
+            f"equilibrium.scene.rod.law must be None, got a {type(equilibrium.scene.rod.law).__name__}: "
+            "a law is code, which cannot be saved"
+        )
     leading = equilibrium.s.shape[:-1]
     if len(leading) > 1:
         raise ValueError(
@@ -142,7 +177,7 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             group = _group(file, "rodjax", path)
             _check_format(group, path)
             points = group.get("s")
-            equilibrium = _read(group, Equilibrium, path, points.shape if isinstance(points, h5py.Dataset) else ())
+            equilibrium = _read(group, (Equilibrium,), path, points.shape if isinstance(points, h5py.Dataset) else ())
     # What h5py raises for a file that is not HDF5, is cut short or damaged.
     except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
@@ -188,62 +223,92 @@ def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
     if type(module).__name__ in KINDS:
         group.attrs["kind"] = type(module).__name__
     for field in dataclasses.fields(module):
-        name, value = field.name, getattr(module, field.name)
+        value = getattr(module, field.name)
         if field.metadata.get("static"):
-            group.attrs[name] = value
-        elif isinstance(value, eqx.Module):
-            _write(group.create_group(name), value, f"{place}{name}/")
-        elif isinstance(value, tuple):
-            modules = group.create_group(name)
-            for k, module_k in enumerate(value):
-                _write(modules.create_group(str(k)), module_k, f"{place}{name}/*/")
-        elif value is not None:
-            dataset = group.create_dataset(name, data=value)
-            dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place + name]
+            group.attrs[field.name] = value
+        else:
+            _write_value(group, field.name, value, f"{place}{field.name}")
 
 
-def _read(group: h5py.Group, kind: Any, path: Path, shape: tuple[int, ...]) -> Any:
-    """A module of class `kind`, or of the one that the group names, with NumPy arrays for leaves.
+def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
+    if isinstance(value, eqx.Module):
+        _write(group.create_group(name), value, f"{place}/")
+    elif isinstance(value, tuple):
+        entries = group.create_group(name)
+        for k, entry in enumerate(value):
+            _write_value(entries, str(k), entry, f"{place}/*")
+    elif value is not None:
+        dataset = group.create_dataset(name, data=value)
+        dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place]
+
+
+def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[int, ...]) -> Any:
+    """A module of one of the classes, or of the one below them that the group names, with NumPy arrays for leaves.
 
     `shape`: of the arclengths of the nodes.
     """
-    if kind in (Shape, Support):
+    allowed = [name for name, known in KINDS.items() if issubclass(known, classes)]
+    kind = classes[0]
+    if allowed:
         name = group.attrs.get("kind")
-        if not isinstance(name, str) or not issubclass(KINDS.get(name, object), kind):
-            raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(KINDS)}")
+        if not isinstance(name, str) or name not in allowed:
+            raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(allowed)}")
         kind = KINDS[name]
     # As it was written, without the checks of its constructor, which take a single scene of sensible numbers.
     module = object.__new__(kind)
     for field in dataclasses.fields(kind):
-        entry = group.get(field.name)
-        is_group = dataclasses.is_dataclass(field.type) or typing.get_origin(field.type) is tuple
         if field.metadata.get("static"):
-            value = group.attrs[field.name]
-            one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
-        elif isinstance(entry, h5py.Group) and typing.get_origin(field.type) is tuple:
-            item = typing.get_args(field.type)[0]
-            value = tuple(_read(_group(entry, str(k), path), item, path, shape) for k in range(len(entry)))
-        elif isinstance(entry, h5py.Group) and is_group:
-            value = _read(entry, field.type, path, shape)
-        elif isinstance(entry, h5py.Dataset) and not is_group:
-            value = _array(entry, field.type, path, shape)
-        elif entry is None and types.NoneType in typing.get_args(field.type):
-            value = None
+            value = _static(group, field, path)
         else:
-            raise ValueError(f"{path} lacks {group.name}/{field.name}: it is damaged, or rodjax.save did not write it")
+            value = _read_value(group, field.name, field.type, path, shape)
         object.__setattr__(module, field.name, value)
     return module
 
 
-def _array(dataset: h5py.Dataset, annotation: Any, path: Path, shape: tuple[int, ...]) -> np.ndarray:
+def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
+    value = group.attrs[field.name]
+    if field.type is not bool:
+        one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
+        return value
+    if not isinstance(value, np.bool_):
+        raise ValueError(f"{path} is damaged: {field.name} of {group.name} must be true or false, got {shown(value)}")
+    return bool(value)
+
+
+def _read_value(group: h5py.Group, name: str, annotation: Any, path: Path, shape: tuple[int, ...]) -> Any:
+    """What a group has under a name: of one of the kinds that the annotation allows."""
+    is_union = typing.get_origin(annotation) in (types.UnionType, typing.Union)
+    kinds = typing.get_args(annotation) if is_union else (annotation,)
+    classes = tuple(kind for kind in kinds if dataclasses.is_dataclass(kind))
+    of_tuple = next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple), None)
+    of_array = next((kind for kind in kinds if hasattr(kind, "dim_str")), None)
+    entry = group.get(name)
+    if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
+        items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
+        return tuple(_read_value(entry, str(k), item, path, shape) for k, item in enumerate(items))
+    if isinstance(entry, h5py.Group) and classes:
+        return _read(entry, classes, path, shape)
+    if isinstance(entry, h5py.Dataset) and of_array:
+        return _array(entry, of_array, path, shape)
+    if entry is None and types.NoneType in kinds:
+        return None
+    raise ValueError(f"{path} lacks {group.name}/{name}: it is damaged, or rodjax.save did not write it")
+
+
+def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...]) -> np.ndarray:
     """The numbers of a dataset, which are of the kind and shape with which the field is annotated."""
-    kind = next(iter(typing.get_args(annotation)), annotation)  # of one that may be None
     *leading, nodes = shape or (0,)
-    sizes = {"n+1": nodes, "n": nodes - 1, "m": 2 * nodes - 1, "3": 3}
-    wanted = (*leading, *(sizes[size] for size in kind.dim_str.split() if size != "..."))
-    if dataset.shape != wanted or dataset.dtype.name not in kind.dtypes:
+    # "m": nodes and middles of elements, or two ends and the middles between nodes; of other names any size.
+    sizes = {"n+1": (nodes,), "n": (nodes - 1,), "m": (2 * nodes - 1, nodes + 1), "3": (3,), "4": (4,)}
+    names = [name for name in kind.dim_str.split() if name != "..."]
+    wanted = [*((size,) for size in leading), *(sizes.get(name) for name in names)]
+    shape_there = dataset.shape or ()  # of an empty dataset None
+    fits = len(shape_there) == len(wanted)
+    fits &= all(not allowed or size in allowed for size, allowed in zip(shape_there, wanted, strict=False))
+    if not fits or dataset.shape is None or dataset.dtype.name not in kind.dtypes:
+        described = ", ".join(" or ".join(map(str, allowed)) if allowed else "any" for allowed in wanted)
         raise ValueError(
-            f"{path} is damaged: {dataset.name} must be {kind.dtype.__name__} of shape {wanted}, "
+            f"{path} is damaged: {dataset.name} must be {kind.dtype.__name__} of shape ({described}), "
             f"got {dataset.dtype.name} of shape {dataset.shape}"
         )
     return dataset[()]

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import is_known
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.form import Form, Point
+from rodjax.discretization.forms import form_of
 from rodjax.discretization.shape import Shape
-from rodjax.result import Equilibrium, Found, SolverState, equilibrium, field_of, form_and_point
+from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.scene import Scene, nondimensional
 from rodjax.stability import Motion, examined
 from rodjax.status import Outcome
@@ -65,7 +66,7 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     shape = result.state.shape
     outcome = Outcome(result.residual, result.iterations, result.evaluations, result.status)
 
-    def same(scene: Scene, shape: Shape, point: MixedPoint) -> Equilibrium:
+    def same(scene: Scene, shape: Shape, point: Point) -> Equilibrium:
         units = nondimensional(scene)[1]
         found = Found(SolverState(shape, point.end_force, units), point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)
@@ -77,32 +78,28 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
-def carried_to(
-    scene: Scene, shape: Shape, point: MixedPoint, motion: Motion | None = None
-) -> tuple[MixedForm, MixedPoint]:
+def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
     """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
 
     The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
     carried there.
     """
-    form = MixedForm.of(scene, field_of(scene, shape))
-    tangents = form.field.as_held(scene, point.tangents)
-    begin = MixedPoint(tangents, point.end_force, form.twist_near(tangents, point.total_twist))
+    form = form_of(scene, shape)
+    begin = form.holding(point)
     if motion is None:
         return form, begin
-    bases = form.field.basis(scene, form.bases(form.field.with_held(scene, tangents)))
     force_change = form.force_change(form.closure(motion.multipliers))
-    return form, form.moved(begin, bases, motion.rotation, force_change)
+    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
 
 
 def _change(
     scene: Scene,
     scene_change: Scene,
     shape: Shape,
-    point: MixedPoint,
+    point: Point,
     is_equilibrium: Bool[Array, ""],
     residual: Float[Array, ""],
-) -> tuple[Shape, MixedPoint]:
+) -> tuple[Shape, Point]:
     """The change of shape and point of an equilibrium with that of its scene, nondimensional.
 
     Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
@@ -110,10 +107,9 @@ def _change(
 
     def gradient(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         form, here = carried_to(scene, shape, point)
-        linearization = form.linearized(here)
-        return linearization.gradient, linearization.closure
+        return form.unbalanced(here)
 
-    def reached(scene: Scene, motion: Motion) -> tuple[Shape, MixedPoint]:
+    def reached(scene: Scene, motion: Motion) -> tuple[Shape, Point]:
         form, there = carried_to(scene, shape, point, motion)
         return shape.reached(form, there), there
 

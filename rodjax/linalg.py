@@ -14,8 +14,10 @@ Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tri
 """
 
 import functools
+import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,7 +27,7 @@ class SaddlePointSystem(eqx.Module):
 
     `border` holds A, `compliance` C, symmetric; `rows` stand in the place of A^T where they are given. Every second
     block of H may also be coupled with the next but one: `across[..., i]` is block (2 i + 2, 2 i). Blocks of size 1
-    and 2.
+    to 3.
     """
 
     diagonal: Float[Array, "b b n"]
@@ -41,10 +43,10 @@ class SaddlePointSystem(eqx.Module):
         given = [x.shape for x in (self.diagonal, self.lower, self.border, self.compliance, rows)]
         if self.across is not None and (n % 2 == 0 or self.across.shape != (b, b, n // 2)):
             raise ValueError(f"across must have the shape {(b, b, n // 2)} for odd n, got {self.across.shape}, n = {n}")
-        if b not in (1, 2) or given != [(b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n)]:
+        if b not in (1, 2, 3) or given != [(b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n)]:
             raise ValueError(
                 "a saddle-point system needs arrays of shapes (b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n) "
-                f"with b = 1 or 2, got {', '.join(map(str, given))}"
+                f"with b = 1 to 3, got {', '.join(map(str, given))}"
             )
 
     def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
@@ -65,6 +67,44 @@ class SaddlePointSystem(eqx.Module):
         identity = jnp.eye(self.diagonal.shape[0], dtype=shift.dtype)[..., None]
         shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
+
+
+class DenseSystem(eqx.Module):
+    """The same as one full matrix without symmetry, where each place of the rod is coupled with all others."""
+
+    matrix: Float[Array, "bn+k bn+k"]
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        return self._parted(self.matrix @ jnp.concatenate([x.reshape(-1), y]))
+
+    def _parted(self, all: Float[Array, "bn+k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        size = math.prod(self.shape)
+        return all[:size].reshape(self.shape), all[size:]
+
+    def shifted(self, shift: Float[Array, ""] | Float[Array, "n"]) -> "DenseSystem":
+        b, n = self.shape
+        by_rotation = jnp.broadcast_to(shift, (b, n)).reshape(-1)
+        k = len(self.matrix) - b * n
+        added = jnp.diag(jnp.concatenate([by_rotation, jnp.zeros(k, by_rotation.dtype)]))
+        return DenseSystem(self.matrix + added, self.shape)
+
+
+class DenseFactors(eqx.Module):
+    """The factorisation of a `DenseSystem`, which says nothing of minima."""
+
+    system: DenseSystem
+    lu: tuple[Array, Array]
+    negative: Int[Array, ""]
+
+    @property
+    def is_minimum(self) -> Bool[Array, ""]:
+        """Whether the factorisation has worked: there is no energy that could be minimal."""
+        return jnp.isfinite(jnp.sum(self.lu[0]))
+
+    def solve(self, f: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        right = jnp.concatenate([f.reshape(-1), c])
+        return self.system._parted(jax.scipy.linalg.lu_solve(self.lu, right))
 
 
 class Factors(eqx.Module):
@@ -95,20 +135,33 @@ class Factors(eqx.Module):
         return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
 
 
+AnyFactors = Factors | DenseFactors
+AnySystem = SaddlePointSystem | DenseSystem
+
+
 def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
     """Sum over an axis of few entries, written out: XLA makes a sum over an axis a loop at each place along the rod."""
     return functools.reduce(jnp.add, jnp.unstack(x, axis=axis)) if x.shape[axis] else jnp.sum(x, axis=axis)
 
 
-def factor(system: SaddlePointSystem) -> Factors:
-    """Factorisation by cyclic reduction, O(n). A block that happens to be singular makes infinities or NaN."""
+def factor(system: AnySystem) -> "AnyFactors":
+    """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
+
+    A block that happens to be singular makes infinities or NaN.
+    """
+    if isinstance(system, DenseSystem):
+        return DenseFactors(system, jax.scipy.linalg.lu_factor(system.matrix), jnp.zeros((), int))
     return _factor(system, system.border)[0]
 
 
 def factor_and_solve(
-    system: SaddlePointSystem, f: Float[Array, "b n"], c: Float[Array, "k"]
-) -> tuple[Factors, Float[Array, "b n"], Float[Array, "k"]]:
+    system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"]
+) -> tuple["AnyFactors", Float[Array, "b n"], Float[Array, "k"]]:
     """Factorisation and the solution for one right side, in one sweep."""
+    if isinstance(system, DenseSystem):
+        dense = factor(system)
+        x, y = dense.solve(f, c)
+        return dense, x, y
     factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1))
     return factors, *factors._bordered(x[:, -1], c)
 
@@ -200,11 +253,26 @@ def _inverse(blocks: Float[Array, "b b m"]) -> tuple[Float[Array, "b b m"], Int[
     """Inverses of symmetric blocks, and how many negative eigenvalues these have together."""
     if blocks.shape[0] == 1:
         return 1 / blocks, jnp.sum(blocks < 0)
+    if blocks.shape[0] == 3:
+        return _inverse_of_three(blocks)
     a, b, d = blocks[0, 0], blocks[1, 0], blocks[1, 1]
     determinant = a * d - b * b
     off = -b / determinant
     inverse = jnp.stack([jnp.stack([d / determinant, off]), jnp.stack([off, a / determinant])])
     return inverse, jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
+
+
+def _inverse_of_three(blocks: Float[Array, "3 3 m"]) -> tuple[Float[Array, "3 3 m"], Int[Array, ""]]:
+    a, b, c, d, e, f = blocks[0, 0], blocks[1, 0], blocks[2, 0], blocks[1, 1], blocks[2, 1], blocks[2, 2]
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    minor = a * d - b * b
+    determinant = a * first + b * second + c * third
+    inverse = [[first, second, third], [second, a * f - c * c, b * c - a * e], [third, b * c - a * e, minor]]
+    # By Sylvester's criterion all eigenvalues are positive, or all of them negative; else the determinant tells.
+    is_positive = (a > 0) & (minor > 0) & (determinant > 0)
+    is_negative = (a < 0) & (minor > 0) & (determinant < 0)
+    count = jnp.where(is_positive, 0, jnp.where(is_negative, 3, jnp.where(determinant < 0, 1, 2)))
+    return jnp.stack([jnp.stack(row) for row in inverse]) / determinant[None, None], jnp.sum(count)
 
 
 def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:

@@ -3,10 +3,16 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance
-from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.along import Along
+from rodjax.checks import instance, is_known, whole_number
+from rodjax.compilation import compiled
+from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.framed import FrameForm
+from rodjax.discretization.framed_curve import FramedCurve
+from rodjax.linalg import DenseSystem
 from rodjax.result import Equilibrium, form_and_point, over_leading_axes
 from rodjax.scene import nondimensional
 from rodjax.stability import Motion, softest
@@ -41,6 +47,55 @@ def lowest_mode(equilibrium: Equilibrium) -> Mode:
     return _lowest_mode(equilibrium)
 
 
+def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
+    """Squares of the lowest angular frequencies of small vibrations [1/s^2], (count,) complex, by their size.
+
+    All real and positive: the equilibrium is stable. A negative one: it is left without vibration (divergence); a
+    complex pair: by vibrations that grow (flutter). Under follower loads and couples, which have no potential, this is
+    what tells stability. The inertia of the sections against turning is left out. O(n^3), eager only.
+
+    Raises `ValueError` where the rod has no mass, or where its tangents suffice (see `rodjax.Rod`): its loads have a
+    potential or are dead moments, and `Equilibrium.index` and `stable` tell.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    if not is_known(equilibrium):
+        raise ValueError("equilibrium must hold numbers, got a traced one: call squared_frequencies outside jax.jit")
+    if equilibrium.s.ndim > 1:
+        raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.s.shape[:-1]}")
+    if not isinstance(equilibrium.state.shape, FramedCurve):
+        raise ValueError("equilibrium must be of a rod or loads that need frames along the rod")
+    rod = equilibrium.scene.rod
+    mass = float(rod.mean_mass_per_length)
+    if not mass > 0:
+        raise ValueError(f"equilibrium must be of a rod with a mass_per_length, got {mass:g} kg/m")
+    flexibility, weights = _flexibility(equilibrium)
+    values = np.linalg.eigvals(np.asarray(flexibility) * np.repeat(np.asarray(weights), 3)[None])
+    values = values[np.argsort(-np.abs(values))][: whole_number(count, "count", 1, len(values))]
+    return float(rod.bending_scale) / (mass * float(rod.length) ** 4) / values.astype(complex)
+
+
+@compiled
+def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float[Array, "n"]]:
+    """The displacements of the nodes under forces on them, nondimensional, and the mass that each node stands for."""
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, FrameForm)
+    here = form.with_all(point)
+    assert isinstance(here.system, DenseSystem)
+    bases, free = here.bases, here.gradient  # of the shape of the rotations
+
+    def nodes(rotation: Float[Array, "3 m"], closure: Float[Array, "c"]) -> Float[Array, "3n"]:
+        moved = form.moved(point, bases, rotation * form.is_free, form.force_change(closure))
+        return form.nodes(form.edges(moved)).reshape(-1)
+
+    by_rotation, by_force = jax.jacfwd(nodes, argnums=(0, 1))(jnp.zeros_like(free), jnp.zeros_like(here.closure))
+    by_all = jnp.concatenate([by_rotation.reshape(len(by_rotation), -1), by_force], axis=1)
+    forces = by_all.at[:, free.size :].set(0.0)
+    s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
+    mass = form.scene.rod.mass_per_length
+    before = mass.integral(s) if isinstance(mass, Along) else s
+    return by_all @ jnp.linalg.solve(here.system.matrix, forces.T), jnp.diff(before)
+
+
 @over_leading_axes
 def _lowest_mode(equilibrium: Equilibrium) -> Mode:
     form, point = form_and_point(equilibrium)
@@ -51,8 +106,8 @@ def _lowest_mode(equilibrium: Equilibrium) -> Mode:
 
 
 def mode_of(
-    form: MixedForm,
-    point: MixedPoint,
+    form: Form,
+    point: Point,
     here: Linearization,
     stiffness: Float[Array, ""],
     motion: Motion,

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.compilation import compiled
-from rodjax.discretization.mixed import MixedPoint
 from rodjax.equilibrium import (
     Discretization,
     Options,
@@ -28,7 +27,7 @@ from rodjax.equilibrium import (
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, warn_if_not_converged
-from rodjax.scene import Scene, between, dead_end_moment, nondimensional
+from rodjax.scene import Scene, between, has_potential, nondimensional
 from rodjax.solvers.newton import Find
 from rodjax.status import Outcome, is_converged
 from rodjax.tracing import DEFAULT_STEPS, trace
@@ -99,7 +98,7 @@ def solve_path(
 def _check_stop(scenes: Scene) -> None:
     if not is_known(scenes):
         raise ValueError("at_critical must be 'jump' inside jax.jit or vmap: how many scenes a path has must be known")
-    if dead_end_moment(scenes) is not None:
+    if not has_potential(scenes):
         raise ValueError("at_critical must be 'jump' for a dead moment on a free end, which has no potential")
 
 
@@ -228,7 +227,7 @@ def _step(
         )
 
     zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
-    nowhere = MixedPoint(jnp.zeros_like(last.state.shape.unknown_tangents), jnp.zeros(3, zero.dtype), zero)
+    nowhere = jax.tree.map(jnp.zeros_like, last.state.shape.point(last.state.end_force, zero))
     progress = _Progress(
         reached=last.state,
         begin=_predicted(last, before, scene),

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from rodjax.checks import line, shown
 
-# SI unit (none: a plain number), shape and an example of every key that holds numbers.
+# SI unit (none: a plain number), shape and an example of every key that holds numbers, as many as its shape says.
 QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "length": ("m", (), '"1 m"'),
     "radius": ("m", (), '"5 mm"'),
@@ -28,9 +28,19 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "poisson_ratio": ("", (), "0.5"),
     "density": ("kg/m^3", (), '"1200 kg/m^3"'),
     "EI": ("N m^2", (), '"4.9e-3 N m^2"'),
+    "EI1": ("N m^2", (), '"4.9e-3 N m^2"'),
+    "EI2": ("N m^2", (), '"2.5e-3 N m^2"'),
     "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
     "EA": ("N", (), '"785 N"'),
     "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
+    "rest_curvature_1": ("1/m", (), '"2 1/m"'),
+    "rest_curvature_2": ("1/m", (), '"0 1/m"'),
+    "rest_twist": ("rad/m", (), '"0.5 rad/m"'),
+    "width": ("m", (), '"10 mm"'),
+    "height": ("m", (), '"1 mm"'),
+    "wires": ("", (), "7"),
+    "wire_radius": ("m", (), '"0.5 mm"'),
+    "stick": ("", (), "0.2"),
     "position": ("m", (3,), '"[0.8, 0, 0] m"'),
     "tangent": ("", (3,), "[1, 0, 0]"),
     "d2": ("", (3,), "[0, 1, 0]"),
@@ -39,11 +49,27 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "turns": ("", (), "1"),
     "force": ("N", (3,), '"[0, 0, -0.2] N"'),
     "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
+    "couple": ("N m/m", (3,), '"[0, 0, 0.01] N m/m"'),
     "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
     "at": ("m", (), '"0.5 m"'),
     "segments": ("", (), "50"),
     "rtol": ("", (), "1e-3"),
     "steps": ("", (), "10"),
+}
+# The same of keys that mean something else in one table, by the name of that table.
+OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
+    "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"')},
+}
+# The same of keys that hold lists, of any length where the shape has `None`.
+LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
+    "radii": ("m", (None,), '"[0, 2, 3] mm"'),
+    "youngs_moduli": ("Pa", (None,), '"[1, 50] MPa"'),
+    "shear_moduli": ("Pa", (None,), '"[0.3, 17] MPa"'),
+    "poisson_ratios": ("", (None,), "[0.5, 0.4]"),
+    "densities": ("kg/m^3", (None,), '"[1100, 1200] kg/m^3"'),
+    "points": ("m", (None, 3), '"[[0, 0, 0], [1, 0, 0], [2, 0.5, 0], [3, 1, 0]] cm"'),
+    "jumps": ("m", (None,), '"[0.5] m"'),
+    "s": ("m", (None,), '"[0, 0.5, 1] m"'),
 }
 NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I | re.S)
 
@@ -64,7 +90,7 @@ def named(where: str) -> Iterator[None]:
     except SceneFileError:
         raise
     except (TypeError, ValueError) as error:
-        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in QUANTITIES
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*QUANTITIES, *LISTS, "values")
         raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
 
 
@@ -80,7 +106,8 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
             )
     for key in required:
         if key not in table:
-            example = f"{key} = {QUANTITIES[key][2]}" if key in QUANTITIES else f"a table [{key}]"
+            is_table = key not in QUANTITIES and key not in LISTS
+            example = f"a table [{key}]" if is_table else f"{key} = {quantity(key, where)[2]}"
             raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
     return table
 
@@ -99,18 +126,32 @@ def choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
     return table.get(key)
 
 
+def quantity(key: str, where: str = "") -> tuple[str, tuple[int | None, ...], str]:
+    """SI unit, shape and an example of a key in the table at that place."""
+    of_table = next((keys for table, keys in OF_TABLES.items() if table in where), {})
+    return of_table.get(key) or QUANTITIES.get(key) or LISTS[key]
+
+
 def si_values(
     table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
 ) -> dict[str, Float[np.ndarray, "..."]]:
     """The numbers of a table in SI units. Keys in `other` may be there too and are left out."""
     check_keys(table, where, required, (*optional, *other))
     with named(where):
-        return {key: _si_value(value, key) for key, value in table.items() if key not in other}
+        return {key: si_value(value, key, *quantity(key, where)) for key, value in table.items() if key not in other}
 
 
-def assignment(key: str, value: Any) -> str:
-    """The line of TOML from which `si_values` makes the same number to the last bit."""
-    numbers, unit = np.asarray(value, float).tolist(), QUANTITIES[key][0]
+def flag(table: dict[str, Any], where: str, key: str) -> bool:
+    """Whether the key of a table is true; it is false where it is not given."""
+    value = table.get(key, False)
+    if not isinstance(value, bool):
+        raise SceneFileError(f"{where}.{key} must be true or false, got {shown(value)}")
+    return value
+
+
+def assignment(key: str, value: Any, unit: str) -> str:
+    """The TOML from which `si_value` makes the same numbers to the last bit; `unit`: none of plain numbers."""
+    numbers = np.asarray(value, float).tolist()
     return f'{key} = "{numbers} {unit}"' if unit else f"{key} = {numbers}"
 
 
@@ -119,9 +160,8 @@ def _check_table(table: Any, where: str) -> None:
         raise SceneFileError(f"{where} must be a table, [{where}], got {shown(table)}")
 
 
-def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
-    """A quantity or plain number of the shape that its key has, in SI units; of a direction, the unit vector."""
-    si, shape, example = QUANTITIES[key]
+def si_value(value: Any, key: str, si: str, shape: tuple[int | None, ...], example: str) -> Float[np.ndarray, "..."]:
+    """A quantity or plain numbers of that shape, in units `si`; of a direction, the unit vector."""
 
     def mistake(allowed: str, got: str = shown(value)) -> ValueError:
         return ValueError(f"{key} must {allowed}, for example {key} = {example}, got {got}")
@@ -135,7 +175,7 @@ def _si_value(value: Any, key: str) -> Float[np.ndarray, "..."]:
             raise mistake("be a number and a unit")
         numbers, unit = _parsed(match[1]), match[2]
     if not _has_shape(numbers, shape):
-        kind = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
+        kind = _described(shape)
         raise mistake(f"be {kind} {'and a unit' if si else 'without quotes or unit'}")
     if si and not unit:
         raise mistake("have a unit")
@@ -165,10 +205,21 @@ def _parsed(numbers: str) -> Any:
         return None
 
 
-def _has_shape(numbers: Any, shape: tuple[int, ...]) -> bool:
+def _has_shape(numbers: Any, shape: tuple[int | None, ...]) -> bool:
+    """Whether numbers are in lists of these lengths; `None`: of any length but 0."""
     if shape == ():
         return isinstance(numbers, (int, float)) and not isinstance(numbers, bool)
-    return isinstance(numbers, list) and len(numbers) == shape[0] and all(_has_shape(x, shape[1:]) for x in numbers)
+    if not isinstance(numbers, list) or not numbers or len(numbers) != (shape[0] or len(numbers)):
+        return False
+    return all(_has_shape(x, shape[1:]) for x in numbers)
+
+
+def _described(shape: tuple[int | None, ...]) -> str:
+    if shape == ():
+        return "a number"
+    if shape[0] is None:
+        return "a list of numbers" if len(shape) == 1 else f"a list of lists of {shape[1]} numbers"
+    return f"{' x '.join(map(str, shape))} numbers"
 
 
 def _unit_vector(vector: np.ndarray) -> Float[np.ndarray, "3"]:

@@ -13,18 +13,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.compilation import compiled
+from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
-from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
+from rodjax.discretization.form import Form
+from rodjax.discretization.forms import form_of
+from rodjax.discretization.framed import FrameForm
+from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
 from rodjax.discretization.hermite import Curve, HermiteElements
-from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import positions_between, resultants
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.results import Resultants, positions_between, resultants
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.tangent_field import TangentField
-from rodjax.energy import axial_strain_under
 from rodjax.guess import cubic
 from rodjax.linalg import factor
-from rodjax.scene import Scene, nondimensional
+from rodjax.scene import Scene, has_potential, nondimensional
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
@@ -37,8 +39,8 @@ class NotConvergedWarning(UserWarning):
 class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
-    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements; `end_force`: the force at s = L between
-    held ends, else zero.
+    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
+    are unknown; `end_force`: the force at s = L between held ends, else zero.
     """
 
     shape: Shape
@@ -58,12 +60,13 @@ class Equilibrium(eqx.Module):
     - `curvature` [..., n+1] |t x t'|, 1/m
     - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
     - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
-    - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of a dead
-      moment depends on the way and is left out; `elastic_energy` [...] J
+    - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
+      without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
-    - `stable` [...] bool: converged, and the energy has no negative curvature there; with a dead moment, which has no
-      potential, this is not examined and False
+    - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
+      (dead moments, couples along the rod, follower loads) this is not examined and False, and
+      `rodjax.squared_frequencies` tells
     - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
       a step of a path took: 1, or more where it was split
     - `residual` [...] largest component of the gradient, in EI/L^2
@@ -72,7 +75,7 @@ class Equilibrium(eqx.Module):
     - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
-      examined, under a dead moment and in the continuum. Computed when asked for
+      examined, under loads without a potential and in the continuum. Computed when asked for
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
     - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
@@ -145,7 +148,7 @@ class Found(eqx.Module):
     """Where a solver stopped, nondimensional."""
 
     state: SolverState
-    point: MixedPoint
+    point: Any
     outcome: Outcome
     is_stable: Bool[Array, ""]
 
@@ -155,12 +158,12 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
     scaled, units = nondimensional(scene)
     point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
-    form = MixedForm.of(scaled, field_of(scaled, found.state.shape))
-    results = resultants(form, point)
+    form = form_of(scaled, found.state.shape)
+    results = _resultants(form, point)
     elastic_energy = form.elastic_energy(point)
     potential = elastic_energy + form.load_energy(point)
     converged = is_converged(outcome.status)
-    axial_strain = axial_strain_under(scaled.rod, results.tension)
+    axial_strain = results.axial_strain
     is_collapsed = ~converged & (jnp.min(axial_strain) <= -1)
     return Equilibrium(
         s=form.field.s * scene.rod.length,
@@ -186,8 +189,15 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         residual=outcome.residual,
         scene=scene,
         state=SolverState(found.state.shape, found.state.end_force, units),
-        discretization="hermite" if isinstance(form.field, HermiteElements) else "finite_difference",
+        discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
     )
+
+
+def _resultants(form: Form, point: Any) -> Resultants:
+    if isinstance(form, FrameForm):
+        return resultants_of_frames(form, point)
+    assert isinstance(form, MixedForm)
+    return resultants(form, point)
 
 
 def over_leading_axes(function: Callable) -> Callable:
@@ -209,9 +219,13 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
     state = equilibrium.state
     if equilibrium.discretization == "continuum":
         return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), None)
+    form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        return errors_of_frames(form, point)
+    assert isinstance(form, MixedForm)
     if isinstance(state.shape, Curve):
-        return errors_of_elements(*form_and_point(equilibrium))
-    return errors_of_differences(*form_and_point(equilibrium), state.shape.nodes, equilibrium.tangents.T)
+        return errors_of_elements(form, point)
+    return errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
 
 
 class _Examination(eqx.Module):
@@ -235,26 +249,23 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
 
 @over_leading_axes
 def _positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    units = equilibrium.state.units
+    form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        nodes = equilibrium.state.shape.nodes
+        return units.origin[None] + units.length * positions_between_frames(form, point, nodes, s / units.length)
+    assert isinstance(form, MixedForm)
     if not isinstance(equilibrium.state.shape, Curve):
         slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
         return cubic(equilibrium.s, equilibrium.nodes, slopes, s)
-    units = equilibrium.state.units
-    form, point = form_and_point(equilibrium)
     positions = positions_between(form, point, equilibrium.state.shape.nodes, s / units.length)
     return units.origin[None] + units.length * positions
 
 
-def form_and_point(equilibrium: Equilibrium) -> tuple[MixedForm, MixedPoint]:
+def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
-    point = MixedPoint(state.shape.unknown_tangents, state.end_force, equilibrium.total_twist)
-    return MixedForm.of(scaled, field_of(scaled, state.shape)), point
-
-
-def field_of(scene: Scene, shape: Shape) -> TangentField:
-    if isinstance(shape, Curve):
-        return HermiteElements.of(scene, shape.s)
-    return EdgeTangents.of(scene, len(shape.nodes) - 1)
+    return form_of(scaled, state.shape), state.shape.point(state.end_force, equilibrium.total_twist)
 
 
 def describe(equilibrium: Equilibrium) -> str:
@@ -262,10 +273,12 @@ def describe(equilibrium: Equilibrium) -> str:
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = _examination(equilibrium)
     converged = np.asarray(equilibrium.converged)
+    potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
         "a saddle: there are motions that lower the energy": examination.index > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
+        "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
         "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(equilibrium.axial_strain, -1)
         <= -1,
     }

@@ -10,7 +10,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
-from rodjax.loads import PointForce
+from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.rod import Rod
 from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
@@ -32,6 +32,7 @@ class Scene(eqx.Module):
     - `point_forces`: `PointForce`s along the rod.
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
         total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only.
+    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, or where the ends are further apart than 1.5 rod lengths.
@@ -43,6 +44,7 @@ class Scene(eqx.Module):
     gravity: Float[Array, "3"] | None
     point_forces: tuple[PointForce, ...]
     turns: Float[Array, ""] | None
+    distributed: tuple[DistributedForce | DistributedCouple, ...]
 
     def __init__(
         self,
@@ -52,6 +54,7 @@ class Scene(eqx.Module):
         gravity: Any = None,
         point_forces: Sequence[PointForce] = (),
         turns: Any = None,
+        distributed: Sequence[DistributedForce | DistributedCouple] = (),
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -61,9 +64,11 @@ class Scene(eqx.Module):
             instance(force, f"point_forces[{k}]", PointForce)
         gravity = None if gravity is None else leaf(vector(gravity, "gravity"))
         turns = None if turns is None else leaf(number_array(turns, "turns"))
-        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns = _of_one_precision(
-            (rod, start, end, gravity, point_forces, turns)
-        )
+        distributed = sequence(distributed, "distributed", "DistributedForce or DistributedCouple")
+        for k, load in enumerate(distributed):
+            instance(load, f"distributed[{k}]", (DistributedForce, DistributedCouple))
+        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed))
+        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, self.distributed = parts
         _check_supports(self)
         _check_numbers(self)
 
@@ -84,7 +89,7 @@ def _check_supports(scene: Scene) -> None:
     for end, other in (ends, ends[::-1]):
         if not isinstance(end, Free):
             continue
-        loaded = scene.gravity is not None or scene.point_forces or end.force is not None
+        loaded = scene.gravity is not None or scene.point_forces or end.force is not None or scene.distributed
         if isinstance(other, Pin) and not loaded:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
         if end.moment is not None and not isinstance(other, Clamp):
@@ -147,6 +152,22 @@ def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
     return None
 
 
+def needs_frames(scene: Scene) -> bool:
+    """Whether the rod or its loads ask for the angle of the sections about the tangent, all along the rod."""
+    return bool(scene.distributed) or not scene.rod.is_plain or _follows(scene.start) or _follows(scene.end)
+
+
+def _follows(end: Support) -> bool:
+    return type(end) is Free and end.follower
+
+
+def has_potential(scene: Scene) -> bool:
+    """Whether all loads have one: a dead moment, a couple along the rod and a load that follows the rod have none."""
+    follows = _follows(scene.start) or _follows(scene.end)
+    follows |= any(isinstance(load, DistributedCouple) or load.follower for load in scene.distributed)
+    return dead_end_moment(scene) is None and not follows
+
+
 def nondimensional(scene: Scene) -> tuple[Scene, Units]:
     """The same scene with L = 1, EI = 1, weight per length = gravity and a held end at the origin, and the way back.
 
@@ -155,8 +176,8 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
     rod = scene.rod
     held = scene.start if isinstance(scene.start, Held) else scene.end
     assert isinstance(held, Held), "a scene holds at least one position"
-    units = Units(origin=held.position, length=rod.length, energy=rod.EI / rod.length)
-    gravity = None if scene.gravity is None else scene.gravity * (rod.mass_per_length * rod.length / units.force)
+    units = Units(origin=held.position, length=rod.length, energy=rod.bending_scale / rod.length)
+    gravity = None if scene.gravity is None else scene.gravity * (rod.mean_mass_per_length * rod.length / units.force)
     scaled = Scene(
         rod.in_units(units),
         scene.start.in_units(units),
@@ -164,5 +185,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         gravity,
         [force.in_units(units) for force in scene.point_forces],
         scene.turns,
+        [load.in_units(units) for load in scene.distributed],
     )
     return scaled, units

@@ -4,17 +4,16 @@ A complete example: a cable whose end is brought closer, then turned by one and 
 of a number, or a list of numbers, and any unit of the right dimension; what has no dimension is a plain number or list.
 
     [rod]
-    section = "circular"           # or "tube": outer_radius and inner_radius in the place of radius
+    section = "circular"           # or another one, see below
     length = "1 m"
     radius = "5 mm"
     youngs_modulus = "10 MPa"
     poisson_ratio = 0.5            # or shear_modulus = "3.3 MPa"
     density = "1200 kg/m^3"        # optional
-    # Without a section: length, EI = "4.9e-3 N m^2", GJ = "3.3e-3 N m^2", EA = "785 N",
-    # and optionally mass_per_length = "0.1 kg/m", radius.
 
     [start]
     support = "clamp"              # also "swivel": position, tangent; "pin": position; "free": optional force, moment
+                                   # and follower = true where these turn with the end
     position = "[0, 0, 0] m"
     tangent = [1, 0, 0]            # or a 3x3 frame, its columns d1, d2, t; optional d2 = [0, 1, 0] is a second axis
 
@@ -32,6 +31,12 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     at = "0.5 m"
     force = "[0, 0, -0.2] N"
 
+    # [[loads.distributed_force]]  # any number of these, too: all along the rod
+    # force = "[0, 0, -0.02] N/m"
+    # follower = true              # optional: where it turns with the rod
+    # [[loads.distributed_couple]]
+    # couple = "[0, 1e-5, 0] N m/m"
+
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
     discretization = "hermite"     # or "finite_difference"
@@ -43,6 +48,21 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     [[path]]
     steps = 18
     end.spin = "540 deg"
+
+The keys of a rod, besides its section (optional ones in brackets; all but those of "centerline" have a length):
+
+- none: EI = "4.9e-3 N m^2", or EI1 and EI2, GJ = "3.3e-3 N m^2", EA = "785 N" [mass_per_length = "0.1 kg/m", radius,
+  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m"]
+- "circular": radius, material; "tube": outer_radius, inner_radius, material
+- "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist]
+- "bundle": wires = 7, wire_radius, stick = 0.2, material
+- "layered": radii = "[0, 2, 3] mm", youngs_moduli = "[1, 50] MPa", poisson_ratios or shear_moduli [densities]
+- "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, EI, or EI1 and EI2, GJ, EA [d2,
+  mass_per_length, radius]
+
+material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
+twist may vary along the rod: constant between jumps, EI = { jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth,
+EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
 
 The main tables are the first scene of a path. Along it may change: position, tangent, d2, spin, force, moment of the
 two ends, and loads.gravity. Tangents and d2 go along great circles, all else linearly. A step turns an end by less than
@@ -62,11 +82,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.along import Along, Smooth, Steps
 from rodjax.atomic_write import replace_file
-from rodjax.checks import file_path, instance, is_known, leaf, whole_number
+from rodjax.checks import file_path, instance, is_known, leaf, shown, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
-from rodjax.loads import PointForce
-from rodjax.quantities import SceneFileError, assignment, check_keys, choice, named, si_values, table_list
+from rodjax.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.quantities import (
+    LISTS,
+    SceneFileError,
+    assignment,
+    check_keys,
+    choice,
+    flag,
+    named,
+    quantity,
+    si_value,
+    si_values,
+    table_list,
+)
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
@@ -75,12 +108,22 @@ from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
 MAX_STEPS = 10_000
 
 _ELASTIC = ("shear_modulus", "poisson_ratio", "density")
+_BENDING = ("EI", "EI1", "EI2")
+_REST = ("rest_curvature_1", "rest_curvature_2", "rest_twist")
 # What makes the rod, and the keys it must and may have.
 _SECTIONS = {
     "circular": (Rod.circular, ("length", "radius", "youngs_modulus"), _ELASTIC),
     "tube": (Rod.tube, ("length", "outer_radius", "inner_radius", "youngs_modulus"), _ELASTIC),
-    None: (Rod, ("length", "EI", "GJ", "EA"), ("mass_per_length", "radius")),
+    "rectangular": (Rod.rectangular, ("length", "width", "height", "youngs_modulus"), (*_ELASTIC, *_REST)),
+    "bundle": (Rod.bundle, ("length", "wires", "wire_radius", "youngs_modulus", "stick"), _ELASTIC),
+    "layered": (Rod.layered, ("length", "radii", "youngs_moduli"), ("shear_moduli", "poisson_ratios", "densities")),
+    "centerline": (Rod.from_centerline, ("points", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", "d2")),
+    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", *_REST)),
 }
+# The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
+_VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", *_REST)
+_PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
+_DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
 # The keys that a support must have, may have, and may change along a path.
 _SUPPORTS = {
     "clamp": (("position",), ("frame", "tangent", "d2", "spin"), ("position", "tangent", "d2", "spin")),
@@ -136,8 +179,10 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
 def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None = None) -> None:
     """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
 
-    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, `OSError` where the
-    file cannot be written.
+    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, and for a rod of
+    `Rod.from_centerline` or with a law, which a file cannot hold; `OSError` where the file cannot be written.
+
+    Of the loads along the rod the file keeps the order among the forces and among the couples.
     """
     instance(scene, "scene", Scene)
     path = file_path(path, "path")
@@ -145,24 +190,59 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
     if scene.rod.length.ndim:
         raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
-    lines = ["[rod]", *_written(scene.rod, ("length", "EI", "GJ", "EA", "mass_per_length", "radius"))]
+    if scene.rod.law is not None:
+        raise ValueError("scene.rod.law must be None to be written: a law is code, which a scene file cannot hold")
+    if scene.rod.rest_centerline is not None:
+        raise ValueError(
+            "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
+            "its rest_centerline; save writes them with a result"
+        )
+    lines = ["[rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']
         lines += _written(end, ("position", "force", "moment", "frame" if isinstance(end, Clamp) else "tangent"))
+        lines += _written_follower(end)
     lines += _written(scene, ("turns",))
     if scene.gravity is not None:
         lines += ["", "[loads]", *_written(scene, ("gravity",))]
     for force in scene.point_forces:
         lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
+    for kind in dict.fromkeys(type(load) for load in scene.distributed):
+        name, key = next((name, key) for name, (of_name, key) in _DISTRIBUTED.items() if of_name is kind)
+        for load in scene.distributed:
+            if isinstance(load, kind):
+                lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
     replace_file(path, "\n".join([*lines, ""]).encode())
 
 
-def _written(module: eqx.Module, keys: Sequence[str]) -> list[str]:
+def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[str]:
     """Lines of TOML for those of the keys that the module has."""
     values = {key: getattr(module, key, None) for key in keys}
-    return [assignment(key, value) for key, value in values.items() if value is not None]
+    return [assignment(key, value, quantity(key, where)[0]) for key, value in values.items() if value is not None]
+
+
+def _written_rod(rod: Rod) -> list[str]:
+    lines = _written(rod, ("length", "radius"))
+    for name in ("EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
+        value = getattr(rod, name)
+        values = zip(_PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
+        lines += [_written_value(key, value) for key, value in values if value is not None]
+    return lines
+
+
+def _written_value(key: str, value: Array | Along) -> str:
+    unit = quantity(key)[0]
+    if not isinstance(value, Along):
+        return assignment(key, value, unit)
+    places = "jumps" if isinstance(value, Steps) else "s"
+    entries = assignment(places, getattr(value, places), "m"), assignment("values", value.values, unit)
+    return f"{key} = {{ {', '.join(entries)} }}"
+
+
+def _written_follower(module: eqx.Module) -> list[str]:
+    return ["follower = true"] if getattr(module, "follower", False) else []
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -226,7 +306,8 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     rod = part(_rod, content["rod"])
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: dict(part(_end_values, content[name], name, kind)) for name, kind in kinds.items()}
-    loads, point_forces = part(_loads, content.get("loads", {}))
+    followers = {name: kind == "free" and flag(content[name], name, "follower") for name, kind in kinds.items()}
+    loads, point_forces, distributed = part(_loads, content.get("loads", {}))
     values["loads"] = dict(loads)
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
     discretization = cast(
@@ -244,9 +325,11 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
 
     def scene(values: Values, where: str = "") -> Scene:
         gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
-        start, end = (part(_support, kind, values[name], f"{where}{name}") for name, kind in kinds.items())
+        start, end = (
+            part(_support, kind, values[name], f"{where}{name}", followers[name]) for name, kind in kinds.items()
+        )
         try:
-            return Scene(rod, start, end, gravity, point_forces, turns)
+            return Scene(rod, start, end, gravity, point_forces, turns, distributed)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -268,9 +351,59 @@ def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:
 def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
-    values = reader.si_values(table, "rod", required, optional, other=("section",))
+    check_keys(table, "rod", required, (*optional, "section"))
+    varying = {key: value for key, value in table.items() if key in _VARYING and isinstance(value, dict)}
+    values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=("section", *varying))
+    values |= {key: reader.part(_along, key, value) for key, value in varying.items()}
+    if "EI" in optional:
+        _check_bending(table)
+    for name, keys in _PAIRS.items():
+        pair = [values.pop(key) for key in keys if key in values]
+        if len(pair) == 1:
+            raise SceneFileError(f"rod.{keys[0]} and rod.{keys[1]} must be given both or neither, got only one of them")
+        if pair:
+            values[name] = tuple(pair)
+    if "wires" in values:
+        wires = float(values["wires"])
+        values["wires"] = int(wires) if wires.is_integer() else wires
+    if section == "layered" and ("shear_moduli" in values) == ("poisson_ratios" in values):
+        raise SceneFileError("rod.shear_moduli or rod.poisson_ratios is needed, exactly one of them")
     with named("rod"):
-        return make(**values)
+        try:
+            return make(**values)
+        except (TypeError, ValueError) as error:
+            raise ValueError(_by_keys(str(error))) from None
+
+
+def _check_bending(table: dict[str, Any]) -> None:
+    if not any(key in table for key in _BENDING):
+        raise SceneFileError(f"rod.EI is missing, for example EI = {quantity('EI')[2]}; or rod.EI1 and rod.EI2")
+    if "EI" in table and ("EI1" in table or "EI2" in table):
+        raise SceneFileError("rod.EI is not allowed together with rod.EI1 and rod.EI2")
+
+
+def _by_keys(message: str) -> str:
+    """A message of `Rod` about one of a pair, with the key that a file has for it."""
+    for name, keys in _PAIRS.items():
+        for k, key in enumerate(keys):
+            message = message.replace(f"{name}[{k}]", key)
+    return message
+
+
+def _along(reader: SceneReader, key: str, table: dict[str, Any]) -> Along:
+    """What varies along the rod, of a table of arclengths and values."""
+    unit, where = quantity(key)[0], f"rod.{key}"
+    kinds = {"jumps": Steps, "s": Smooth}
+    places = next((places for places in kinds if set(table) == {places, "values"}), None)
+    if places is None:
+        raise SceneFileError(
+            f"{where} must be a number and a unit, or a table of jumps and values, or of s and values, "
+            f'for example {key} = {{ jumps = "[0.5] m", values = "[1, 4] {unit}" }}, got {shown(table)}'
+        )
+    with named(where):
+        s = si_value(table[places], places, *LISTS[places])
+        values = si_value(table["values"], "values", unit, (None,), f'"[1, 4] {unit}"')
+        return kinds[places](s, values)
 
 
 def _support_kind(table: Any, where: str) -> str:
@@ -284,7 +417,8 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     required, optional, _ = _SUPPORTS[kind]
     if kind == "clamp" and where == "end":
         optional = (*optional, "turns")
-    values = reader.si_values(table, where, required, optional, other=("support",))
+    other = ("support", "follower") if kind == "free" else ("support",)
+    values = reader.si_values(table, where, required, optional, other=other)
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
@@ -301,14 +435,23 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     return values
 
 
-def _loads(reader: SceneReader, table: Any) -> tuple[dict[str, np.ndarray], list[PointForce]]:
-    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force",))
+def _loads(
+    reader: SceneReader, table: Any
+) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple]]:
+    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", *_DISTRIBUTED))
     forces = []
     for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
         where = f"loads.point_force[{k}]"
         with named(where):
             forces.append(PointForce(**reader.si_values(force, where, ("at", "force"), ())))
-    return values, forces
+    distributed = []
+    for name in (name for name in table if name in _DISTRIBUTED):
+        make, key = _DISTRIBUTED[name]
+        for k, load in enumerate(table_list(table[name], f"loads.{name}")):
+            where = f"loads.{name}[{k}]"
+            numbers = reader.si_values(load, where, (key,), (), other=("follower",))
+            distributed.append(make(numbers[key], flag(load, where, "follower")))
+    return values, forces, distributed
 
 
 def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:
@@ -335,7 +478,9 @@ def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[s
 # --- supports and paths ----------------------------------------------------------------------------------------------
 
 
-def _support(reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str) -> Support:
+def _support(
+    reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str, follower: bool = False
+) -> Support:
     with named(where):
         if kind == "clamp":
             placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
@@ -344,7 +489,7 @@ def _support(reader: SceneReader, kind: str, values: dict[str, np.ndarray], wher
             swivel = Swivel(**values)
             # Swivel divides by the length once more, which may change the last bit of what write_scene wrote.
             return eqx.tree_at(lambda swivel: swivel.tangent, swivel, jnp.asarray(values["tangent"]))
-        return Pin(**values) if kind == "pin" else Free(**values)
+        return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
 
 
 def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[np.ndarray, "3 3"]:

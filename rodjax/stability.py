@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.joints import components, generic_field
-from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
-from rodjax.linalg import Factors, factor, factor_and_solve
+from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
+from rodjax.discretization.joints import generic_field
+from rodjax.linalg import AnyFactors, factor, factor_and_solve
+from rodjax.vectors import components
 
 # Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
 SHIFT_ROUNDINGS = 100.0
@@ -38,8 +39,8 @@ class Motion(eqx.Module):
 
 
 def examined(
-    form: MixedForm, point: MixedPoint, here: Linearization, residual: Float[Array, ""]
-) -> tuple[Factors, Bool[Array, ""], Motion]:
+    form: Form, point: Point, here: Linearization, residual: Float[Array, ""]
+) -> tuple[AnyFactors, Bool[Array, ""], Motion]:
     """The factors at an equilibrium, whether it is critical, and its neutral turn, or no motion where it has none.
 
     Critical: a motion other than the neutral one has no stiffness left, as far as the residual allows to tell.
@@ -60,7 +61,7 @@ def examined(
     def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
         return (stiffness**2 <= least) | ~jnp.isfinite(stiffness)
 
-    def closer(fixed: tuple[MixedForm, MixedPoint, Linearization, Factors]) -> tuple[Bool[Array, ""], Motion]:
+    def closer(fixed: tuple[Form, Point, Linearization, AnyFactors]) -> tuple[Bool[Array, ""], Motion]:
         form, point, here, factors = fixed
         # Under a dead moment, without symmetry of the system, no turn is looked for.
         neutral = neutral_turn(form, point, here) if form.has_potential else nothing
@@ -81,14 +82,14 @@ def _stiffness(generic: Float[Array, "b m"], softer: Float[Array, "b m"]) -> Flo
     return jnp.sum(generic * softer) / jnp.sum(softer**2)
 
 
-def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Motion:
+def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
     """The turn of the whole rod about an axis that leaves it in equilibrium, or no motion where there is none.
 
     So turns a rod between coaxial clamps, or between pins without weight, about the line through its ends.
     """
 
     def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
-        rotation = components(here.bases, jnp.cross(axis[:, None], point.tangents, axis=0))
+        rotation = form.turn(point, here.bases, axis)
         of_force = form.of_force(jnp.cross(axis, point.end_force))
         multipliers = jnp.zeros_like(here.closure)
         motion = Motion(rotation, multipliers.at[len(multipliers) - len(of_force) :].set(of_force))
@@ -104,7 +105,7 @@ def neutral_turn(form: MixedForm, point: MixedPoint, here: Linearization) -> Mot
     return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)
 
 
-def softest(form: MixedForm, point: MixedPoint, here: Linearization) -> tuple[Float[Array, ""], Motion]:
+def softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
     """The lowest eigenvalue [EI/L^2] of the Hessian under the constraints, by the length of rod, and its motion.
 
     The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import direction, is_known, leaf, namespace, rotation, shown, vector
+from rodjax.checks import direction, instance, is_known, leaf, namespace, rotation, shown, vector
 from rodjax.units import Units
 
 
@@ -74,13 +74,17 @@ class Free(Support):
     """Nothing is held; dead loads act on the end, along fixed global axes.
 
     `force`: (3,) [N]; `moment`: (3,) [N m]; an omitted one is zero and not computed. A dead moment has no potential in
-    three dimensions: its virtual work enters the equilibrium, but no work of it the `energy` of a result.
+    three dimensions: its virtual work enters the equilibrium, but no work of it the `energy` of a result. `follower`:
+    both are given along the material frame (d1, d2, t) of the end instead, and turn with it: no potential either.
     """
 
     force: Float[Array, "3"] | None
     moment: Float[Array, "3"] | None
+    follower: bool = eqx.field(static=True)
 
-    def __init__(self, force: Any = None, moment: Any = None):
+    def __init__(self, force: Any = None, moment: Any = None, follower: bool = False):
+        instance(follower, "follower", bool)
+        self.follower = follower
         self.force = None if force is None else leaf(vector(force, "force"))
         self.moment = None if moment is None else leaf(vector(moment, "moment"))
 
@@ -88,6 +92,7 @@ class Free(Support):
         return Free(
             None if self.force is None else self.force / units.force,
             None if self.moment is None else self.moment / units.energy,
+            self.follower,
         )
 
 

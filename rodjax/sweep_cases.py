@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rodjax.checks import line, shown
-from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, si_values
+from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, quantity, si_values
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile, SceneReader, read_text, toml_tables
 
@@ -221,7 +221,7 @@ def _parameter(key: str, values: list[Any] | np.ndarray) -> Parameter:
 def _si_number(value: Any, place: Place, component: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """A value as the scene file has it, or a plain number in SI units."""
     where, name = _dotted(place[:-1]), str(place[-1])
-    unit, shape, _ = QUANTITIES[name]
+    unit, shape = quantity(name, where)[0], QUANTITIES[name][1]
     is_scalar = not shape or bool(component)
     # The bulk of a large table, which must not wait for the parsing of text.
     if is_scalar and type(value) in (int, float) and abs(value) <= sys.float_info.max:
@@ -272,7 +272,7 @@ class CaseReader:
             numbers[parameter.place][parameter.component] = values[parameter.key][row]
         content = dict(self._content)
         for place, number in numbers.items():
-            _put(content, place, _as_text(number, str(place[-1])))
+            _put(content, place, _as_text(number, str(place[-1]), _dotted(place[:-1])))
         try:
             return self._reader.read(content)
         except SceneFileError as mistake:
@@ -320,23 +320,23 @@ def _put(content: dict[str, Any], place: Place, value: Any) -> None:
     table[place[-1]] = value
 
 
-def _as_text(number: Float[np.ndarray, "..."], name: str) -> Any:
-    unit = QUANTITIES[name][0]
+def _as_text(number: Float[np.ndarray, "..."], name: str, where: str) -> Any:
+    unit = quantity(name, where)[0]
     return f"{number.tolist()} {unit}" if unit else number.tolist()
 
 
-def _in_si(table: Any) -> Any:
+def _in_si(table: Any, where: str = "") -> Any:
     """A table with all quantities in SI units."""
     if isinstance(table, list):
-        return [_in_si(entry) for entry in table]
+        return [_in_si(entry, where) for entry in table]
     if not isinstance(table, dict):
         return table
 
     def value(key: str, value: Any) -> Any:
         if isinstance(value, str) and key in QUANTITIES:
             with suppress(SceneFileError):  # each case has another value in its place
-                return _as_text(si_values({key: value}, "", (), (key,))[key], key)
-        return _in_si(value)
+                return _as_text(si_values({key: value}, where, (), (key,))[key], key, where)
+        return _in_si(value, f"{where}.{key}")
 
     return {key: value(key, entry) for key, entry in table.items()}
 
@@ -344,4 +344,4 @@ def _in_si(table: Any) -> Any:
 def unit_of(key: str) -> str:
     """SI unit of the numbers of a key; 1 where they have no dimension."""
     place, _ = _target(key)
-    return QUANTITIES[str(place[-1])][0] or "1"
+    return quantity(str(place[-1]), _dotted(place[:-1]))[0] or "1"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.branch import Along, Station, no_motion, stepped
-from rodjax.discretization.mixed import NEUTRAL
+from rodjax.discretization.form import NEUTRAL
 from rodjax.result import Equilibrium
 from rodjax.scene import Scene
 

@@ -309,3 +309,14 @@ def test_float32(monkeypatch, capsys):
     assert [row.status for row in rows] == 4 * ["ROUNDING_FLOOR"]
     assert all(row.shape < 1e-5 and row.force < 1e-5 for row in rows)
     assert capsys.readouterr().out.count("\n") == 6
+
+
+@pytest.mark.slow
+def test_general_rods(tmp_path):
+    rows = script("general_rods").main(["--part", "princeton", "--out", str(tmp_path)])
+    at_45 = [row for row in rows if "at 45 degrees" in row.case]
+    # The references are given to four digits and more.
+    assert max(abs(float(row.difference)) for row in at_45) < 1e-4
+    assert len(at_45) == 4
+    with open(tmp_path / "general_rods.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(rows)

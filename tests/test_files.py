@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import functools
 import os
 import re
 import signal
@@ -20,7 +21,26 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
-from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Swivel, frame, problems, solve, solve_path
+from rodjax import (
+    Clamp,
+    DistributedCouple,
+    DistributedForce,
+    Equilibrium,
+    Free,
+    Law,
+    Pin,
+    PointForce,
+    Rod,
+    Scene,
+    Smooth,
+    Steps,
+    Swivel,
+    frame,
+    problems,
+    solve,
+    solve_path,
+)
+from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.files import FIELDS, FORMAT, load, point_data, save
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
@@ -42,6 +62,39 @@ SCENES = {
     "free end": Scene(problems.cable(), CLAMP, Free((0, 0.1, 1 / 3), (0.1, 0, 0)), GRAVITY),
     "free start": Scene(problems.cable(), Free((0, 0.1, 1 / 3), (0.1, 0, 0)), CLAMP),
 }
+
+
+def steps(value: float) -> Steps:
+    return Steps((1 / 3, 0.6), value * np.array([1.0, 1.5, 1 / 3]))
+
+
+def smooth(value: float) -> Smooth:
+    return Smooth((0.0, 0.3, 0.7, 1.0), value * np.array([1.0, 1 / 3, 0.7, 1.2]))
+
+
+GENERAL = ("numbers", "steps", "smooth", "both", "curve", "one stiffness")
+
+
+@functools.cache
+def general_scene(name: str) -> Scene:
+    """Of rods that vary, have two bending stiffnesses or a rest shape, and of loads that follow them."""
+    angles = np.linspace(0, 1.5, 6)
+    arc = np.stack([np.sin(angles), 0 * angles, 1 - np.cos(angles)], axis=1)
+    follower, dead = DistributedForce((0, 0.001, 1 / 300), follower=True), DistributedForce((0, 0.001, 0.0))
+    couple = DistributedCouple((0, 1e-5, 0), follower=True)
+    rod, end, distributed = {
+        "numbers": (Rod(1.0, (4e-3, 1 / 300), 3e-3, 500.0, 0.1, None, (0.1, 1 / 3), 1 / 7), Free(), ()),
+        "steps": (Rod(1.0, steps(4e-3), steps(3e-3), steps(1e3), steps(0.1), 0.01), Free(), [follower]),
+        "smooth": (Rod(1.0, smooth(4e-3), smooth(3e-3), smooth(1e3), smooth(0.1)), Free(ORIGIN, ORIGIN, True), ()),
+        "both": (
+            Rod(1.0, (steps(4e-3), smooth(4e-3)), 3e-3, 500.0, 0.0, None, (smooth(0.3), steps(0.2)), smooth(0.2)),
+            Free((0.0, 1e-3, 0.0), follower=True),
+            [couple, dead, follower],
+        ),
+        "curve": (Rod.from_centerline(arc, (4e-3, 3e-3), 3e-3, 500.0), Free(), [dead, DistributedCouple((0, 0, 1e-5))]),
+        "one stiffness": (Rod(1.0, 4e-3, 3e-3, 500.0, rest_twist=steps(0.2)), Free(), [couple]),
+    }[name]
+    return Scene(rod, CLAMP, end, (0.0, 0.0, -0.5), distributed=distributed)
 
 
 @pytest.fixture(scope="session")
@@ -82,6 +135,13 @@ def assert_same(actual: Equilibrium, expected: Equilibrium) -> None:
         assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
 
 
+def with_frames(result: Equilibrium, count: int) -> Equilibrium:
+    """The result with so many frames of any kind for the state of its solver."""
+    shape = result.state.shape
+    framed = FramedCurve(shape.nodes, jnp.ones((4, count)) / 2, jnp.linspace(0.0, 1.0, len(shape.nodes)))
+    return eqx.tree_at(lambda result: result.state.shape, result, framed)
+
+
 def read_steps(path) -> list:
     """What VTK makes of a file, one `vtkPolyData` a time step."""
     reader = vtkHDFReader()
@@ -111,15 +171,57 @@ def test_the_error_is_estimated_after_load_too(equilibrium, tmp_path):
     assert np.all(estimate > 0)
 
 
-@pytest.mark.parametrize("steps", [None, 2])
-@pytest.mark.parametrize("name", SCENES)
-def test_every_kind_of_scene_comes_back(name, steps, single, tmp_path):
-    scene = SCENES[name]
-    of_scene = dataclasses.replace(single, scene=scene)
-    if steps is not None:
+@pytest.mark.parametrize("count", [None, 2])
+@pytest.mark.parametrize("name", [*SCENES, *GENERAL])
+def test_every_kind_of_scene_comes_back(name, count, single, tmp_path):
+    of_scene = dataclasses.replace(single, scene=SCENES[name] if name in SCENES else general_scene(name))
+    if count is not None:
         of_scene = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + leaf]), of_scene)
     save(of_scene, str(tmp_path / "rod.vtkhdf"))
     assert_same(load(str(tmp_path / "rod.vtkhdf")), of_scene)
+
+
+@pytest.mark.parametrize(
+    ("name", "discretization"),
+    [
+        ("steps", "finite_difference"),
+        pytest.param("both", "hermite", marks=pytest.mark.slow),
+        pytest.param("curve", "finite_difference", marks=pytest.mark.slow),
+        pytest.param("one stiffness", "finite_difference", marks=pytest.mark.slow),
+    ],
+)
+def test_results_with_frames_come_back(name, discretization, tmp_path):
+    solved = solve(general_scene(name), segments=4, discretization=discretization)
+    assert bool(solved.converged)
+    assert isinstance(solved.state.shape, FramedCurve)
+    save(solved, tmp_path / "rod.vtkhdf")
+    assert_same(load(tmp_path / "rod.vtkhdf"), solved)
+
+
+@pytest.mark.slow
+def test_a_path_with_frames_comes_back(tmp_path):
+    scenes = [dataclasses.replace(general_scene("steps"), gravity=jnp.array([0.0, 0.0, g])) for g in (-0.5, -0.6, -0.7)]
+    path = solve_path(scenes, segments=4, discretization="finite_difference")
+    assert np.all(path.converged)
+    save(path, tmp_path / "rod.vtkhdf")
+    assert_same(load(tmp_path / "rod.vtkhdf"), path)
+
+
+class Hardening(Law):
+    """Stiffer where it is bent more."""
+
+    factor: jax.Array
+
+    def __call__(self, curvature, twist, axial_strain, s):
+        return self.factor * jnp.sum(curvature**4)
+
+
+def test_a_law_cannot_be_saved(single, tmp_path):
+    law = Hardening(jnp.asarray(0.1))
+    of_law = eqx.tree_at(lambda result: result.scene.rod.law, single, law, is_leaf=lambda leaf: leaf is None)
+    with pytest.raises(ValueError, match=r"scene\.rod\.law must be None, got a Hardening: a law is code.* be saved"):
+        save(of_law, tmp_path / "rod.vtkhdf")
+    assert not os.listdir(tmp_path)
 
 
 def test_not_a_number_and_float32_survive(single, tmp_path):
@@ -149,12 +251,13 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
 
     def look(name: str, entry: h5py.Group | h5py.Dataset) -> None:
         if isinstance(entry, h5py.Dataset):
-            place = re.sub(r"/\d+/", "/*/", name)
+            place = re.sub(r"/\d+(?=/|$)", "/*", name)
             seen.add(place)
             assert (entry.attrs["units"], entry.attrs["description"]) == FIELDS[place]
             assert all(FIELDS[place])
 
-    results = [loaded_path, *(dataclasses.replace(single, scene=scene) for scene in SCENES.values())]
+    scenes = [*SCENES.values(), *map(general_scene, GENERAL)]
+    results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")
         with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:
@@ -173,6 +276,37 @@ def test_the_file_names_its_format_and_its_classes(saved):
     assert kinds == {"scene/start": "Clamp", "scene/end": "Clamp", "state/shape": "Curve"}
 
 
+@pytest.mark.parametrize("count", [10, 17])
+def test_frames_are_as_many_as_a_mesh_of_their_nodes_has(count, single, tmp_path):
+    framed = with_frames(single, count)
+    save(framed, tmp_path / "rod.vtkhdf")
+    assert_same(load(tmp_path / "rod.vtkhdf"), framed)
+    save(with_frames(single, count + 1), tmp_path / "rod.vtkhdf")
+    with pytest.raises(ValueError, match=r"quaternions must be Float of shape \(4, 17 or 10\), got .*\(4, 1[18]\)"):
+        load(tmp_path / "rod.vtkhdf")
+
+
+def test_alongs_and_loads_along_the_rod_name_their_classes(single, tmp_path):
+    save(dataclasses.replace(single, scene=general_scene("both")), tmp_path / "rod.vtkhdf")
+    places = {"rod/EI/0": "Steps", "rod/EI/1": "Smooth", "rod/rest_twist": "Smooth"}
+    places |= {f"distributed/{k}": f"Distributed{name}" for k, name in enumerate(("Couple", "Force", "Force"))}
+    with h5py.File(tmp_path / "rod.vtkhdf", "r+") as file:
+        attributes = {place: file[f"rodjax/scene/{place}"].attrs for place in places}
+        assert {place: entry["kind"] for place, entry in attributes.items()} == places
+        assert [bool(attributes[f"distributed/{k}"]["follower"]) for k in range(3)] == [True, False, True]
+        attributes["distributed/0"]["kind"] = "Clamp"
+    with pytest.raises(ValueError, match=r"distributed/0 that it is Clamp; allowed are DistributedForce, Distrib"):
+        load(tmp_path / "rod.vtkhdf")
+
+
+def test_a_follower_is_true_or_false(single, tmp_path):
+    save(dataclasses.replace(single, scene=general_scene("both")), tmp_path / "rod.vtkhdf")
+    with h5py.File(tmp_path / "rod.vtkhdf", "r+") as file:
+        file["rodjax/scene/end"].attrs["follower"] = "hermite"
+    with pytest.raises(ValueError, match=r"follower of /rodjax/scene/end must be true or false, got 'hermite'"):
+        load(tmp_path / "rod.vtkhdf")
+
+
 @pytest.mark.parametrize("place", ["scene/start", "state/shape"])
 def test_a_group_of_no_known_kind_is_named(place, saved, tmp_path):
     damaged = tmp_path / "damaged.vtkhdf"
@@ -181,7 +315,7 @@ def test_a_group_of_no_known_kind_is_named(place, saved, tmp_path):
         with h5py.File(damaged, "r+") as file:
             attributes = file[f"rodjax/{place}"].attrs
             attributes.update({"kind": kind}) if kind else attributes.pop("kind")
-        with pytest.raises(ValueError, match=f"says of /rodjax/{place} that it is {kind}; allowed are Clamp"):
+        with pytest.raises(ValueError, match=f"says of /rodjax/{place} that it is {kind}; allowed are (Clamp|Poly)"):
             load(damaged)
 
 

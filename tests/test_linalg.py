@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
+from rodjax.linalg import DenseSystem, SaddlePointSystem, factor, factor_and_solve
 
 
 def random_system(n: int, b: int, k: int, *, dominance: float = 8.0, seed: int = 0) -> SaddlePointSystem:
@@ -45,7 +45,8 @@ afterwards = jax.jit(lambda system, f, c: factor(system).solve(f, c))
 
 
 # All depths of the elimination up to five, odd and even; more columns than unknowns.
-SIZES = [(1, 1, 0), (1, 2, 4), (2, 1, 2), (2, 2, 1), (3, 2, 4), (4, 2, 0), (5, 1, 3), (16, 2, 4), (33, 2, 3)]
+SIZES = [(1, 1, 0), (1, 2, 4), (2, 1, 2), (2, 2, 1), (3, 2, 4), (4, 2, 0), (5, 1, 3), (5, 3, 3), (6, 3, 0)]
+SIZES += [(16, 2, 4), (17, 3, 3), (33, 2, 3)]
 
 
 @pytest.mark.parametrize(("n", "b", "k"), SIZES)
@@ -66,6 +67,23 @@ def test_solutions_and_signs_agree_with_dense_matrices(n, b, k):
         negative = np.sum(np.linalg.eigvalsh(matrix) < 0) - k
         assert factors.negative == negative
         assert factors.is_minimum == (negative == 0)
+
+
+def test_a_full_matrix_is_solved_and_shifted():
+    """Without symmetry; the order of the unknowns is x row by row, then y."""
+    rng = np.random.default_rng(3)
+    b, n, k = 3, 4, 2
+    matrix = rng.normal(size=(b * n + k, b * n + k))
+    f, c = right_side(n, b, k)
+    shift = jnp.asarray(rng.normal(size=n))
+    system = DenseSystem(jnp.asarray(matrix), (b, n)).shifted(shift)
+    shifted = matrix + np.diag([*np.tile(shift, b), *np.zeros(k)])
+    expected = np.linalg.solve(shifted, [*np.asarray(f).ravel(), *np.asarray(c)])
+    factors, x, y = at_once(system, f, c)
+    np.testing.assert_allclose([*np.asarray(x).ravel(), *np.asarray(y)], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(system.times(x, y)[0], f, rtol=0, atol=1e-12)
+    assert factors.is_minimum
+    assert factors.negative == 0
 
 
 def test_a_minimum_under_the_constraints_may_be_indefinite_without_them():
@@ -151,10 +169,10 @@ def test_derivatives_of_a_solution():
         [(2, 2, 3), (2, 2, 3), (2, 1, 3), (1, 1)],
         [(2, 2, 4), (2, 2, 2), (2, 1, 3), (1, 1)],
         [(2, 2, 3), (2, 2, 2), (2, 1, 3), (2, 2)],
-        [(3, 3, 3), (3, 3, 2), (3, 1, 3), (1, 1)],
+        [(4, 4, 3), (4, 4, 2), (4, 1, 3), (1, 1)],
     ],
 )
 def test_wrong_shapes_are_named(shapes):
-    message = r"shapes \(b, b, n\), .* with b = 1 or 2, got " + ", ".join(rf"\({str(s)[1:-1]}\)" for s in shapes)
+    message = r"shapes \(b, b, n\), .* with b = 1 to 3, got " + ", ".join(rf"\({str(s)[1:-1]}\)" for s in shapes)
     with pytest.raises(ValueError, match=message):
         SaddlePointSystem(*map(jnp.zeros, shapes))

@@ -6,11 +6,27 @@ import tomllib
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rodjax
-from rodjax import Clamp, Free, Pin, PointForce, Rod, Scene, Swivel, problems, scene_file
+from rodjax import (
+    Clamp,
+    DistributedCouple,
+    DistributedForce,
+    Free,
+    Law,
+    Pin,
+    PointForce,
+    Rod,
+    Scene,
+    Smooth,
+    Steps,
+    Swivel,
+    problems,
+    scene_file,
+)
 from rodjax.scene_file import SceneFileError, read_scene, read_scene_file, write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
@@ -87,6 +103,62 @@ def test_write_and_read_give_the_same_numbers_to_the_last_bit(ends, seed, tmp_pa
     assert [file.name for file in tmp_path.iterdir()] == ["scene.toml"]
 
 
+def general_rods(seed):
+    """Rods of every kind of stiffness and rest shape, of numbers that use all their digits."""
+    a, b, c, d = np.abs(awkward((4, 3), seed)) + 0.1
+    steps, other = Steps((0.1, 1 / 7), a / 100), Steps([0.2], b[:2])
+    smooth, rest = Smooth((0, 0.1, 1 / 3), c / 100), Smooth((0, 1 / 3), awkward(2, seed))
+    return {
+        "pair": Rod(1 / 3, (a[0], b[0]), c[0], d[0], radius=0.01),
+        "rest shape": Rod(1 / 3, a[0], b[0], c[0], rest_curvature=awkward(2, seed), rest_twist=-d[0]),
+        "steps": Rod(1 / 3, steps, other, other, steps),
+        "smooth": Rod(1 / 3, smooth, 0.3 * b[0], smooth, smooth, rest_curvature=(rest, 0.0), rest_twist=rest),
+        "both": Rod(1 / 3, (steps, smooth), other, c[0], rest_curvature=(other, rest), rest_twist=other),
+        "one of a pair": Rod(1 / 3, (a[0], steps), b[0], c[0]),
+    }
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_general_rods_come_back_to_the_last_bit(seed, tmp_path):
+    path = tmp_path / "scene.toml"
+    for rod in general_rods(seed).values():
+        scene = Scene(rod, Clamp((0, 0, 0), np.eye(3)), Free())
+        write_scene(scene, path)
+        assert_same(read_scene(path), scene)
+
+
+def test_loads_that_follow_come_back_to_the_last_bit(tmp_path):
+    rod, path = problems.cable(), tmp_path / "scene.toml"
+    x, y, z = awkward((3, 3))
+    clamp = Clamp((0, 0, 0), np.eye(3))
+    for follower in (True, False):
+        loads = [DistributedCouple(x), DistributedCouple(y, follower), DistributedForce(z, follower)]
+        scene = Scene(rod, clamp, Free(x, y, follower), distributed=loads)
+        write_scene(scene, path)
+        assert_same(read_scene(path), scene)
+        scene = Scene(rod, Free(None, y, follower), clamp, distributed=loads[::-1])
+        write_scene(scene, path)
+        assert_same(read_scene(path), scene)
+
+
+class Cubic(Law):
+    """A law without numbers."""
+
+    def __call__(self, curvature, twist, axial_strain, s):
+        return jnp.sum(jnp.abs(curvature) ** 3)
+
+
+def test_write_refuses_rods_that_a_file_cannot_hold(tmp_path):
+    points = [(0, 0, 0), (0.1, 0, 0), (0.2, 0.1, 0), (0.3, 0.1, 0)]
+    for rod, message in (
+        (Rod(1.0, 1e-3, 1e-3, 1.0, law=Cubic()), r"scene\.rod\.law must be None .* a law is code"),
+        (Rod.from_centerline(points, 1e-3, 1e-3, 1.0), r"scene\.rod must not be one of Rod\.from_centerline"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_scene(Scene(rod, Clamp((0, 0, 0), np.eye(3)), Free()), tmp_path / "scene.toml")
+    assert not list(tmp_path.iterdir())
+
+
 def test_write_refuses_what_is_not_one_scene(tmp_path):
     scene = problems.hanging_cable()
     stack = jax.tree.map(lambda leaf: leaf[None], scene)
@@ -156,6 +228,87 @@ def test_sections_are_those_of_rod(read):
     assert_same(tube.rod, expected)
 
 
+MATERIAL = 'youngs_modulus = "10 MPa"\npoisson_ratio = 0.4\ndensity = "1200 kg/m^3"\n'
+POINTS = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.01), (0.2, 0.02, 0.0), (0.3, 0.1, 0.0), (0.4, 0.2, 0.0)]
+STIFF = 'GJ = "3 N mm^2"\nEA = "785 N"\n'
+
+
+@pytest.mark.parametrize(
+    ("table", "make"),
+    [
+        (
+            f'section = "rectangular"\nlength = "1 m"\nwidth = "10 mm"\nheight = "1 mm"\n{MATERIAL}'
+            'rest_curvature_1 = "2 1/m"\nrest_curvature_2 = "1e-2 1/cm"\n'
+            'rest_twist = { jumps = "[50] cm", values = "[0, 90] deg/m" }',
+            lambda: Rod.rectangular(
+                1.0, 0.01, 0.001, 1e7, None, 0.4, 1200, (2.0, 1.0), Steps([0.5], [0.0, math.pi / 2])
+            ),
+        ),
+        (
+            f'section = "bundle"\nlength = "1 m"\nwires = 7\nwire_radius = "0.5 mm"\nstick = 0.2\n{MATERIAL}',
+            lambda: Rod.bundle(1.0, 7, 5e-4, 1e7, None, 0.4, 1200, stick=0.2),
+        ),
+        (
+            'section = "layered"\nlength = "1 m"\nradii = "[0, 2, 3] mm"\nyoungs_moduli = "[1, 50] MPa"\n'
+            'shear_moduli = "[0.4, 20] MPa"\ndensities = "[1100, 1200] kg/m^3"',
+            lambda: Rod.layered(1.0, [0, 0.002, 0.003], [1e6, 5e7], [4e5, 2e7], None, [1100, 1200]),
+        ),
+        (
+            'section = "layered"\nlength = "1 m"\nradii = "[1, 3] mm"\nyoungs_moduli = "[1] MPa"\n'
+            "poisson_ratios = [0.4]",
+            lambda: Rod.layered(1.0, [0.001, 0.003], [1e6], poisson_ratios=[0.4]),
+        ),
+        (
+            f'section = "centerline"\npoints = "{[list(point) for point in POINTS]} m"\nEI1 = "4 N mm^2"\n'
+            f'EI2 = {{ jumps = "[0.1] m", values = "[2, 3] N mm^2" }}\n{STIFF}'
+            'mass_per_length = "10 g/m"\nradius = "2 mm"\nd2 = [0, 1, 1]',
+            lambda: Rod.from_centerline(
+                POINTS, (4e-6, Steps([0.1], [2e-6, 3e-6])), 3e-6, 785, 0.01, 0.002, d2=(0, 1, 1)
+            ),
+        ),
+        (
+            'length = "1 m"\nEI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N mm^2" }\n'
+            'mass_per_length = { s = "[0, 100] cm", values = "[0.1, 0.2] kg/m" }\n' + STIFF,
+            lambda: Rod(1.0, Smooth([0, 0.5, 1], [1e-6, 3e-6, 4e-6]), 3e-6, 785, Smooth([0, 1], [0.1, 0.2])),
+        ),
+        (
+            f'length = "1 m"\nEI1 = "1 N mm^2"\nEI2 = "2 N mm^2"\nrest_twist = "1 rad/m"\n{STIFF}',
+            lambda: Rod(1.0, (1e-6, 2e-6), 3e-6, 785, rest_twist=1.0),
+        ),
+    ],
+    ids=["rectangular", "bundle", "layered", "one layer", "centerline", "smooth", "pair"],
+)
+def test_general_rods_are_read(table, make, read):
+    rod, expected = read(f"[rod]\n{table}\n{START}{FREE}").scenes[0].rod, make()
+    assert jax.tree.structure(rod) == jax.tree.structure(expected)
+    for value, other in zip(jax.tree.leaves(rod), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(value, other, rtol=1e-13, atol=1e-13)
+
+
+def test_loads_along_the_rod_and_followers_are_read(read):
+    scene = read(
+        ROD + START + FREE + 'force = "[0, 0, 1] N"\nfollower = true\n'
+        '[[loads.distributed_couple]]\ncouple = "[0, 1, 0] N cm/cm"\n'
+        '[[loads.distributed_force]]\nforce = "[0, 0, 2] mN/mm"\nfollower = true\n'
+        '[[loads.distributed_force]]\nforce = "[1, 0, 0] N/m"\nfollower = false\n'
+    ).scenes[0]
+    assert scene.end.follower
+    couple, force, dead = scene.distributed
+    assert isinstance(couple, DistributedCouple)
+    assert isinstance(force, DistributedForce)
+    assert [load.follower for load in scene.distributed] == [False, True, False]
+    np.testing.assert_allclose(couple.couple, [0, 1, 0], rtol=1e-14)
+    np.testing.assert_allclose(force.force, [0, 0, 2], rtol=1e-14)
+    np.testing.assert_array_equal(dead.force, [1, 0, 0])
+
+
+def test_a_follower_stays_one_along_a_path(read):
+    path = '\n[[path]]\nsteps = 2\nend.force = "[0, 0, 1] N"\n'
+    scenes = read(ROD + START + FREE + "follower = true\n" + path).scenes
+    assert [scene.end.follower for scene in scenes] == [True] * 3
+    np.testing.assert_array_equal([scene.end.force[2] for scene in scenes], [0, 0.5, 1])
+
+
 def test_spin_turns_the_frame_about_its_tangent(read):
     scene = read(ROD + START + END.replace("[1, 0, 0]", '[0, 0, 2]\nspin = "90 deg"')).scenes[0]
     np.testing.assert_allclose(scene.end.frame, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
@@ -211,7 +364,7 @@ MISTAKES = [
     (
         ROD + "color = 1\n" + START + END,
         "rod.color is not allowed",
-        "length, EI, GJ, EA, mass_per_length, radius, section",
+        "length, GJ, EA, EI, EI1, EI2, mass_per_length, radius, rest_curvature_1",
     ),
     (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, solve, path"),
     (ROD + START + END + "path = 1\n", "end.path is not allowed", "position, frame, tangent, d2, spin"),
@@ -249,6 +402,100 @@ MISTAKES = [
         'youngs_modulus = "1 MPa"\npoisson_ratio = 0.5\n' + START + END,
         "rod.outer_radius - inner_radius must be positive",
         "got -0.001",
+    ),
+    # rods that vary, of two stiffnesses, with a rest shape
+    (ROD.replace('EI = "4.9e-3 N m^2"', "") + START + END, "rod.EI is missing", "rod.EI1 and rod.EI2"),
+    (ROD + 'EI1 = "1 N m^2"\n' + START + END, "rod.EI is not allowed together with", "rod.EI1 and rod.EI2"),
+    (ROD.replace("EI", "EI1") + START + END, "rod.EI1 and rod.EI2 must be given both or neither", "only one"),
+    (ROD + 'rest_curvature_2 = "1 1/m"\n' + START + END, "rod.rest_curvature_2 must be given both", "rest_curvature_1"),
+    (ROD + "rest_twist = 1\n" + START + END, "rod.rest_twist must have a unit", '"0.5 rad/m"'),
+    (ROD + 'rest_twist = "1 m"\n' + START + END, "rod.rest_twist must be in rad/m", "'m'"),
+    (
+        ROD.replace("EI", "EI1") + 'EI2 = "-1 N m^2"\n' + START + END,
+        "rod.EI2 must be positive",
+        "got -1",
+    ),
+    (
+        ROD.replace('"4.9e-3 N m^2"', '{ jumps = "[0.5] m" }') + START + END,
+        "rod.EI must be a number and a unit, or a table of jumps and values, or of s and values",
+        "[1, 4] N m^2",
+    ),
+    (ROD.replace('"785 N"', "{ EA = 1 }") + START + END, "rod.EA must be a number and a unit, or a table", "{'EA': 1}"),
+    (ROD.replace('"1 m"', '{ s = "[0] m" }') + START + END, "rod.length must have a unit", 'length = "1 m"'),
+    (
+        ROD.replace('"785 N"', '{ jumps = "0.5 m", values = "[1, 4] N" }') + START + END,
+        "rod.EA.jumps must be a list of numbers and a unit",
+        'jumps = "[0.5] m"',
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5] m", values = "[1, 4] m" }') + START + END,
+        "rod.EA.values must be in N",
+        'values = "[1, 4] N"',
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5] m", values = "[1] N" }') + START + END,
+        "rod.EA.values must be one more than jumps",
+        "1 values and 1 jumps",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[1.5] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA.jumps must lie inside 0 to 1 m",
+        "1.5",
+    ),
+    (
+        ROD.replace('"785 N"', '{ s = "[0, 0.5] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA.s must run from 0 to 1 m",
+        "0 to 0.5",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5] m", values = "[1, -4] N" }') + START + END,
+        "rod.EA must be positive",
+        "got -4",
+    ),
+    # sections
+    (
+        '[rod]\nsection = "bundle"\nlength = "1 m"\nwires = 7.5\nwire_radius = "1 mm"\nstick = 0\n'
+        + MATERIAL
+        + START
+        + END,
+        "rod.wires must be a whole number",
+        "got 7.5",
+    ),
+    (
+        '[rod]\nsection = "bundle"\nlength = "1 m"\nwires = 7\nwire_radius = "1 mm"\n' + MATERIAL + START + END,
+        "rod.stick is missing",
+        "stick = 0.2",
+    ),
+    (
+        '[rod]\nsection = "layered"\nlength = "1 m"\nradii = "[0, 1] mm"\nyoungs_moduli = "[1] MPa"\n' + START + END,
+        "rod.shear_moduli or rod.poisson_ratios is needed",
+        "exactly one",
+    ),
+    (
+        '[rod]\nsection = "layered"\nlength = "1 m"\nradii = "[] mm"\nyoungs_moduli = "[1] MPa"\n' + START + END,
+        "rod.radii must be a list of numbers and a unit",
+        "[0, 2, 3] mm",
+    ),
+    (
+        '[rod]\nsection = "layered"\nlength = "1 m"\nradii = "[0, 1] mm"\nyoungs_moduli = "[1, 2] MPa"\n'
+        "poisson_ratios = [0.5]\n" + START + END,
+        "rod.radii must be one more than youngs_moduli",
+        "2 radii and 2 moduli",
+    ),
+    (
+        '[rod]\nsection = "centerline"\npoints = "[[0, 0, 0], [1, 0]] m"\nEI = "1 N m^2"\n' + STIFF + START + END,
+        "rod.points must be a list of lists of 3 numbers and a unit",
+        "[1, 0, 0]",
+    ),
+    (
+        '[rod]\nsection = "centerline"\npoints = "[[0, 0, 0], [1, 0, 0]] m"\nEI = "1 N m^2"\n' + STIFF + START + END,
+        "rod.points must have the shape (m, 3) with m >= 4",
+        "(2, 3)",
+    ),
+    (
+        '[rod]\nsection = "centerline"\nlength = "1 m"\n' + START + END,
+        "rod.length is not allowed",
+        "points, GJ, EA, EI, EI1, EI2",
     ),
     # the ends
     (ROD + START.replace('support = "clamp"', "") + END, "start.support is missing", "clamp, swivel, pin, free"),
@@ -312,6 +559,23 @@ MISTAKES = [
         "-2",
     ),
     (ROD + START + END + '[[loads.point_force]]\nat = "2 m"\n', "loads.point_force[0].force is missing", "N"),
+    (ROD + START + FREE + "follower = 1\n", "end.follower must be true or false", "got 1"),
+    (ROD + START + FREE + 'follower = "true"\n', "end.follower must be true or false", "'true'"),
+    (ROD + START + END + "follower = true\n", "end.follower is not allowed", "position, frame, tangent"),
+    (ROD + START + FREE + "[[path]]\nend.follower = true\n", "path[0].end.follower is not allowed", "force, moment"),
+    (
+        ROD + START + END + '[[loads.distributed_force]]\nforce = "[0, 0, 1] N"\n',
+        "loads.distributed_force[0].force must be in N/m",
+        'force = "[0, 0, -0.2] N/m"',
+    ),
+    (
+        ROD + START + END + '[[loads.distributed_force]]\nforce = "[0, 0, 1] N/m"\nfollower = "no"\n',
+        "loads.distributed_force[0].follower must be true or false",
+        "'no'",
+    ),
+    (ROD + START + END + "[[loads.distributed_force]]\n", "loads.distributed_force[0].force is missing", "N/m"),
+    (ROD + START + END + "[[loads.distributed_couple]]\n", "loads.distributed_couple[0].couple is missing", "N m/m"),
+    (ROD + START + END + "[loads]\ndistributed_force = 1\n", "loads.distributed_force must be a list", "got 1"),
     (ROD + START + END + "[solve]\nsegments = 1\n", "solve.segments must be a whole number", "2 to 100000"),
     (ROD + START + END + "[solve]\nsegments = 2.5\n", "solve.segments must be a whole number", "2 to 100000"),
     (ROD + START + END + "[solve]\nsteps = 2\n", "solve.steps is not allowed", "segments"),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.energy import dead_load_energy
+from rodjax.loads import DistributedForce
 from rodjax.scene import Scene
 from rodjax.supports import Free, Held
 from rodjax.units import Units
@@ -34,11 +35,13 @@ def forces_on_nodes(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
 
 
 def total_force(scene: Scene) -> Float[Array, "3"]:
-    """All loads together."""
+    """All dead forces together."""
     forces = [load.force for load in scene.point_forces]
-    forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+    ends = [end for end in (scene.start, scene.end) if isinstance(end, Free) and not end.follower]
+    forces += [end.force for end in ends if end.force is not None]
     if scene.gravity is not None:
         forces.append(scene.gravity)
+    forces += [load.force for load in scene.distributed if isinstance(load, DistributedForce) and not load.follower]
     return sum(forces, jnp.zeros(3, scene.rod.length.dtype))
 
 

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.hermite import HermiteElements, interleaved
-from rodjax.discretization.joints import components, cross, dot
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve, short_sum
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
+from rodjax.vectors import components, cross, dot
 
 # Steps of the integration of an element: an even number.
 STEPS = 4

@@ -15,17 +15,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes, load_energy
+from rodjax.discretization.form import FLOOR_SAFETY, Form
 from rodjax.discretization.joints import (
     assembled,
     bending_derivatives,
-    components,
-    dot,
     joints,
     of_edges,
     tangent_bases,
     with_held_tangents,
 )
-from rodjax.discretization.mixed import FLOOR_SAFETY, MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import (
     FramedTangents,
@@ -38,10 +37,11 @@ from rodjax.discretization.twist import (
 )
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import resampled
-from rodjax.linalg import Factors, SaddlePointSystem, factor, short_sum
+from rodjax.linalg import AnyFactors, Factors, SaddlePointSystem, factor, short_sum
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
 from rodjax.strain import axial_strain
 from rodjax.supports import Clamp, Directed, Held
+from rodjax.vectors import components, dot
 
 
 class Polyline(Shape):
@@ -66,9 +66,8 @@ class Polyline(Shape):
     def tangents(self) -> Float[Array, "3 n"]:
         return self.edges.T / self.lengths[None]
 
-    @property
-    def unknown_tangents(self) -> Float[Array, "3 n"]:
-        return self.tangents
+    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
+        return MixedPoint(self.tangents, end_force, total_twist)
 
     def points(self, pieces: int) -> Float[Array, "k 3"]:
         return resampled(self.nodes, pieces)
@@ -76,7 +75,7 @@ class Polyline(Shape):
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "Polyline":
         return Polyline(self.nodes * scale + shift[None], self.edges * scale)
 
-    def reached(self, form: MixedForm, point: MixedPoint) -> "Polyline":
+    def reached(self, form: Form, point: MixedPoint) -> "Polyline":
         edges = form.edges(point)
         return Polyline(form.nodes(edges), edges)
 
@@ -249,7 +248,7 @@ class FiniteDifference(eqx.Module):
 class Preconditioner(eqx.Module):
     """A factorised Gauss-Newton Hessian by the rotations of the edges, and how each edge lengthens under tension."""
 
-    factors: Factors
+    factors: AnyFactors
     tangents: Float[Array, "3 n"]
     bases: Float[Array, "3 2 n"]
     lengths: Float[Array, "n"]
@@ -262,6 +261,7 @@ class Preconditioner(eqx.Module):
     def changes_under(self, forces: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         """The changes of the edges under these forces in them and the one in all that keeps the ends in place."""
         stretched = self.per_tension * dot(self.tangents, forces)
+        assert isinstance(self.factors, Factors)
         constraints = self.factors.rows.shape[1]
         closure = (self.tangents @ stretched)[:constraints]
         rotation, common = self.factors.solve(self.lengths[None] * components(self.bases, forces), closure)

@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.joints import Joints, components, cross, dot, outer, twist_derivatives, twist_gradient
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.form import Form
+from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
+from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
@@ -31,6 +32,7 @@ from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import swept_angle
 from rodjax.supports import Clamp, Directed, Free, Held
+from rodjax.vectors import components, cross, dot
 
 # Simpson's weights of the three points of an element.
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
@@ -252,9 +254,8 @@ class Curve(Shape):
     tangents: Float[Array, "3 m"]
     s: Float[Array, "n+1"]
 
-    @property
-    def unknown_tangents(self) -> Float[Array, "3 m"]:
-        return self.tangents
+    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
+        return MixedPoint(self.tangents, end_force, total_twist)
 
     @staticmethod
     def through(points: Float[Array, "m 3"]) -> "Curve":
@@ -268,7 +269,7 @@ class Curve(Shape):
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "Curve":
         return Curve(self.nodes * scale + shift[None], self.tangents, self.s)
 
-    def reached(self, form: MixedForm, point: MixedPoint) -> "Curve":
+    def reached(self, form: Form, point: MixedPoint) -> "Curve":
         return Curve(form.nodes(form.edges(point)), point.tangents, form.field.s)
 
     def change_to(self, other: Any) -> Float[Array, ""]:
@@ -317,16 +318,24 @@ def _turned(
     return jnp.where(turns, turned, tangents)
 
 
-def with_nodes_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Float[Array, "n+1"]:
+def with_nodes_at(
+    s: Float[Array, "n+1"], places: Float[Array, "k"], *, may_repeat: bool = False
+) -> Float[Array, "n+1"]:
     """The nodes moved, with all between them and the next one fixed, so that one lies at each of the sorted places.
 
-    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none.
+    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none. `may_repeat`: several of
+    them may be the same, so that there may be more of them than nodes.
     """
     n, k = len(s) - 1, min(len(places), len(s) - 2)
+    remaining: Iterable[Any] = range(k, 0, -1)
+    if may_repeat:
+        k = len(places)
+        differ = jnp.concatenate([jnp.diff(places) * n >= LEAST_ELEMENT, jnp.array([True])])
+        remaining = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
     index = jnp.arange(n + 1)
     fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
-    for remaining, place in zip(range(k, 0, -1), places[:k], strict=True):
-        nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - remaining)
+    for nodes_left, place in zip(remaining, places[:k], strict=True):
+        nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - nodes_left)
         here = s[nearest]
         # Written so that the same bits come out where the node is there already.
         before = s + (s - fixed_place) * ((place - fixed_place) / (here - fixed_place) - 1)
@@ -335,6 +344,8 @@ def with_nodes_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Float[Ar
         moved = jnp.where(index == nearest, place, moved)
         is_apart = (place - fixed_place) * n >= LEAST_ELEMENT
         is_apart &= (1 - place) * n >= LEAST_ELEMENT
+        if may_repeat:
+            is_apart &= nearest > fixed
         s = jnp.where(is_apart, moved, s)
         fixed, fixed_place = jnp.where(is_apart, nearest, fixed), jnp.where(is_apart, place, fixed_place)
     return s

@@ -19,6 +19,7 @@ from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import squared_curvature_between
 from rodjax.supports import Directed
+from rodjax.vectors import components, cross, dot
 
 # In a Gauss-Newton Hessian a joint bent further than this counts as one bent so far: it stays definite.
 LEAST_COSINE = 0.1
@@ -187,24 +188,6 @@ def _two_derivatives(function, x: Float[Array, "k"]) -> tuple[Float[Array, "k"],
     """First and second derivative of a function that acts on each number by itself."""
     ones = jnp.ones_like(x)
     return jax.jvp(lambda x: jax.jvp(function, (x,), (ones,))[1], (x,), (ones,))
-
-
-def components(basis: Float[Array, "3 b *k"], vectors: Float[Array, "3 *k"]) -> Float[Array, "b *k"]:
-    return short_sum(basis * vectors[:, None], axis=0)
-
-
-def dot(a: Float[Array, "c *k"], b: Float[Array, "c *k"]) -> Float[Array, "*k"]:
-    return short_sum(a * b, axis=0)
-
-
-def cross(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-def root(x: Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """Square root, with the derivative 0 at 0."""
-    is_zero = x == 0
-    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, x)))
 
 
 def outer(a: Float[Array, "*c 2 k"], b: Float[Array, "*c 2 k"]) -> Float[Array, "*c 2 2 k"]:

@@ -22,27 +22,18 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rodjax.discretization.dead_loads import total_force
-from rodjax.discretization.joints import components, dot, outer, rotated, tangent_bases
+from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
+from rodjax.discretization.joints import outer, rotated, tangent_bases
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
-from rodjax.linalg import SaddlePointSystem, short_sum
-from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
+from rodjax.linalg import AnySystem, SaddlePointSystem, short_sum
+from rodjax.scene import Scene, dead_end_moment
 from rodjax.supports import Clamp, Free, Held
-
-# Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
-# a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
-# costs Newton a factor of 1e7 a step instead of quadratic convergence. The softest mode of a clamped rod has pi^2.
-NEUTRAL = 1e-6
-# Multiple of eps (stiffness or force + 4 N^2) that is taken for the rounding floor of the gradient.
-FLOOR_SAFETY = 4.0
-# Where the gradient is at the tolerance, the polyline must close to this multiple of it: a hundredth, as a bent rod has
-# about 100 EI/L^3 of stiffness; or to so many roundings.
-CLOSURE_TOLERANCE = 0.01
-CLOSURE_ROUNDINGS = 64
+from rodjax.vectors import components, dot
 
 
 class MixedPoint(eqx.Module):
@@ -60,22 +51,7 @@ class MixedPoint(eqx.Module):
         return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist))
 
 
-class Linearization(eqx.Module):
-    """First and second derivatives of L at a point, by rotations of the tangents in `bases`, by F and by the torque.
-
-    `gradient`: by the rotations; `closure`: by F, what the polyline lacks of the span, and a zero for the torque;
-    `residual`: largest force left on a node; `energy`: L, without the work of a dead moment.
-    """
-
-    bases: Float[Array, "3 b n"]
-    gradient: Float[Array, "b n"]
-    closure: Float[Array, "k"]
-    system: SaddlePointSystem
-    energy: Float[Array, ""]
-    residual: Float[Array, ""]
-
-
-class MixedForm(eqx.Module):
+class MixedForm(Form):
     """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
     `forces_beyond`: what the loads exert on what lies beyond each point; `force_spread`: as in `TangentField`, as the
@@ -92,10 +68,18 @@ class MixedForm(eqx.Module):
 
     @staticmethod
     def of(scene: Scene, field: TangentField) -> "MixedForm":
-        return MixedForm(scene, field, field.forces_beyond(scene), field.force_spread(scene))
+        return MixedForm(
+            scene=scene, field=field, forces_beyond=field.forces_beyond(scene), force_spread=field.force_spread(scene)
+        )
 
     def along(self, axes: Float[Array, "3 a"]) -> "MixedForm":
-        return MixedForm(self.scene, self.field, self.forces_beyond, self.force_spread, axes)
+        return MixedForm(
+            scene=self.scene,
+            field=self.field,
+            forces_beyond=self.forces_beyond,
+            force_spread=self.force_spread,
+            axes=axes,
+        )
 
     def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
         """Directions at right angles to each tangent, along the axes."""
@@ -105,6 +89,23 @@ class MixedForm(eqx.Module):
             return jnp.broadcast_to(self.axes[..., None], (3, 1, tangents.shape[1]))
         normal = jnp.cross(self.axes[:, 0], self.axes[:, 1])
         return jnp.cross(jnp.broadcast_to(normal[:, None], tangents.shape), tangents, axis=0)[:, None]
+
+    def bases_at(self, point: MixedPoint) -> Float[Array, "3 b n"]:
+        """Those along which the tangents of a point may turn: none where a support holds one."""
+        return self.field.basis(self.scene, self.bases(self.field.with_held(self.scene, point.tangents)))
+
+    def turn(self, point: MixedPoint, bases: Float[Array, "3 b n"], axis: Float[Array, "3"]) -> Float[Array, "b n"]:
+        """The rotations that turn the whole rod about an axis."""
+        return components(bases, jnp.cross(axis[:, None], point.tangents, axis=0))
+
+    def holding(self, point: MixedPoint) -> MixedPoint:
+        """The point with the tangents that supports hold, and the total twist of the scene."""
+        tangents = self.field.as_held(self.scene, point.tangents)
+        return MixedPoint(tangents, point.end_force, self.twist_near(tangents, point.total_twist))
+
+    def settled(self, point: MixedPoint) -> MixedPoint:
+        """The point where a solver stopped, with all that is known of it."""
+        return point
 
     @property
     def has_torsion(self) -> bool:
@@ -131,27 +132,6 @@ class MixedForm(eqx.Module):
             _, softness = self._strain(point)
             ways += self.field.ways_of_spread(self.scene, point.tangents, softness)
         return ways
-
-    def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
-        """Nodes along the edges, between held ends to the last digit."""
-        start, end = self.scene.start, self.scene.end
-        if not isinstance(start, Held):
-            assert isinstance(end, Held), "a scene holds at least one position"
-            return jnp.concatenate([end.position[None] - jnp.cumsum(edges[::-1], axis=0)[::-1], end.position[None]])
-        nodes = start.position[None] + jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        if isinstance(end, Held):
-            s = jnp.linspace(0.0, 1.0, len(nodes), dtype=nodes.dtype)[:, None]
-            nodes = (nodes + s * (end.position - nodes[-1])[None]).at[-1].set(end.position)
-        return nodes
-
-    def end_forces(self, point: MixedPoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The section forces at s = 0 and s = L."""
-        total = total_force(self.scene)
-        for end, sign in ((self.scene.start, -1), (self.scene.end, 1)):
-            if isinstance(end, Free):
-                given = jnp.zeros_like(total) if end.force is None else sign * end.force
-                return (given, -total) if sign < 0 else (total, given)
-        return point.end_force + total, point.end_force
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
         """The potential of gravity and dead forces, zero at the origin."""
@@ -290,37 +270,10 @@ class MixedForm(eqx.Module):
             residual=field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
         )
 
-    def regular(self, system: SaddlePointSystem) -> SaddlePointSystem:
+    def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
+        assert isinstance(system, SaddlePointSystem)
         return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
-
-    @property
-    def multipliers(self) -> int:
-        """How many columns the border of the system has, where the scene has a potential."""
-        return int(self.has_torsion) + self._closures
-
-    @property
-    def _closures(self) -> int:
-        """How many of the multipliers are components of the end force: the last ones."""
-        if not held_at_both_ends(self.scene):
-            return 0
-        return 3 if self.axes is None else self.axes.shape[1]
-
-    def closure(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
-        """The part for the end force, of what is given for all multipliers."""
-        return multipliers[len(multipliers) - self._closures :]
-
-    def of_force(self, vector: Float[Array, "3"]) -> Float[Array, "c"]:
-        """The components of a vector that belong to the end force."""
-        if not self._closures:
-            return jnp.zeros(0, vector.dtype)
-        return vector if self.axes is None else vector @ self.axes
-
-    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3"]:
-        """A change of the end force from its components."""
-        if not self._closures:
-            return jnp.zeros(3, closure.dtype)
-        return closure if self.axes is None else self.axes @ closure
 
     def under_force(
         self, point: MixedPoint, bases: Float[Array, "3 b n"], rotation: Float[Array, "b n"], change: Float[Array, "3"]
@@ -355,11 +308,6 @@ class MixedForm(eqx.Module):
         largest = jnp.max(jnp.abs(point.end_force[:, None] + self.forces_beyond))
         eps = jnp.finfo(largest.dtype).eps
         return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 / self.field.finest**2)
-
-    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
-        """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
-        least = CLOSURE_ROUNDINGS * jnp.finfo(closure.dtype).eps
-        return jnp.all(jnp.abs(closure) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))
 
 
 def _times(matrices: Float[Array, "3 3 m"], vectors: Float[Array, "3 m"]) -> Float[Array, "3 m"]:

@@ -6,21 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.hermite import HermiteElements
-from rodjax.discretization.joints import (
-    Joints,
-    bending_derivatives,
-    cross,
-    dot,
-    root,
-    tangent_bases,
-    twist_derivatives,
-)
+from rodjax.discretization.joints import Joints, bending_derivatives, tangent_bases, twist_derivatives
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import angle_about, transport, transport_along
 from rodjax.energy import axial_strain_under
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Directed, Free, Support
+from rodjax.vectors import cross, dot, root
 
 
 class Resultants(eqx.Module):
@@ -30,6 +23,7 @@ class Resultants(eqx.Module):
     curvature: Float[Array, "n+1"]
     twist: Float[Array, "n+1"]
     tension: Float[Array, "n+1"]
+    axial_strain: Float[Array, "n+1"]
     start_force: Float[Array, "3"]
     start_moment: Float[Array, "3"]
     end_force: Float[Array, "3"]
@@ -55,12 +49,14 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
     ends = [jnp.sum(force * nodes[:, k])[None] for k, force in zip((0, -1), forces, strict=True)]
+    tension = jnp.concatenate([ends[0], tension[1:-1], ends[1]])
     start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(nodes[:, 0])
     return Resultants(
         frames=_turning_frames(scene, nodes, field.carried(start_d1, tangents), point.total_twist * field.s),
         curvature=curvature,
         twist=jnp.full_like(field.s, point.total_twist),
-        tension=jnp.concatenate([ends[0], tension[1:-1], ends[1]]),
+        tension=tension,
+        axial_strain=axial_strain_under(rod, tension),
         start_force=forces[0],
         start_moment=_given_moment(scene.start, moments[:, 0], sign=-1),
         end_force=forces[1],
@@ -148,6 +144,7 @@ def _on_edges(
         curvature=root(jnp.concatenate(squared_curvatures)),
         twist=jnp.full(n + 1, twist),
         tension=tension,
+        axial_strain=axial_strain_under(rod, tension),
         start_force=end_forces[0],
         start_moment=start_moment,
         end_force=end_forces[1],

@@ -6,7 +6,7 @@ from typing import Any, Self
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.form import Form
 
 
 class Shape(eqx.Module):
@@ -14,10 +14,9 @@ class Shape(eqx.Module):
 
     nodes: eqx.AbstractVar[Float[Array, "n+1 3"]]
 
-    @property
     @abstractmethod
-    def unknown_tangents(self) -> Float[Array, "3 m"]:
-        """The tangents of a `MixedPoint`."""
+    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> Any:
+        """The unknowns of its form, with these."""
 
     @staticmethod
     @abstractmethod
@@ -33,7 +32,7 @@ class Shape(eqx.Module):
         """Scaled, then shifted."""
 
     @abstractmethod
-    def reached(self, form: MixedForm, point: MixedPoint) -> Self:
+    def reached(self, form: Form, point: Any) -> Self:
         """The shape of a solution."""
 
     @abstractmethod

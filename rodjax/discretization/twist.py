@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.joints import components, cross, dot, tangent_bases
+from rodjax.discretization.joints import tangent_bases
 from rodjax.scene import Scene, dead_end_moment
 from rodjax.strain import swept_angle
 from rodjax.supports import Free
+from rodjax.vectors import components, cross, dot
 
 
 class FramedTangents(eqx.Module):

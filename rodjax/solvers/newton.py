@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import not_negative, plain_number, whole_number
-from rodjax.discretization.joints import components, generic_field
-from rodjax.discretization.mixed import NEUTRAL, Linearization, MixedForm, MixedPoint
+from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
+from rodjax.discretization.joints import generic_field
 from rodjax.linalg import factor, factor_and_solve
 from rodjax.status import Outcome, Status
+from rodjax.vectors import components
 
 
 class Newton(eqx.Module):
@@ -67,7 +68,7 @@ STAGNATION = 10.0
 class NewtonEnd(eqx.Module):
     """Where the method stopped. `is_stable`: whether the energy has no negative curvature there."""
 
-    point: MixedPoint
+    point: Point
     outcome: Outcome
     is_stable: Bool[Array, ""]
 
@@ -76,7 +77,7 @@ class NewtonState(eqx.Module):
     """What a turn leaves to the next one."""
 
     # The last accepted point, and the step from it.
-    point: MixedPoint
+    point: Point
     bases: Float[Array, "3 b n"]
     residual: Float[Array, ""]
     shift: Float[Array, ""]
@@ -98,12 +99,12 @@ class NewtonState(eqx.Module):
     is_stable: Bool[Array, ""]
 
 
-def is_stable(form: MixedForm, point: MixedPoint) -> Bool[Array, ""]:
+def is_stable(form: Form, point: Point) -> Bool[Array, ""]:
     """Whether the energy has no negative curvature at an equilibrium, neutral modes apart."""
     return factor(form.regular(form.linearized(point).system)).is_minimum
 
 
-def find_equilibrium(form: MixedForm, point: MixedPoint, solver: Newton, find: Find = "minimum") -> NewtonEnd:
+def find_equilibrium(form: Form, point: Point, solver: Newton, find: Find = "minimum") -> NewtonEnd:
     """The equilibrium reached from `point`."""
     state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver, find), begin(form, point))
     return ended(form, state)
@@ -113,7 +114,7 @@ def is_running(state: NewtonState) -> Bool[Array, ""]:
     return state.status == Status.RUNNING
 
 
-def ended(form: MixedForm, state: NewtonState) -> NewtonEnd:
+def ended(form: Form, state: NewtonState) -> NewtonEnd:
     return NewtonEnd(
         point=state.point,
         outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
@@ -121,7 +122,7 @@ def ended(form: MixedForm, state: NewtonState) -> NewtonEnd:
     )
 
 
-def turn(form: MixedForm, state: NewtonState, solver: Newton, find: Find) -> NewtonState:
+def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonState:
     """One evaluation of all derivatives, at most one factorisation, and so the same work for every rod of a batch.
 
     The trial is accepted, factorised and gives the next step; or the step is halved; or, where the Hessian has negative
@@ -146,17 +147,17 @@ def turn(form: MixedForm, state: NewtonState, solver: Newton, find: Find) -> New
     )
 
 
-def _descends(form: MixedForm, find: Find) -> bool:
+def _descends(form: Form, find: Find) -> bool:
     """Whether steps are judged by the energy; else by the square of what is out of balance, which a step makes less."""
     return form.has_potential and find == "minimum"
 
 
-def _half_square(form: MixedForm, here: Linearization) -> Float[Array, ""]:
+def _half_square(form: Form, here: Linearization) -> Float[Array, ""]:
     return jnp.sum(here.gradient**2 / form.field.weights[None]) / 2
 
 
 def _advanced(
-    form: MixedForm, state: NewtonState, point: MixedPoint, here: Linearization, solver: Newton, find: Find
+    form: Form, state: NewtonState, point: Point, here: Linearization, solver: Newton, find: Find
 ) -> NewtonState:
     dtype = point.tangents.dtype
     h = 1 / point.tangents.shape[1]
@@ -240,7 +241,7 @@ def _advanced(
     )
 
 
-def _shortened(form: MixedForm, state: NewtonState, find: Find) -> NewtonState:
+def _shortened(form: Form, state: NewtonState, find: Find) -> NewtonState:
     halvings = state.halvings + 1
     failed = halvings > MAX_HALVINGS
     stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
@@ -260,11 +261,12 @@ def _shortened(form: MixedForm, state: NewtonState, find: Find) -> NewtonState:
     )
 
 
-def begin(form: MixedForm, point: MixedPoint) -> NewtonState:
+def begin(form: Form, point: Point) -> NewtonState:
     """Before the first turn, whose trial is the point itself."""
     dtype = point.tangents.dtype
     zero = jnp.zeros((), dtype)
-    bases = form.bases(point.tangents)
+    of_bases = jax.eval_shape(form.bases_at, point)
+    bases = jnp.zeros(of_bases.shape, of_bases.dtype)
     count = jnp.zeros((), int)
     no = jnp.array(False)
     return NewtonState(

@@ -1,0 +1,319 @@
+"""Cells of a rod whose frames are unknown: between neighbouring frames, what strains, ways and loads they give.
+
+Two kinds, as for rods whose tangents suffice: `JointCells`, the finite differences of the report, with a frame at the
+middle of each edge and at both ends, of second order; and `ElementCells`, with frames at both ends and in the middle of
+an element, of fourth order. Both see only rotations between neighbours, so that no parametrisation has a pole.
+
+A cell is strained by what its strains exceed those of the stress-free rod by, where these come from the same formula
+at the frames of the stress-free rod, and its way by what that misses there. So a rod at rest has no residual on any
+mesh.
+Arrays have the components first, then the frames of a cell or its strain points, then the cells.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.along import Steps, stiffness_at
+from rodjax.discretization.hermite import SIMPSON, interleaved, with_nodes_at
+from rodjax.energy import Sections
+from rodjax.linalg import short_sum
+from rodjax.rod import Rod
+from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product
+from rodjax.scene import Scene
+from rodjax.staging import staged
+
+# The frames of a cell, each component an array along the cells.
+Frames = tuple[Quaternion, ...]
+# The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
+REFERENCE = 1
+
+
+class Cells(Protocol):
+    """m frames along a rod in n cells of p frames each; each frame of a cell is a strain point."""
+
+    @property
+    def s(self) -> Float[Array, "nodes"]:
+        """Arclengths of the nodes: 0, ..., 1."""
+        ...
+
+    @property
+    def places(self) -> Float[Array, "m"]:
+        """Arclengths of the frames."""
+        ...
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        """The length of rod that each frame stands for."""
+        ...
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        """The shortest distance between frames."""
+        ...
+
+    @property
+    def lengths(self) -> Float[Array, "p n"]:
+        """The length of rod that each strain point stands for."""
+        ...
+
+    @property
+    def strain_places(self) -> Float[Array, "p n"]:
+        """Arclengths of the strain points."""
+        ...
+
+    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c p n"]: ...
+
+    def assembled(self, by_cell: Float[Array, "... p n"]) -> Float[Array, "... m"]:
+        """Sums over the cells at each frame."""
+        ...
+
+    def strains(self, frames: Frames) -> tuple[Vector, ...]:
+        """Curvature along d1 and d2, and twist, at the strain points."""
+        ...
+
+    def ways(self, by_strain: Float[Array, "3 p n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
+        """From node to node, of ways at the strain points and the rest in each cell."""
+        ...
+
+    def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
+        """The rests of ways from node to node as those of the cells."""
+        ...
+
+    def sections(self, rod: Rod) -> Sections:
+        """What resists at the strain points."""
+        ...
+
+    def parts_before(self, at: Float[Array, ""]) -> Float[Array, "p n"]:
+        """How much of the length of each strain point lies before an arclength."""
+        ...
+
+    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 p n"], Float[Array, "3"]]:
+        """The integral along the rod of what is given per length, from each strain point on and from the start on."""
+        ...
+
+    def couplings(self, blocks: Float[Array, "p 3 p 3 n"]) -> tuple[Array, Array, Array | None]:
+        """The blocks (b, b, ...) on the diagonal, between neighbours, and between ends of elements."""
+        ...
+
+
+class JointCells(eqx.Module):
+    """n equal edges, n + 2 frames: of the start, of the edges and of the end; cells are the joints between them."""
+
+    s: Float[Array, "n+1"]
+
+    @staticmethod
+    def of(scene: Scene, s: Float[Array, "n+1"]) -> "JointCells":
+        return JointCells(s)
+
+    @property
+    def segments(self) -> int:
+        return len(self.s) - 1
+
+    @property
+    def places(self) -> Float[Array, "n+2"]:
+        return jnp.concatenate([self.s[:1], (self.s[:-1] + self.s[1:]) / 2, self.s[-1:]])
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return 1 / jnp.asarray(self.segments, self.s.dtype)
+
+    @property
+    def spacing(self) -> Float[Array, "n+1"]:
+        return jnp.diff(self.places)
+
+    @property
+    def lengths(self) -> Float[Array, "2 n+1"]:
+        half = jnp.diff(self.s) / 2
+        none = jnp.zeros_like(half[:1])
+        return jnp.stack([jnp.concatenate([none, half]), jnp.concatenate([half, none])])
+
+    @property
+    def weights(self) -> Float[Array, "n+2"]:
+        half = self.spacing / 2
+        none = jnp.zeros_like(half[:1])
+        return jnp.concatenate([half, none]) + jnp.concatenate([none, half])
+
+    @property
+    def strain_places(self) -> Float[Array, "2 n+1"]:
+        return jnp.stack([self.places[:-1], self.places[1:]])
+
+    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
+        return jnp.stack([by_frame[:, :-1], by_frame[:, 1:]], axis=1)
+
+    def assembled(self, by_cell: Float[Array, "... 2 n"]) -> Float[Array, "... m"]:
+        none = jnp.zeros_like(by_cell[..., 0, :1])
+        before, after = by_cell[..., 0, :], by_cell[..., 1, :]
+        return jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
+
+    def strains(self, frames: Frames) -> tuple[Vector, ...]:
+        """Of the rotation between two frames, a swing by the angle a and half of a spin before and after it, 2 tan(a/2)
+        and the spin: alone the curvature of `strain.squared_curvature_between`, and a twist that adds up.
+        """
+        first, last = frames
+        w, x, y, z = staged(product(inverse(first), last))
+        swing = 2 / (jnp.sqrt(w * w + z * z) * self.spacing)
+        strain = swing * x, swing * y, 2 * jnp.arctan2(z, w) / self.spacing
+        return strain, strain
+
+    def ways(self, by_strain: Float[Array, "3 2 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
+        return by_strain[:, 1, :-1] + by_strain[:, 0, 1:] + rest[:, :-1]
+
+    def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
+        return jnp.pad(by_segment, ((0, 0), (0, 1)))
+
+    def sections(self, rod: Rod) -> Sections:
+        a, b = self.places[:-1], self.places[1:]
+        joints = [stiffness_at(value, (a + b) / 2, a, b) for value in (*rod.bending_pair, rod.GJ)]
+        # The strain of an edge is one, in both of its joints.
+        a, b = self.s[:-1], self.s[1:]
+        edges = stiffness_at(rod.EA, (a + b) / 2, a, b)
+        EA = jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
+        EI1, EI2, GJ = (jnp.stack([joint, joint]) for joint in joints)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law)
+
+    def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:
+        of_edges = jnp.clip((at - self.s[:-1]) / jnp.diff(self.s), 0.0, 1.0)
+        none = jnp.zeros_like(of_edges[:1])
+        return jnp.stack([jnp.concatenate([none, of_edges]), jnp.concatenate([of_edges, none])])
+
+    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 2 n+1"], Float[Array, "3"]]:
+        of_edges = jnp.diff(self.s)[None] * by_frame[:, 1:-1]
+        sums = jnp.cumsum(of_edges[:, ::-1], axis=1)[:, ::-1]
+        middles = sums - of_edges / 2
+        beyond = [jnp.concatenate([sums[:, :1], middles], axis=1), jnp.pad(middles, ((0, 0), (0, 1)))]
+        return jnp.stack(beyond, axis=1), sums[:, 0]
+
+    def couplings(self, blocks: Float[Array, "2 3 2 3 n"]) -> tuple[Array, Array, None]:
+        diagonal = self.assembled(jnp.stack([blocks[0, :, 0], blocks[1, :, 1]], axis=-2))
+        return diagonal, blocks[1, :, 0], None
+
+
+class ElementCells(eqx.Module):
+    """n elements between nodes at the arclengths `s`; frames at nodes and middles in turn.
+
+    Seen from its middle, the frame in an element turns by the rotation vector v(s), a parabola through those of both
+    ends: helices are exact. The strains at the three points enter with Simpson's weights. As in `hermite`, the length
+    of v is the angle as far as its tenth power, and beyond grows without bound as this approaches pi.
+    """
+
+    s: Float[Array, "n+1"]
+
+    @staticmethod
+    def of(scene: Scene, s: Float[Array, "n+1"]) -> "ElementCells":
+        """On these nodes, moved so that one lies at each point force and at each jump of the rod."""
+        places = [load.at for load in scene.point_forces] + [jump for steps in varying(scene) for jump in steps]
+        return ElementCells(with_nodes_at(s, jnp.sort(jnp.stack(places)), may_repeat=True) if places else s)
+
+    @property
+    def h(self) -> Float[Array, "n"]:
+        return jnp.diff(self.s)
+
+    @property
+    def places(self) -> Float[Array, "m"]:
+        return interleaved(self.s, (self.s[:-1] + self.s[1:]) / 2)
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return jnp.min(self.h) / 2
+
+    @property
+    def lengths(self) -> Float[Array, "3 n"]:
+        return jnp.array(SIMPSON, self.s.dtype)[:, None] * self.h[None]
+
+    @property
+    def weights(self) -> Float[Array, "m"]:
+        return self.assembled(self.lengths)
+
+    @property
+    def strain_places(self) -> Float[Array, "3 n"]:
+        return jnp.stack([self.s[:-1], (self.s[:-1] + self.s[1:]) / 2, self.s[1:]])
+
+    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
+        return jnp.stack([by_frame[:, 0:-1:2], by_frame[:, 1::2], by_frame[:, 2::2]], axis=1)
+
+    def assembled(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
+        start, middle, end = (by_cell[..., k, :] for k in range(3))
+        none = jnp.zeros_like(start[..., :1])
+        nodes = jnp.concatenate([start, none], axis=-1) + jnp.concatenate([none, end], axis=-1)
+        return interleaved(nodes, middle)
+
+    def strains(self, frames: Frames) -> tuple[Vector, ...]:
+        middle = inverse(frames[1])
+        relative = staged((product(middle, frames[0]), product(middle, frames[2])))
+        first, rate_of_first = _rotation_vector(relative[0])
+        last, rate_of_last = _rotation_vector(relative[1])
+        change = _combined(1 / self.h, last, -1 / self.h, first)
+        return (
+            rate_of_first(_combined(-3 / self.h, first, -1 / self.h, last)),
+            change,
+            rate_of_last(_combined(3 / self.h, last, 1 / self.h, first)),
+        )
+
+    def ways(self, by_strain: Float[Array, "3 3 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return short_sum(by_strain, axis=1) + rest
+
+    def rest_of(self, by_segment: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return by_segment
+
+    def sections(self, rod: Rod) -> Sections:
+        s = self.strain_places
+        a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
+        EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in (*rod.bending_pair, rod.GJ, rod.EA))
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law)
+
+    def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
+        x = jnp.clip((at - self.s[:-1]) / self.h, 0.0, 1.0)
+        parts = (x - 3 * x**2 / 2 + 2 * x**3 / 3, 2 * x**2 - 4 * x**3 / 3, 2 * x**3 / 3 - x**2 / 2)
+        return jnp.stack([part / weight for part, weight in zip(parts, SIMPSON, strict=True)])
+
+    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 3 n"], Float[Array, "3"]]:
+        """By parabolas through the three points of each element."""
+        a, b, c = (part[:, 0] for part in jnp.split(self.of_cells(by_frame), 3, axis=1))
+        whole = self.h[None] * (SIMPSON[0] * (a + c) + SIMPSON[1] * b)
+        second_half = self.h[None] * (-a + 8 * b + 5 * c) / 24
+        sums = jnp.cumsum(whole[:, ::-1], axis=1)[:, ::-1]
+        beyond = sums - whole
+        return jnp.stack([sums, beyond + second_half, beyond], axis=1), sums[:, 0]
+
+    def couplings(self, blocks: Float[Array, "3 3 3 3 n"]) -> tuple[Array, Array, Array]:
+        diagonal = self.assembled(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))
+        between = jnp.stack([blocks[1, :, 0], blocks[2, :, 1]], axis=-1)
+        return diagonal, between.reshape(*between.shape[:2], -1), blocks[2, :, 0]
+
+
+def _combined(a: Array, u: Vector, b: Array, v: Vector) -> Vector:
+    """a u + b v."""
+    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
+
+
+def _rotation_vector(q: Quaternion) -> tuple[Vector, Callable[[Vector], Vector]]:
+    """The rotation vector of a quaternion, and what makes of its rate of change that of turning, in the turned axes."""
+    sign = jnp.where(q[0] < 0, -1.0, 1.0).astype(q[0].dtype)
+    vector = sign * q[1], sign * q[2], sign * q[3]
+    x = inner(vector, vector)  # sin(t/2)^2
+    # t^2/(4 x) to fourth order in x, and growing to infinity at 1; and by how much it is above 1 - x, by x.
+    above = 1 / 3 + x * (8 / 45) + x**2 * (4 / 35) + x**3 * (128 / 1575) / (1 - x)
+    ratio, rest = 1 + x * above, 1 + above
+    size = 2 * jnp.sqrt(ratio)
+    v = size * vector[0], size * vector[1], size * vector[2]
+    by_sine = jnp.sqrt((1 - x) / ratio)  # sin(t)/t
+    second = rest / (4 * ratio**2 * (1 + by_sine))  # (t - sin t)/t^3
+    first = 1 / (2 * ratio)  # (1 - cos t)/t^2
+
+    def rate(change: Vector) -> Vector:
+        across = outer(v, change)
+        a, b, c = _combined(-first, across, second, outer(v, across))
+        return change[0] + a, change[1] + b, change[2] + c
+
+    return v, rate
+
+
+def varying(scene: Scene) -> list[Float[Array, "k"]]:
+    """The arclengths of the jumps of a rod and of loads along it."""
+    rod = scene.rod
+    values = (*rod.bending_pair, rod.GJ, rod.EA, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
+    return [value.jumps for value in values if isinstance(value, Steps)]

@@ -1,0 +1,466 @@
+"""A rod whose frames are unknown: anisotropic, not straight at rest, varying along its length, or with its own law.
+
+The mixed form of `mixed`, with a frame R in the place of each tangent. An equilibrium is a saddle point of
+
+    L(R, F) = sum h [w(strains(R), e) - n . t (1 + e)] - sum n . R rest + F . span,
+
+a minimum over the frames and a maximum over the force F at s = L; the axial strain e is the one at which dw/de = n . t.
+A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
+frames (`cells`): each cell is one function of its few rotations and F, which JAX differentiates twice, all at once.
+
+Couples, follower loads and dead moments have no potential. Their virtual work enters the gradient; what follower forces
+change far away makes the matrix full, and the method Newton's own on all of it.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.along import Along
+from rodjax.discretization.cells import REFERENCE, Cells, Frames, JointCells
+from rodjax.discretization.dead_loads import total_force
+from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
+from rodjax.discretization.hermite import interleaved
+from rodjax.energy import Sections
+from rodjax.linalg import DenseSystem, SaddlePointSystem
+from rodjax.loads import DistributedCouple, DistributedForce
+from rodjax.rotations import Vector, columns, from_frame, inner, inverse, nearer, rotated, swung, tangent, turned, unit
+from rodjax.scene import Scene, has_potential
+from rodjax.staging import staged
+from rodjax.supports import Clamp, Free, Held, Swivel
+from rodjax.vectors import components, dot
+
+
+class FramePoint(eqx.Module):
+    """Frames along the rod; the force at s = L between held ends, else zero; the total twist [rad], where known."""
+
+    quaternions: Float[Array, "4 m"]
+    end_force: Float[Array, "3"]
+    total_twist: Float[Array, ""]
+
+    @property
+    def tangents(self) -> Float[Array, "3 m"]:
+        return tangent(self.quaternions)
+
+
+class Strained(eqx.Module):
+    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, axial strains under
+    the tension, and tangents.
+    """
+
+    curvature: Float[Array, "2 p n"]
+    twist: Float[Array, "p n"]
+    axial: Float[Array, "p n"]
+    tension: Float[Array, "p n"]
+    tangents: Float[Array, "3 p n"]
+
+
+class FrameForm(Form):
+    """A nondimensional scene on cells, as a function of a `FramePoint`.
+
+    `rest_strains` and `rest_ways`: of the rod at rest, by the formula of the cells, and what its ways from node to node
+    have beyond that; `loads`: what the dead loads beyond each strain point exert on it.
+    """
+
+    scene: Scene
+    field: Cells
+    sections: Sections
+    rest_strains: Float[Array, "3 k n"] | None
+    rest_ways: Float[Array, "3 n"] | None
+    loads: Float[Array, "3 k n"]
+    axes: Float[Array, "3 a"] | None = None
+
+    @staticmethod
+    def of(scene: Scene, field: Cells) -> "FrameForm":
+        rest_strains, rest_ways = _at_rest(scene, field)
+        return FrameForm(
+            scene=scene,
+            field=field,
+            sections=field.sections(scene.rod),
+            rest_strains=rest_strains,
+            rest_ways=rest_ways,
+            loads=_dead_loads(scene, field),
+        )
+
+    @property
+    def has_torsion(self) -> bool:
+        return False
+
+    @property
+    def has_potential(self) -> bool:
+        return has_potential(self.scene)
+
+    @property
+    def is_free(self) -> Float[Array, "3 m"]:
+        """1 for the rotations in the axes of each frame that no support holds, else 0."""
+        free = jnp.ones((3, len(self.field.places)), self.loads.dtype)
+        for end, k in ((self.scene.start, 0), (self.scene.end, -1)):
+            if isinstance(end, Clamp):
+                free = free.at[:, k].set(0.0)
+            elif isinstance(end, Swivel):
+                free = free.at[:2, k].set(0.0)
+        return free
+
+    def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
+        return columns(point.quaternions) * self.is_free[None]
+
+    def turn(self, point: FramePoint, bases: Float[Array, "3 3 m"], axis: Float[Array, "3"]) -> Float[Array, "3 m"]:
+        return components(bases, jnp.broadcast_to(axis[:, None], point.tangents.shape))
+
+    def holding(self, point: FramePoint) -> FramePoint:
+        """The point with the frames and tangents that supports hold."""
+        q = point.quaternions
+        for end, k in ((self.scene.start, 0), (self.scene.end, -1)):
+            if isinstance(end, Clamp):
+                q = q.at[:, k].set(nearer(from_frame(end.frame), q[:, k]))
+            elif isinstance(end, Swivel):
+                q = q.at[:, k].set(swung(q[:, k], end.tangent))
+        return FramePoint(q, point.end_force, point.total_twist)
+
+    def settled(self, point: FramePoint) -> FramePoint:
+        return FramePoint(point.quaternions, point.end_force, self.total_twist(point.quaternions))
+
+    def total_twist(self, quaternions: Float[Array, "4 m"]) -> Float[Array, ""]:
+        return jnp.sum(self.field.lengths * self.strains(quaternions)[2])
+
+    def strains(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 p n"]:
+        """Curvature along d1 and d2, and twist, at the strain points."""
+        return stacked(self.field.strains(of_cells(self.field, quaternions)))
+
+    def moved(
+        self,
+        point: FramePoint,
+        bases: Float[Array, "3 3 m"],
+        rotation: Float[Array, "3 m"],
+        force_change: Float[Array, "3"],
+    ) -> FramePoint:
+        # Rounding would grow with every step.
+        quaternions = unit(turned(point.quaternions, rotation))
+        return FramePoint(quaternions, point.end_force + force_change, point.total_twist)
+
+    # --- strains, forces and ways ------------------------------------------------------------------------------------
+
+    def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]) -> Float[Array, "3 k n"]:
+        """The force through the rod at the strain points."""
+        forces = end_force[:, None, None] + self.loads
+        following = self._following(quaternions)
+        return forces if following is None else forces + following
+
+    def _following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
+        """What the follower loads beyond each strain point exert on it; where the start is free, less all of them."""
+        scene = self.scene
+        parts = []
+        starts_held = isinstance(scene.start, Held)
+        for load in scene.distributed:
+            if isinstance(load, DistributedForce) and load.follower:
+                given = rotated(quaternions, jnp.broadcast_to(load.force[:, None], quaternions[1:].shape))
+                beyond, total = self.field.summed_beyond(given)
+                parts.append(beyond if starts_held else beyond - total[:, None, None])
+        for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1)):
+            if isinstance(end, Free) and end.follower and end.force is not None:
+                parts.append(sign * rotated(quaternions[:, k], end.force)[:, None, None])
+        return sum(parts[1:], parts[0]) if parts else None
+
+    def couples_in_cells(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
+        """The couples along the rod on the strain points, in their axes; `None` where there are none."""
+        parts = []
+        for load in self.scene.distributed:
+            if isinstance(load, DistributedCouple):
+                couple = jnp.broadcast_to(load.couple[:, None], quaternions[1:].shape)
+                couple = couple if load.follower else rotated(inverse(quaternions), couple)
+                parts.append(self.field.lengths[None] * self.field.of_cells(couple))
+        return sum(parts[1:], parts[0]) if parts else None
+
+    def _couples(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 m"] | None:
+        """All couples on the frames, in their axes; `None` where there are none."""
+        scene = self.scene
+        along = self.couples_in_cells(quaternions)
+        parts = [] if along is None else [self.field.assembled(along)]
+        for end, k in ((scene.start, 0), (scene.end, -1)):
+            if isinstance(end, Free) and end.moment is not None:
+                moment = end.moment if end.follower else rotated(inverse(quaternions[:, k]), end.moment)
+                parts.append(jnp.zeros_like(quaternions[1:]).at[:, k].set(moment))
+        return sum(parts[1:], parts[0]) if parts else None
+
+    def strained(self, point: FramePoint) -> Strained:
+        frames = of_cells(self.field, point.quaternions)
+        strains = stacked(self.field.strains(frames))
+        if self.rest_strains is not None:
+            strains -= self.rest_strains
+        tangents = stacked(tuple(tangent(frame) for frame in frames))
+        tension = dot(self.forces(point.quaternions, point.end_force), tangents)
+        axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+        return Strained(strains[:2], strains[2], axial, tension, tangents)
+
+    def _by_cells(self, frames: Frames, rotations: tuple[Vector, ...], forces: tuple[Vector, ...]) -> Float[Array, "n"]:
+        """L of each cell, as its frames turn under forces that stay."""
+        frames = staged(tuple(turned(frame, rotation) for frame, rotation in zip(frames, rotations, strict=True)))
+        lengths = self.field.lengths
+        terms = []
+        for k, strain in enumerate(staged(self.field.strains(frames))):
+            if self.rest_strains is not None:
+                strain = tuple(x - at_rest for x, at_rest in zip(strain, self.rest_strains[:, k], strict=True))
+            sections = self.sections.at(k)
+            tension = inner(forces[k], tangent(frames[k]))
+            axial = sections.axial_strain_under(tension, strain[:2], strain[2])
+            terms.append(lengths[k] * (sections.density(strain[:2], strain[2], axial) - tension * (1 + axial)))
+        if self.rest_ways is not None:
+            x, y, z = self.rest_ways
+            terms.append(-inner(forces[REFERENCE], rotated(frames[REFERENCE], (x, y, z))))
+        return sum(terms[1:], terms[0])
+
+    def edges(self, point: Any) -> Float[Array, "segments 3"]:
+        """From node to node."""
+        here = self.strained(point)
+        ways = (self.field.lengths * (1 + here.axial))[None] * here.tangents
+        return self.field.ways(ways, self._rest_of_ways(point, jnp.zeros_like(ways[:, 0]))).T
+
+    def _rest_of_ways(self, point: FramePoint, nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        if self.rest_ways is None:
+            return nothing
+        return rotated(self.field.of_cells(point.quaternions)[:, REFERENCE], self.rest_ways)
+
+    # --- energies ----------------------------------------------------------------------------------------------------
+
+    def elastic_energy(self, point: FramePoint) -> Float[Array, ""]:
+        here = self.strained(point)
+        densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
+        return jnp.sum(self.field.lengths * densities)
+
+    def load_energy(self, point: FramePoint) -> Float[Array, ""]:
+        """The potential of dead forces, zero at the origin; other loads have none."""
+        start, end = self.scene.start, self.scene.end
+        held = start if isinstance(start, Held) else end
+        assert isinstance(held, Held), "a scene holds at least one position"
+        here = self.strained(point)
+        work = jnp.sum((self.field.lengths * (1 + here.axial)) * dot(self.loads, here.tangents))
+        rest = self._rest_of_ways(point, jnp.zeros_like(self.loads[:, 0]))
+        work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
+        return -work - jnp.sum(total_force(self.scene) * held.position)
+
+    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The section forces at s = 0 and s = L."""
+        scene, q = self.scene, point.quaternions
+        total = total_force(scene)
+        for load in scene.distributed:
+            if isinstance(load, DistributedForce) and load.follower:
+                given = rotated(q, jnp.broadcast_to(load.force[:, None], q[1:].shape))
+                total += self.field.summed_beyond(given)[1]
+        for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1)):
+            if isinstance(end, Free):
+                given = jnp.zeros_like(total) if end.force is None else end.force
+                if end.follower:
+                    given = rotated(q[:, k], given)
+                    total += given
+                return (-given, -total) if sign < 0 else (total, given)
+        return point.end_force + total, point.end_force
+
+    # --- derivatives -------------------------------------------------------------------------------------------------
+
+    def by_rotations(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]) -> Float[Array, "3 p n"]:
+        """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
+        frames = of_cells(self.field, quaternions)
+        forces = unstacked(self.forces(quaternions, end_force))
+        nothing = jax.tree.map(jnp.zeros_like, tuple(frame[1:] for frame in frames))
+        return stacked(jax.grad(lambda rotations: jnp.sum(self._by_cells(frames, rotations, forces)))(nothing))
+
+    def _unbalanced(
+        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]
+    ) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
+        """What is out of balance at the frames, in their axes, and what the rod lacks of its span."""
+        gradient = self.field.assembled(self.by_rotations(quaternions, end_force))
+        couples = self._couples(quaternions)
+        if couples is not None:
+            gradient -= couples
+        closure = jnp.zeros(0, end_force.dtype)
+        if self._closures:
+            edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros_like(end_force[0])))
+            closure = self._span - jnp.sum(edges, axis=0)
+        return gradient * self.is_free, closure
+
+    def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
+        return self._unbalanced(point.quaternions, point.end_force)
+
+    @property
+    def _span(self) -> Float[Array, "3"]:
+        start, end = self.scene.start, self.scene.end
+        assert isinstance(start, Held)
+        assert isinstance(end, Held)
+        return end.position - start.position
+
+    def linearized(self, point: FramePoint) -> Linearization:
+        return self._with_cells(point) if self.has_potential else self.with_all(point)
+
+    def _with_cells(self, point: FramePoint) -> Linearization:
+        """By two derivatives of each cell."""
+        field = self.field
+        frames = of_cells(field, point.quaternions)
+        loads = unstacked(self.loads)
+        p, n = field.lengths.shape
+        closures = self._closures
+
+        def energies(rotations: tuple[Vector, ...], force: Vector) -> Float[Array, ""]:
+            forces = tuple(tuple(f + load for f, load in zip(force, at, strict=True)) for at in loads)
+            return jnp.sum(self._by_cells(frames, rotations, forces))
+
+        nothing = jax.tree.map(jnp.zeros_like, tuple(frame[1:] for frame in frames))
+        x, y, z = (jnp.broadcast_to(component, (n,)) for component in point.end_force)
+        force = (x, y, z)
+        value = energies(nothing, force)
+        first, by_all = jax.linearize(jax.grad(energies, argnums=(0, 1) if closures else (0,)), nothing, force)
+        # Each rotation of each frame changed in all cells at once, then each component of the force.
+        unknowns = 3 * p + closures
+        directions = jnp.broadcast_to(jnp.eye(unknowns, dtype=value.dtype)[..., None], (unknowns, unknowns, n))
+        of_frames = tuple(tuple(directions[:, 3 * k + a] for a in range(3)) for k in range(p))
+        of_force = tuple(directions[:, 3 * p + a] if closures else jnp.zeros_like(directions[:, 0]) for a in range(3))
+        second = jax.vmap(by_all)(of_frames, of_force)
+        # [i, a, j, b]: by component a of the rotation of frame i, and b of frame j.
+        by_rotation = jnp.stack([jnp.stack(frame, axis=1) for frame in second[0]], axis=1)
+        blocks = by_rotation[: 3 * p].reshape(p, 3, p, 3, n)
+        diagonal, lower, across = field.couplings(blocks)
+        free = self.is_free
+        gradient = field.assembled(stacked(first[0])) * free
+        diagonal = diagonal * free[:, None] * free[None] + jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
+        lower = lower * free[:, None, 1:] * free[None, :, :-1]
+        if across is not None:
+            across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
+        closure, border = jnp.zeros(0, value.dtype), jnp.zeros((3, 0, free.shape[1]), value.dtype)
+        compliance = jnp.zeros((0, 0), value.dtype)
+        if closures:
+            value += jnp.sum(point.end_force * self._span)
+            closure = self._span + jnp.stack([jnp.sum(component) for component in first[1]])
+            by_force = by_rotation[3 * p :].transpose(2, 0, 1, 3)  # [a, component of the force, i]
+            border = field.assembled(by_force) * free[:, None]
+            compliance = -jnp.stack([jnp.sum(component[3 * p :], axis=1) for component in second[1]])
+        return Linearization(
+            bases=self.bases_at(point),
+            gradient=gradient,
+            closure=closure,
+            system=SaddlePointSystem(diagonal, lower, border, compliance, across=across),
+            energy=value,
+            residual=self._residual(gradient),
+        )
+
+    def with_all(self, point: FramePoint) -> Linearization:
+        """By one derivative of all that is out of balance, by all rotations."""
+        q = point.quaternions
+        gradient, closure = self._unbalanced(q, point.end_force)
+        free = self.is_free
+
+        def residual(unknowns: Float[Array, "3m+c"]) -> Float[Array, "3m+c"]:
+            rotation = unknowns[: free.size].reshape(free.shape)
+            force = point.end_force + self.force_change(unknowns[free.size :])
+            gradient, closure = self._unbalanced(turned(q, rotation * free), force)
+            return jnp.concatenate([gradient.reshape(-1), closure])
+
+        unknowns = jnp.zeros(free.size + len(closure), gradient.dtype)
+        matrix = jax.jacfwd(residual)(unknowns)
+        held = jnp.concatenate([1 - free.reshape(-1), jnp.zeros_like(closure)])
+        return Linearization(
+            bases=self.bases_at(point),
+            gradient=gradient,
+            closure=closure,
+            system=DenseSystem(matrix + jnp.diag(held), (3, free.shape[1])),
+            energy=self.elastic_energy(point),
+            residual=self._residual(gradient),
+        )
+
+    def _residual(self, gradient: Float[Array, "3 m"]) -> Float[Array, ""]:
+        """Largest component of the moment left at a frame, per length of rod."""
+        return jnp.max(jnp.abs(gradient) / self.field.weights[None])
+
+    def regular(self, system: SaddlePointSystem | DenseSystem) -> SaddlePointSystem | DenseSystem:
+        """The system of a linearisation, neutral modes held."""
+        m = len(self.field.places)
+        return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))
+
+    def under_force(
+        self, point: FramePoint, bases: Float[Array, "3 3 m"], rotation: Float[Array, "3 m"], change: Float[Array, "3"]
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        """With another end force: what the rod lacks of its span and the rate of that as the frames begin to turn;
+        by how much L differs, and by how much the rate of L does.
+        """
+        if not self._closures:
+            nothing = jnp.zeros(0, change.dtype)
+            return nothing, nothing, jnp.zeros_like(change[0]), jnp.zeros_like(change[0])
+        frames = of_cells(self.field, point.quaternions)
+        turning = unstacked(self.field.of_cells(rotation))
+
+        def parts(amount: Float[Array, ""], force: Float[Array, "3"]) -> tuple[Array, Array]:
+            def value(force):
+                forces = unstacked(force[:, None, None] + self.loads)
+                cells = self._by_cells(frames, jax.tree.map(lambda x: amount * x, turning), forces)
+                return jnp.sum(cells) + force @ self._span
+
+            return jax.value_and_grad(value)(force)
+
+        def rates(force: Float[Array, "3"]):
+            zero = jnp.zeros_like(change[0])
+            return jax.jvp(lambda amount: parts(amount, force), (zero,), (jnp.ones_like(zero),))
+
+        (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
+        (before, _), (rate_before, _) = rates(point.end_force)
+        return closure, closure_rate, energy - before, rate - rate_before
+
+    def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
+        """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
+        largest = jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
+        stiffest = jnp.maximum(jnp.max(self.sections.EI), jnp.max(self.sections.GJ))
+        eps = jnp.finfo(largest.dtype).eps
+        return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * jnp.maximum(stiffest, 1.0) / self.field.finest**2)
+
+
+def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:
+    return unstacked(cells.of_cells(quaternions))
+
+
+def unstacked(by_cell: Float[Array, "c p n"]) -> tuple[Any, ...]:
+    """By the frames of a cell, then by component."""
+    return tuple(tuple(jnp.unstack(by_cell[:, k])) for k in range(by_cell.shape[1]))
+
+
+def stacked(by_frame: tuple[Any, ...]) -> Float[Array, "c p n"]:
+    return jnp.stack([jnp.stack(components) for components in by_frame], axis=1)
+
+
+def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, Float[Array, "3 n"] | None]:
+    """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
+    rest = scene.rod.rest_shape
+    if rest is None:
+        return None, None
+    # At the nodes and between them, so that both are at hand: of finite differences the frames of the inner nodes are
+    # left out.
+    nodes = cells.s
+    middles = (nodes[:-1] + nodes[1:]) / 2
+    poses = rest.poses(interleaved(nodes, middles))
+    is_joints = isinstance(cells, JointCells)
+    q = poses.quaternions
+    frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
+    strains = stacked(cells.strains(of_cells(cells, frames)))
+    ways = cells.lengths[None] * tangent(cells.of_cells(frames))
+    missing = jnp.diff(poses.positions[:, ::2], axis=1) - cells.ways(ways, jnp.zeros_like(ways[:, 0]))
+    return strains, cells.rest_of(rotated(inverse(q[:, 1::2]), missing))
+
+
+def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
+    """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
+    starts_held = isinstance(scene.start, Held)
+    s = cells.strain_places
+    forces = jnp.zeros((3, *s.shape), s.dtype)
+    if scene.gravity is not None:
+        mass = scene.rod.mass_per_length
+        before = mass.integral(s) if isinstance(mass, Along) else s
+        forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
+    for load in scene.distributed:
+        if isinstance(load, DistributedForce) and not load.follower:
+            forces += load.force[:, None, None] * (1.0 - s if starts_held else -s)[None]
+    for load in scene.point_forces:
+        before = cells.parts_before(load.at)
+        forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
+    for end, sign in ((scene.start, -1), (scene.end, 1)):
+        if isinstance(end, Free) and end.force is not None and not end.follower:
+            forces += sign * end.force[:, None, None]
+    return forces

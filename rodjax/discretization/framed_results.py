@@ -1,0 +1,322 @@
+"""What an equilibrium by frames says at its nodes and ends and between them, and how far it is from the continuum."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.cells import ElementCells, JointCells
+from rodjax.discretization.error import COUPLE_REACH, STEPS, TURN_REACH, Errors
+from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.results import Resultants
+from rodjax.energy import Sections
+from rodjax.guess import cubic
+from rodjax.linalg import factor_and_solve
+from rodjax.rotations import columns, inverse, product, rotated, tangent
+from rodjax.supports import Directed, Free, Held
+from rodjax.vectors import cross, dot, root
+
+
+class NodeStrains(eqx.Module):
+    """At the nodes: section moment (global axes), curvature along d1 and d2, twist, axial strain and tension."""
+
+    moments: Float[Array, "3 n+1"]
+    strains: Float[Array, "3 n+1"]
+    axial: Float[Array, "n+1"]
+    tension: Float[Array, "n+1"]
+
+
+def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
+    scene = form.scene
+    is_joints = isinstance(form.field, JointCells)
+    at_nodes = _on_joints(form, point) if is_joints else _on_elements(form, point)
+    frames = columns(node_quaternions(form, point))
+    forces = form.end_forces(point)
+    moments = [
+        _end_moment(end, frames[..., k], at_nodes.moments[:, k], sign)
+        for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1))
+    ]
+    return Resultants(
+        frames=jnp.moveaxis(frames, 2, 0),
+        curvature=root(dot(at_nodes.strains[:2], at_nodes.strains[:2])),
+        twist=at_nodes.strains[2],
+        tension=at_nodes.tension,
+        axial_strain=at_nodes.axial,
+        start_force=forces[0],
+        start_moment=moments[0],
+        end_force=forces[1],
+        end_moment=moments[1],
+    )
+
+
+def node_quaternions(form: FrameForm, point: FramePoint) -> Float[Array, "4 n+1"]:
+    q = point.quaternions
+    if isinstance(form.field, ElementCells):
+        return q[:, ::2]
+    inner = q[:, 1:-2] + q[:, 2:-1]
+    inner /= jnp.sqrt(dot(inner, inner))[None]
+    return jnp.concatenate([q[:, :1], inner, q[:, -1:]], axis=1)
+
+
+def _end_moment(end, frame: Float[Array, "3 3"], held: Float[Array, "3"], sign: int) -> Float[Array, "3"]:
+    """The section moment at an end: that which holds it, or the given one."""
+    if isinstance(end, Free):
+        given = jnp.zeros_like(held) if end.moment is None else end.moment
+        return sign * (frame @ given if end.follower else given)
+    if isinstance(end, Directed):
+        return held
+    return jnp.zeros_like(held)
+
+
+def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
+    """By frames of cells, global axes: at the last one the section moment, at the first the reverse."""
+    q = point.quaternions
+    by_cells = form.by_rotations(q, point.end_force)
+    couples = form.couples_in_cells(q)
+    if couples is not None:
+        by_cells -= couples
+    return rotated(form.field.of_cells(q), by_cells)
+
+
+def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
+    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too."""
+    field = form.field
+    own = own_moments(form, point)
+    moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
+    q = node_quaternions(form, point)
+    forces = form.forces(point.quaternions, point.end_force)
+    first, last = forces[:, 0], forces[:, 2]
+    # On the side of the element beyond, at the end of the one before.
+    beyond = jnp.concatenate([first, last[:, -1:]], axis=1)
+    tension = dot(beyond, tangent(q))
+    a, b = field.s[:-1], field.s[1:]
+    sections = jax.tree.map(
+        lambda leaf: jnp.concatenate([leaf[..., 0, :], leaf[..., 2, -1:]], axis=-1), _arrays(form.sections)
+    )
+    sections = eqx.combine(sections, form.sections)
+    strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
+    rest = form.scene.rod.rest_shape
+    if rest is not None:
+        last_cell = jnp.concatenate([a, a[-1:]]), jnp.concatenate([b, b[-1:]])
+        strains += rest.at(field.s, *last_cell)
+    mean = jnp.concatenate([first[:, :1], (first[:, 1:] + last[:, :-1]) / 2, last[:, -1:]], axis=1)
+    return NodeStrains(moments, strains, axial, dot(mean, tangent(q)))
+
+
+def _arrays(sections: Sections) -> Sections:
+    """Without the law, whose numbers do not vary along the rod."""
+    return eqx.tree_at(lambda sections: sections.law, sections, None, is_leaf=lambda x: x is None)
+
+
+def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
+    """Of the joints at the inner nodes; at the ends by moment and force."""
+    q = point.quaternions
+    own = own_moments(form, point)
+    moments = jnp.concatenate([-own[:, 0, :1], own[:, 1]], axis=1)
+    ends = [
+        _strains_at_end(form, point, moments[:, k], force, k)
+        for k, force in zip((0, -1), form.end_forces(point), strict=True)
+    ]
+    here, strains = form.strained(point), form.strains(q)
+
+    def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
+        return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)
+
+    parts = ((strains[..., 1:-1], here.axial[:, 1:-1], here.tension[:, 1:-1])[k] for k in range(3))
+    return NodeStrains(moments, *(between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)))
+
+
+def _strains_at_end(
+    form: FrameForm, point: FramePoint, moment: Float[Array, "3"], force: Float[Array, "3"], k: int
+) -> tuple[Float[Array, "3 1"], Float[Array, "1"], Float[Array, "1"]]:
+    """Strains, axial strain and tension at the first or last node."""
+    q = point.quaternions[:, k, None]
+    sections = eqx.combine(jax.tree.map(lambda leaf: leaf[..., k, k, None], _arrays(form.sections)), form.sections)
+    tension = dot(force[:, None], tangent(q))
+    strains, axial = strains_under(sections, rotated(inverse(q), moment[:, None]), tension)
+    rest = form.scene.rod.rest_shape
+    if rest is not None:
+        s = form.field.s
+        strains += rest.at(s[k, None], s[[0, -2][k], None], s[[1, -1][k], None])
+    return strains, axial, tension
+
+
+def strains_under(
+    sections: Sections, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
+) -> tuple[Float[Array, "3 *k"], Float[Array, "*k"]]:
+    """What the strains exceed those at rest by, under a moment in material axes, and the axial strain."""
+    stiffness = jnp.concatenate([sections.EI, sections.GJ[None]])
+    strains = moment / stiffness
+    if sections.law is None:
+        return strains, sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+
+    def improved(strains: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+        def enthalpy(strains):
+            axial = sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+            return jnp.sum(sections.density((strains[0], strains[1]), strains[2], axial) - tension * (1 + axial))
+
+        first, by_all = jax.linearize(jax.grad(enthalpy), strains)
+        directions = jnp.eye(3, dtype=strains.dtype).reshape(3, 3, *[1] * tension.ndim) * jnp.ones_like(strains)[None]
+        second = jax.vmap(by_all)(directions)
+        moved = jnp.linalg.solve(jnp.moveaxis(second, (0, 1), (-1, -2)), jnp.moveaxis(moment - first, 0, -1)[..., None])
+        return strains + jnp.moveaxis(moved[..., 0], -1, 0)
+
+    for _ in range(LAW_STEPS):
+        strains = improved(strains)
+    return strains, sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+
+
+# Steps of Newton's method for the strains under a moment where there is a law.
+LAW_STEPS = 6
+
+
+def positions_between_frames(
+    form: FrameForm, point: FramePoint, nodes: Float[Array, "n+1 3"], s: Float[Array, "k"]
+) -> Float[Array, "k 3"]:
+    """The centerline at arclengths between the nodes: by cubics through positions and slopes, of elements also in the
+    middle, where a parabola through the slopes leads.
+    """
+    field, q = form.field, point.quaternions
+    here = form.strained(point)
+    slopes = (1 + here.axial)[None] * here.tangents
+    if not isinstance(field, ElementCells):
+        t = tangent(node_quaternions(form, point))
+        return cubic(field.s, nodes, t.T, s)
+    a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
+    ways = field.h[None] * (5 * a + 8 * b - c) / 24
+    if form.rest_ways is not None:
+        ways += rotated(q[:, 1::2], form.rest_ways) / 2
+    middles = nodes[:-1] + ways.T
+    places = jnp.stack([field.s[:-1], (field.s[:-1] + field.s[1:]) / 2], axis=1).reshape(-1)
+    points = jnp.stack([nodes[:-1], middles], axis=1).reshape(-1, 3)
+    bends = jnp.stack([a.T, b.T], axis=1).reshape(-1, 3)
+    return cubic(
+        jnp.concatenate([places, field.s[-1:]]),
+        jnp.concatenate([points, nodes[-1:]]),
+        jnp.concatenate([bends, c.T[-1:]]),
+        s,
+    )
+
+
+# --- the error of the mesh -------------------------------------------------------------------------------------------
+
+
+class Pose(eqx.Module):
+    """What is integrated along each element: way from its first node, frame, and section moment, global axes."""
+
+    way: Float[Array, "3 n"]
+    quaternion: Float[Array, "4 n"]
+    moment: Float[Array, "3 n"]
+
+
+def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
+    """As `error.errors_of_elements`: what the elements lack enters as strains at rest, couples and ways at rest."""
+    field, q = form.field, point.quaternions
+    if not isinstance(field, ElementCells):
+        return _errors_of_joints(form, point)
+    moments = _on_elements(form, point).moments
+    nodes = q[:, ::2]
+    first = Pose(jnp.zeros_like(moments[:, 1:]), nodes[:, :-1], moments[:, :-1])
+    last = _integrated(form, field, point, first)
+
+    turn = product(last.quaternion, inverse(nodes[:, 1:]))
+    turn = 2 * jnp.where(turn[0] < 0, -1.0, 1.0).astype(q.dtype)[None] * turn[1:]  # small
+    edges = form.edges(point).T
+    middles = q[:, 1::2]
+    force = form.forces(q, point.end_force)[:, 1]
+    gap = last.way - edges - field.h[None] / 2 * cross(turn, tangent(middles))
+    couple = last.moment - moments[:, 1:] + cross(last.way - edges, force)
+
+    strains = jnp.broadcast_to((rotated(inverse(middles), turn) / field.h[None])[:, None], form.loads.shape)
+    ways = rotated(inverse(middles), gap)
+    at_rest = [jnp.zeros_like(x) if y is None else y for x, y in ((strains, form.rest_strains), (ways, form.rest_ways))]
+
+    def unbalanced(strains: Float[Array, "3 k n"], ways: Float[Array, "3 n"]):
+        lacking = eqx.tree_at(
+            lambda form: (form.rest_strains, form.rest_ways), form, (strains, ways), is_leaf=lambda x: x is None
+        )
+        return lacking.unbalanced(point)
+
+    _, (gradient, closure) = jax.jvp(unbalanced, tuple(at_rest), (strains, ways))
+    gradient += jnp.zeros_like(gradient).at[:, 2::2].set(rotated(inverse(nodes[:, 1:]), couple)) * form.is_free
+    here = form.linearized(point)
+    _, rotation, multipliers = factor_and_solve(form.regular(here.system), -gradient, -closure)
+
+    def reached(amount):
+        lacking = eqx.tree_at(
+            lambda form: (form.rest_strains, form.rest_ways),
+            form,
+            (at_rest[0] + amount * strains, at_rest[1] + amount * ways),
+            is_leaf=lambda x: x is None,
+        )
+        change = amount * form.force_change(form.closure(multipliers))
+        return lacking.edges(form.moved(point, here.bases, amount * rotation, change)).T
+
+    zero = jnp.zeros((), q.dtype)
+    _, changes = jax.jvp(reached, (zero,), (jnp.ones_like(zero),))
+    sums = jnp.concatenate([jnp.zeros_like(changes[:, :1]), jnp.cumsum(changes, axis=1)], axis=1)
+    displacements = sums if isinstance(form.scene.start, Held) else sums - sums[:, -1:]
+    sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
+    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH)
+
+
+def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: Pose) -> Pose:
+    """The sections at the ends of the elements, by the rule of Runge and Kutta."""
+    h = field.h
+    # Between the three points of an element, all along the rod that varies is a parabola; so are forces.
+    forces = form.forces(point.quaternions, point.end_force)
+    sections = form.sections
+    rest = form.scene.rod.rest_shape
+    couples = form.couples_in_cells(point.quaternions)
+    if couples is not None:
+        couples = rotated(field.of_cells(point.quaternions), couples) / field.lengths[None]
+
+    def parabola(x: Float[Array, ""], by_point: Float[Array, "... 3 n"]) -> Float[Array, "... n"]:
+        weights = ((1 - x) * (1 - 2 * x), 4 * x * (1 - x), x * (2 * x - 1))
+        return sum(
+            (weight * by_point[..., k, :] for k, weight in enumerate(weights)), jnp.zeros_like(by_point[..., 0, :])
+        )
+
+    def slope(pose: Pose, x: Float[Array, ""]) -> Pose:
+        q = pose.quaternion / jnp.sqrt(dot(pose.quaternion, pose.quaternion))[None]
+        t = tangent(q)
+        force = parabola(x, forces)
+        here = jax.tree.map(lambda leaf: parabola(x, leaf), _arrays(sections))
+        here = eqx.combine(here, sections)
+        strains, axial = strains_under(here, rotated(inverse(q), pose.moment), dot(force, t))
+        if rest is not None:
+            strains += rest.at(field.s[:-1] + x * h, field.s[:-1], field.s[1:])
+        rate = product(q, jnp.concatenate([jnp.zeros_like(t[:1]), strains])) / 2
+        way = (1 + axial)[None] * t
+        moment = -cross(way, force)
+        if couples is not None:
+            moment -= parabola(x, couples)
+        return Pose(way, rate, moment)
+
+    def ahead(pose: Pose, slope: Pose, part: float) -> Pose:
+        return jax.tree.map(lambda value, change: value + (part * h / STEPS)[None] * change, pose, slope)
+
+    def advanced(pose: Pose, k: Float[Array, ""]) -> tuple[Pose, None]:
+        x = k / STEPS
+        a = slope(pose, x)
+        b = slope(ahead(pose, a, 0.5), x + 0.5 / STEPS)
+        c = slope(ahead(pose, b, 0.5), x + 0.5 / STEPS)
+        d = slope(ahead(pose, c, 1.0), x + 1 / STEPS)
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, a, b, c, d)
+        return ahead(pose, mean, 1.0), None
+
+    last, _ = jax.lax.scan(advanced, first, jnp.arange(STEPS, dtype=h.dtype))
+    return last
+
+
+def _errors_of_joints(form: FrameForm, point: FramePoint) -> Errors:
+    """The way to the elements between the same nodes by one step of Newton's method."""
+    field, scene = form.field, form.scene
+    elements = FrameForm.of(scene, ElementCells(field.s))
+    nodes = node_quaternions(form, point)
+    q = jnp.stack([nodes[:, :-1], point.quaternions[:, 1:-1]], axis=2).reshape(4, -1)
+    begin = FramePoint(jnp.concatenate([q, nodes[:, -1:]], axis=1), point.end_force, point.total_twist)
+    here = elements.linearized(begin)
+    _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
+    end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
+    return Errors(elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)), None)

@@ -1,0 +1,155 @@
+"""Rotations as unit quaternions (w, x, y, z), components first: (4, *k) for a row of them.
+
+A frame with columns (d1, d2, t) is the rotation that takes the global axes to these.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.vectors import cross, dot
+
+# Angles below this have series for functions of them.
+SMALL = 1e-2
+
+# Components one by one, each an array along the rod. Derivatives of slices and stacks make large programs; where these
+# are taken, functions that stay with components make small ones.
+Vector = tuple[Array, Array, Array]
+Quaternion = tuple[Array, Array, Array, Array]
+
+
+def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function of tuples of components also as one of arrays with the components first."""
+
+    @functools.wraps(function)
+    def either(*values: Any) -> Any:
+        if isinstance(values[0], tuple):
+            return function(*values)
+        return jnp.stack(function(*(tuple(value) for value in values)))
+
+    return either
+
+
+def inner(a: Vector, b: Vector) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def outer(a: Vector, b: Vector) -> Vector:
+    """a x b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@by_components
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """First b, then a; or a, then b in the axes of a."""
+    (p, *u), (q, *v) = a, b
+    x, y, z = outer((u[0], u[1], u[2]), (v[0], v[1], v[2]))
+    w = p * q - u[0] * v[0] - u[1] * v[1] - u[2] * v[2]
+    return w, p * v[0] + q * u[0] + x, p * v[1] + q * u[1] + y, p * v[2] + q * u[2] + z
+
+
+@by_components
+def inverse(q: Quaternion) -> Quaternion:
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@by_components
+def tangent(q: Quaternion) -> Vector:
+    """The third column."""
+    w, x, y, z = q
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+
+
+@by_components
+def rotated(q: Quaternion, vector: Vector) -> Vector:
+    w, *u = q
+    axis = (u[0], u[1], u[2])
+    a, b, c = outer(axis, vector)
+    a, b, c = 2 * a, 2 * b, 2 * c
+    x, y, z = outer(axis, (a, b, c))
+    return vector[0] + w * a + x, vector[1] + w * b + y, vector[2] + w * c + z
+
+
+@by_components
+def turned(q: Quaternion, rotation: Vector) -> Quaternion:
+    """Turned on by a vector in its own axes, 2 tan(angle/2) about the axis: to second order the rotation vector."""
+    size = 1 / jnp.sqrt(1 + inner(rotation, rotation) / 4)
+    half = size / 2
+    small = (size, half * rotation[0], half * rotation[1], half * rotation[2])
+    return product(q, small)
+
+
+def columns(q: Float[Array, "4 *k"]) -> Float[Array, "3 3 *k"]:
+    """The rotation matrices: [i, j] is component i of director j."""
+    w, x, y, z = q
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def spun(q: Float[Array, "4 *k"], angle: Float[Array, "*k"]) -> Float[Array, "4 *k"]:
+    """Turned about its tangent."""
+    cosine, sine = jnp.cos(angle / 2), jnp.sin(angle / 2)
+    w, x, y, z = q
+    return jnp.stack([w * cosine - z * sine, x * cosine + y * sine, y * cosine - x * sine, z * cosine + w * sine])
+
+
+def swung(q: Float[Array, "4 *k"], new: Float[Array, "3 *k"]) -> Float[Array, "4 *k"]:
+    """Turned by the smallest rotation that takes the tangent to a new one, not opposite to it."""
+    old = tangent(q)
+    swing = jnp.concatenate([1 + dot(old, new)[None], cross(old, new)])
+    return unit(product(unit(swing), q))
+
+
+def unit(q: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
+    """The same direction at the length 1."""
+    return q / jnp.sqrt(dot(q, q))[None]
+
+
+def from_frame(frame: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """Of the two quaternions of a rotation matrix either."""
+    trace = frame[0, 0] + frame[1, 1] + frame[2, 2]
+    squares = jnp.stack([1 + trace, *(1 - trace + 2 * frame[k, k] for k in range(3))])  # four times those of w, x, y, z
+    antisymmetric = [frame[2, 1] - frame[1, 2], frame[0, 2] - frame[2, 0], frame[1, 0] - frame[0, 1]]
+    symmetric = [frame[0, 1] + frame[1, 0], frame[0, 2] + frame[2, 0], frame[1, 2] + frame[2, 1]]
+    w, x, y, z = squares
+    products = jnp.stack(
+        [
+            jnp.stack([w, *antisymmetric]),
+            jnp.stack([antisymmetric[0], x, symmetric[0], symmetric[1]]),
+            jnp.stack([antisymmetric[1], symmetric[0], y, symmetric[2]]),
+            jnp.stack([antisymmetric[2], symmetric[1], symmetric[2], z]),
+        ]
+    )
+    # The row of the largest component loses no digits.
+    row = products[jnp.argmax(squares)]
+    return row / jnp.sqrt(jnp.sum(row**2))
+
+
+def nearer(q: Float[Array, "4 *k"], other: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
+    """The one of the two quaternions of a rotation that is nearer to another."""
+    return jnp.where(dot(q, other)[None] < 0, -q, q)
+
+
+def screw(
+    rotation: Float[Array, "3 *k"], translation: Float[Array, "3 *k"]
+) -> tuple[Float[Array, "4 *k"], Float[Array, "3 *k"]]:
+    """What a unit of time makes of a motion with this constant rate of turn and velocity, both in its own axes."""
+    squared = dot(rotation, rotation)
+    is_small = squared < SMALL**2
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    half = jnp.where(is_small, 0.5 - squared / 48 + squared**2 / 3840, jnp.sin(angle / 2) / angle)
+    cosine = jnp.where(is_small, 1 - squared / 8 + squared**2 / 384, jnp.cos(angle / 2))
+    first = 2 * half**2  # (1 - cos)/angle^2
+    series = 1 / 6 - squared / 120 + squared**2 / 5040
+    second = jnp.where(is_small, series, (angle - jnp.sin(angle)) / angle**3)
+    across = cross(rotation, translation)
+    way = translation + first[None] * across + second[None] * cross(rotation, across)
+    return jnp.concatenate([cosine[None], half[None] * rotation]), way

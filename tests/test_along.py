@@ -1,0 +1,105 @@
+"""What varies along a rod, and rods made of it."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax.along import Spline
+from rodjax.rod import torsion_constant
+
+
+def test_a_spline_reproduces_cubics():
+    """Values, and integrals of fourth degree: to rounding."""
+    knots = np.array([0.0, 0.3, 0.5, 1.1, 2.0])
+    values = np.stack([knots**3 - knots, 2 + knots**2], axis=1)
+    spline = Spline.through(jnp.asarray(knots), jnp.asarray(values))
+    x = np.linspace(0, 2, 21)
+    np.testing.assert_allclose(spline.at(jnp.asarray(x)), [x**3 - x, 2 + x**2], rtol=0, atol=1e-13)
+    expected = [x**4 / 4 - x**2 / 2, 2 * x + x**3 / 3]
+    np.testing.assert_allclose(spline.integral(jnp.asarray(x)), expected, rtol=0, atol=1e-13)
+
+
+def test_steps_have_the_mean_of_a_stretch():
+    steps = rj.Steps([0.4, 0.5], [1.0, 3.0, 2.0])
+    a, b = jnp.array([0.0, 0.3, 0.4, 0.6]), jnp.array([0.2, 0.5, 0.5, 1.0])
+    np.testing.assert_allclose(steps.mean(a, b), [1, 2, 3, 2], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: rj.Steps([0.5, 0.4], [1, 2, 3]), "jumps must increase"),
+        (lambda: rj.Steps([0.5], [1, 2, 3]), "values must be one more than jumps"),
+        (lambda: rj.Smooth([0, 1], [1, 2, 3]), "values must be as many as s"),
+        (lambda: rj.Rod(1.0, rj.Steps([1.5], [1, 2]), 1, 1), r"EI.jumps must lie inside 0 to 1 m"),
+        (lambda: rj.Rod(1.0, 1, rj.Smooth([0, 0.5], [1, 2]), 1), r"GJ.s must run from 0 to 1 m"),
+        (lambda: rj.Rod(1.0, rj.Steps([0.5], [1, -2]), 1, 1), "EI must be positive"),
+        (lambda: rj.Rod(1.0, rj.Smooth([0, 0.4, 0.5, 1], [1, 0.001, 1, 1]), 1, 1), "EI must be positive"),
+        (lambda: rj.Rod(1.0, (1, 2, 3), 1, 1), "EI must be one or a pair"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, rest_curvature=3.0), "rest_curvature must be a pair"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, law=3), "law must be a Law"),
+        (lambda: rj.Rod.from_centerline([[0, 0, 0], [1, 0, 0]], 1, 1, 1), "points must have the shape"),
+        (lambda: rj.Rod.from_centerline([[0, 0, 0]] * 5, 1, 1, 1), "points must not repeat"),
+        (lambda: rj.Rod.bundle(1.0, 7, 1e-3, 1e9, poisson_ratio=0.3, stick=2), "stick must lie in 0"),
+        (lambda: rj.Rod.layered(1.0, [0, 1e-3], [1e9, 1e9], poisson_ratios=[0.3]), "radii must be one more"),
+        (lambda: rj.Rod.rectangular(1.0, 0, 1e-3, 1e9, poisson_ratio=0.3), "width must be positive"),
+        (lambda: rj.DistributedForce((0, 0, 1), follower=1), "follower must be a bool"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()
+
+
+def test_the_torsion_constant_of_rectangles():
+    """Timoshenko & Goodier, table of sec. 109: of a square 0.1406, of 2 to 1 0.229; J/(long short^3)."""
+    assert float(torsion_constant(1.0, 1.0)) == pytest.approx(0.1405770, abs=1e-7)
+    assert float(torsion_constant(1.0, 2.0)) / 2 == pytest.approx(0.2286817, abs=1e-7)
+    strip = rj.Rod.rectangular(1.0, width=3.0, height=1.0, youngs_modulus=12.0, shear_modulus=1.0)
+    np.testing.assert_allclose(strip.EI, [3.0, 27.0], rtol=1e-14)
+
+
+def test_a_bundle_between_slip_and_stick():
+    """Seven wires: six at the distance of two radii, E A (2 r)^2 6/2 = 48 E I on top of 7 E I."""
+    slip, stick = (rj.Rod.bundle(1.0, 7, 1e-3, 1e9, poisson_ratio=0.3, stick=x) for x in (0, 1))
+    wire = rj.Rod.circular(1.0, 1e-3, 1e9, poisson_ratio=0.3)
+    np.testing.assert_allclose([slip.EI, slip.GJ, slip.EA], 7 * np.array([wire.EI, wire.GJ, wire.EA]), rtol=1e-14)
+    assert float(stick.EI / wire.EI) == pytest.approx(55, rel=1e-12)
+    assert float(stick.GJ / wire.GJ) == pytest.approx(55, rel=1e-12)
+    assert float(stick.radius) == pytest.approx(3e-3, rel=1e-12)
+
+
+def test_equal_layers_are_one_rod():
+    layers = rj.Rod.layered(1.0, [0, 1e-3, 2e-3], [1e9, 1e9], poisson_ratios=[0.3, 0.3], densities=[1e3, 1e3])
+    rod = rj.Rod.circular(1.0, 2e-3, 1e9, poisson_ratio=0.3, density=1e3)
+    for name in ("EI", "GJ", "EA", "mass_per_length", "radius"):
+        assert float(getattr(layers, name)) == pytest.approx(float(getattr(rod, name)), rel=1e-13)
+
+
+def test_the_ends_of_a_helix_at_rest():
+    """Of constant curvature and twist, the pose at the end is that of a helix: to rounding."""
+    curvature, twist, length = 3.0, 2.0, 1.7
+    rate = math.hypot(curvature, twist)
+    rod = rj.Rod(length, 1, 1, 1, rest_curvature=(curvature, 0), rest_twist=twist)
+    _, (position, frame) = rod.rest_ends()
+    axis = np.array([curvature, 0, twist]) / rate
+    np.testing.assert_allclose(frame, rj.rotate(np.eye(3), rate * length * axis), rtol=0, atol=1e-13)
+    along = axis[2] * axis
+    across = np.array([0, 0, 1]) - along
+    turned = math.sin(rate * length) * across + (1 - math.cos(rate * length)) * np.cross(axis, [0, 0, 1])
+    np.testing.assert_allclose(position, along * length + turned / rate, rtol=0, atol=1e-13)
+
+
+def test_a_curve_through_points_has_their_curvature():
+    """A circle of radius 2: a cubic spline through 60 points has its curvature to 1e-3 but near its ends."""
+    angle = np.linspace(0, 1.5, 61)
+    points = np.stack([2 * np.cos(angle), 2 * np.sin(angle), 0 * angle], axis=1)
+    rod = rj.Rod.from_centerline(points, 1, 1, 1, d2=(0, 0, 1))
+    assert float(rod.length) == pytest.approx(3.0, abs=1e-6)
+    s = jnp.linspace(0.2, 0.8, 9)
+    strains = rod.rest_shape.at(s, s, s) / float(rod.length)
+    np.testing.assert_allclose(strains[1], np.full(9, 0.5), rtol=1e-3)
+    np.testing.assert_allclose(strains[::2], np.zeros((2, 9)), rtol=0, atol=1e-10)

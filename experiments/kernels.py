@@ -31,7 +31,6 @@ from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.joints import (
     Joints,
     bending_derivatives,
-    dot,
     joints,
     tangent_bases,
     twist_derivatives,
@@ -47,6 +46,7 @@ from rodjax.result import Found, SolverState, equilibrium
 from rodjax.scene import nondimensional
 from rodjax.status import Outcome
 from rodjax.strain import swept_angle
+from rodjax.vectors import dot
 
 LOOPS = 300
 NUDGE = 1e-30

@@ -22,7 +22,8 @@ from measuring import conditions, set_up
 
 import rodjax
 from rodjax import Clamp, Equilibrium, Free, Pin, Rod, Scene, Status, Swivel
-from rodjax.discretization.mixed import NEUTRAL
+from rodjax.discretization.form import NEUTRAL
+from rodjax.linalg import SaddlePointSystem
 from rodjax.result import form_and_point, over_leading_axes
 
 KINDS: dict[str, Callable] = {
@@ -185,6 +186,7 @@ def _dense(equilibrium: Equilibrium) -> tuple[jax.Array, jax.Array]:
     """
     form, point = form_and_point(equilibrium)
     system = form.linearized(point).system
+    assert isinstance(system, SaddlePointSystem)
     b, k, m = system.border.shape
     columns = jnp.eye(b * m + k)
     f, c = jax.vmap(lambda x: system.times(x[: b * m].reshape(b, m), x[b * m :]))(columns)

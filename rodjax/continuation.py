@@ -101,8 +101,7 @@ def follow(
         they change the index, or the direction of the parameter.
     - `max_points`: the most equilibria.
 
-    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for a dead moment on a free
-    end, which has no energy.
+    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential.
     Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).
     """
     stacked = _checked(scenes, "follow")
@@ -282,7 +281,10 @@ def _checked(scenes: Any, name: str) -> Scene:
     if count < 2:
         raise ValueError(f"scenes must be at least two, between which the parameter runs, got {count}")
     if not has_potential(stacked):
-        raise ValueError("scenes must have a potential: a dead moment on a free end has none")
+        raise ValueError(
+            "scenes must have a potential: dead moments on a free end, couples along the rod and follower loads "
+            "have none"
+        )
     return stacked
 
 

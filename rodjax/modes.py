@@ -16,6 +16,7 @@ from rodjax.linalg import DenseSystem
 from rodjax.result import Equilibrium, form_and_point, over_leading_axes
 from rodjax.scene import nondimensional
 from rodjax.stability import Motion, softest
+from rodjax.status import Status
 from rodjax.units import Units
 
 
@@ -35,11 +36,11 @@ class Mode(eqx.Module):
 def lowest_mode(equilibrium: Equilibrium) -> Mode:
     """The lowest eigenvalue of the energy's second variation at an equilibrium under its supports, and its motion.
 
-    Motions out of a plane in which the rod lies count too. Sections spin without resistance of inertia, so that the
-    metric is that of the tangents: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n).
+    Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
+    where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n).
 
-    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum or under a dead moment,
-    which has no potential.
+    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum or under loads without a
+    potential.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     if equilibrium.discretization == "continuum":
@@ -69,6 +70,8 @@ def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
     if not mass > 0:
         raise ValueError(f"equilibrium must be of a rod with a mass_per_length, got {mass:g} kg/m")
     flexibility, weights = _flexibility(equilibrium)
+    if not np.all(np.isfinite(flexibility)):
+        raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
     values = np.linalg.eigvals(np.asarray(flexibility) * np.repeat(np.asarray(weights), 3)[None])
     values = values[np.argsort(-np.abs(values))][: whole_number(count, "count", 1, len(values))]
     return float(rod.bending_scale) / (mass * float(rod.length) ** 4) / values.astype(complex)
@@ -80,7 +83,9 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     form, point = form_and_point(equilibrium)
     assert isinstance(form, FrameForm)
     here = form.with_all(point)
-    assert isinstance(here.system, DenseSystem)
+    # A rod that can spin, or turn as a whole, is held softly.
+    system = form.regular(here.system)
+    assert isinstance(system, DenseSystem)
     bases, free = here.bases, here.gradient  # of the shape of the rotations
 
     def nodes(rotation: Float[Array, "3 m"], closure: Float[Array, "c"]) -> Float[Array, "3n"]:
@@ -93,14 +98,17 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
     mass = form.scene.rod.mass_per_length
     before = mass.integral(s) if isinstance(mass, Along) else s
-    return by_all @ jnp.linalg.solve(here.system.matrix, forces.T), jnp.diff(before)
+    return by_all @ jnp.linalg.solve(system.matrix, forces.T), jnp.diff(before)
 
 
 @over_leading_axes
 def _lowest_mode(equilibrium: Equilibrium) -> Mode:
     form, point = form_and_point(equilibrium)
     if not form.has_potential:
-        raise ValueError("equilibrium must have a potential: a dead moment on a free end has none")
+        raise ValueError(
+            "equilibrium must have a potential: dead moments on a free end, couples along the rod and follower loads "
+            "have none"
+        )
     here = form.linearized(point)
     return mode_of(form, point, here, *softest(form, point, here), nondimensional(equilibrium.scene)[1])
 

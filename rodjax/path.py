@@ -99,7 +99,9 @@ def _check_stop(scenes: Scene) -> None:
     if not is_known(scenes):
         raise ValueError("at_critical must be 'jump' inside jax.jit or vmap: how many scenes a path has must be known")
     if not has_potential(scenes):
-        raise ValueError("at_critical must be 'jump' for a dead moment on a free end, which has no potential")
+        raise ValueError(
+            "at_critical must be 'jump' for dead moments, couples and follower loads, which have no potential"
+        )
 
 
 def _before_critical(scenes: Scene, path: Equilibrium) -> int:

@@ -106,6 +106,8 @@ class SpaceCurve(eqx.Module):
         tangents = slopes / _size(slopes)[None]
         if frames is not None:
             given = jnp.asarray(number_array(frames, "frames", (shape[0], 3, 3)))
+            for k, frame in enumerate(given if is_known(given) else ()):
+                rotation(frame, f"frames[{k}]")
             if is_known(given, tangents) and not np.max(np.abs(np.asarray(given[..., 2].T - tangents))) < 0.1:
                 raise ValueError("frames must have the tangents of the curve through points as their third columns")
             d1 = given[..., 0].T

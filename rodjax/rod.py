@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,6 +21,7 @@ from rodjax.checks import (
     number_array,
     number_list,
     positive,
+    shown,
     whole_number,
 )
 from rodjax.rest import RestShape, RestStrain, SpaceCurve, ends
@@ -101,7 +103,6 @@ class Rod(eqx.Module):
         rest_twist: Any = None,
         *,
         law: Law | None = None,
-        _rest_centerline: SpaceCurve | None = None,
     ):
         self.length = leaf(positive(length, "length"))
         self.EI = _pair(EI, "EI", positive) if _is_pair(EI) else _value(EI, "EI", positive)
@@ -113,10 +114,8 @@ class Rod(eqx.Module):
             raise ValueError(f"rest_curvature must be a pair (k1, k2), got {rest_curvature!r}")
         self.rest_curvature = None if rest_curvature is None else _pair(rest_curvature, "rest_curvature", number_array)
         self.rest_twist = None if rest_twist is None else _value(rest_twist, "rest_twist", number_array)
-        self.rest_centerline = _rest_centerline
-        if law is not None:
-            instance(law, "law", Law)
-        self.law = law
+        self.rest_centerline = None
+        self.law = None if law is None else _law(law)
         _check_arclengths(self)
 
     @property
@@ -171,7 +170,7 @@ class Rod(eqx.Module):
         mass = self.mass_per_length
         rest = self.rest_shape
         strain = rest.scaled(L) if isinstance(rest, RestStrain) else RestStrain(None, None)
-        return Rod(
+        scaled_rod = Rod(
             one,
             EI,
             scaled(self.GJ, L, bending),
@@ -181,8 +180,8 @@ class Rod(eqx.Module):
             strain.curvature,
             strain.twist,
             law=None if self.law is None else ScaledLaw(self.law, L, units.energy),
-            _rest_centerline=rest.scaled(L) if isinstance(rest, SpaceCurve) else None,
         )
+        return _shaped(scaled_rod, rest.scaled(L)) if isinstance(rest, SpaceCurve) else scaled_rod
 
     @staticmethod
     def from_centerline(
@@ -207,7 +206,7 @@ class Rod(eqx.Module):
         `Rod.rest_ends` gives position and frame of its ends, for the supports that leave it free of stress.
         """
         curve, length = SpaceCurve.through(points, d2, frames)
-        return Rod(length, EI, GJ, EA, mass_per_length, radius, law=law, _rest_centerline=curve)
+        return _shaped(Rod(length, EI, GJ, EA, mass_per_length, radius, law=law), curve)
 
     def rest_ends(
         self, position: Any = None, frame: Any = None
@@ -412,6 +411,30 @@ def _shear_modulus(E: Float[Numbers, ""], shear_modulus: Any, poisson_ratio: Any
     if is_known(ratio) and not -1 < float(ratio) <= 0.5:
         raise ValueError(f"poisson_ratio must be above -1 and at most 0.5, got {float(ratio):g}")
     return E / (2 * (1 + ratio))
+
+
+def _shaped(rod: Rod, curve: SpaceCurve) -> Rod:
+    return eqx.tree_at(lambda rod: rod.rest_centerline, rod, curve, is_leaf=lambda value: value is None)
+
+
+def _law(law: Any) -> Law:
+    """A law with arrays for its numbers, which gives a number."""
+    instance(law, "law", Law)
+    for value in jax.tree.leaves(law):
+        if not isinstance(value, int | float | np.number | np.ndarray | Array) or isinstance(value, bool):
+            raise TypeError(
+                f"law must have numbers in its fields, got {shown(value)}; mark what is none by eqx.field(static=True)"
+            )
+    law = jax.tree.map(lambda value: leaf(number_array(value, "law", np.shape(value))), law)
+    # Scenes bring all numbers to one precision.
+    dtype = max((value.dtype for value in jax.tree.leaves(law)), key=lambda dtype: dtype.itemsize, default=float)
+    number = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(dtype))
+    as_one = jax.tree.map(lambda value: jax.ShapeDtypeStruct(value.shape, number.dtype), law)
+    pair = jax.ShapeDtypeStruct((2,), number.dtype)
+    given = jax.eval_shape(lambda law, *strains: law(*strains), as_one, pair, number, number, number)
+    if getattr(given, "shape", None) != () or not jnp.issubdtype(given.dtype, jnp.floating):
+        raise ValueError(f"law must give one floating-point number, got {given}")
+    return law
 
 
 def _is_pair(value: Any) -> bool:

@@ -89,7 +89,8 @@ def _check_supports(scene: Scene) -> None:
     for end, other in (ends, ends[::-1]):
         if not isinstance(end, Free):
             continue
-        loaded = scene.gravity is not None or scene.point_forces or end.force is not None or scene.distributed
+        along = [load for load in scene.distributed if isinstance(load, DistributedForce)]
+        loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
         if isinstance(other, Pin) and not loaded:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
         if end.moment is not None and not isinstance(other, Clamp):

@@ -87,6 +87,8 @@ class Free(Support):
         self.follower = follower
         self.force = None if force is None else leaf(vector(force, "force"))
         self.moment = None if moment is None else leaf(vector(moment, "moment"))
+        if follower and force is None and moment is None:
+            raise ValueError("follower must be False without a force or a moment that could follow the end")
 
     def in_units(self, units: Units) -> "Free":
         return Free(

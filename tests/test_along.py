@@ -1,7 +1,9 @@
 """What varies along a rod, and rods made of it."""
 
 import math
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +11,25 @@ import pytest
 import rodjax as rj
 from rodjax.along import Spline
 from rodjax.rod import torsion_constant
+
+LINE = np.stack([np.arange(5.0), np.zeros(5), np.zeros(5)], axis=1)
+FRAMES = np.stack([np.eye(3)] * 5)
+
+
+class Stiff(rj.Law):
+    """Plain Python numbers for fields."""
+
+    stiffness: Any
+
+    def __call__(self, curvature, twist, axial_strain, s):
+        return self.stiffness * (jnp.sum(curvature**2) + twist**2 + axial_strain**2)
+
+
+def test_a_law_may_hold_plain_numbers():
+    rod = rj.Rod(1.0, 1, 1, 1, law=Stiff(2))
+    assert rod.law.stiffness.dtype == jnp.float64
+    scene = rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free())
+    assert all(leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(scene))
 
 
 def test_a_spline_reproduces_cubics():
@@ -41,6 +62,15 @@ def test_steps_have_the_mean_of_a_stretch():
         (lambda: rj.Rod(1.0, (1, 2, 3), 1, 1), "EI must be one or a pair"),
         (lambda: rj.Rod(1.0, 1, 1, 1, rest_curvature=3.0), "rest_curvature must be a pair"),
         (lambda: rj.Rod(1.0, 1, 1, 1, law=3), "law must be a Law"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, law=Stiff("soft")), r"law must have numbers in its fields, got 'soft'"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, law=Stiff(np.ones(2))), "law must give one floating-point number"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, law=Stiff(math.nan)), "law must be finite"),
+        (lambda: rj.Free(follower=True), "follower must be False without a force or a moment"),
+        (lambda: rj.Rod.layered(1.0, [2e-3, 1e-3], [1e9], poisson_ratios=[0.3]), "radii must increase"),
+        (lambda: rj.Rod.from_centerline(LINE, 1, 1, 1, frames=2 * FRAMES), r"frames\[0\] must be a rotation"),
+        (lambda: rj.Rod.from_centerline(LINE, 1, 1, 1, frames=FRAMES[:, :, ::-1]), r"frames\[0\] must be right-handed"),
+        (lambda: rj.Rod.from_centerline(LINE, 1, 1, 1, frames=FRAMES), "frames must have the tangents of the curve"),
+        (lambda: rj.Rod.from_centerline(LINE, 1, 1, 1, d2=(1, 0, 0)), "d2 must not be parallel"),
         (lambda: rj.Rod.from_centerline([[0, 0, 0], [1, 0, 0]], 1, 1, 1), "points must have the shape"),
         (lambda: rj.Rod.from_centerline([[0, 0, 0]] * 5, 1, 1, 1), "points must not repeat"),
         (lambda: rj.Rod.bundle(1.0, 7, 1e-3, 1e9, poisson_ratio=0.3, stick=2), "stick must lie in 0"),

@@ -359,7 +359,11 @@ def moment_loaded(moment: float) -> Scene:
     ("scenes", "options", "message"),
     [
         ([pressed(0.0)], {}, "at least two"),
-        ([moment_loaded(0.0), moment_loaded(1.0)], {}, "dead moment on a free end has none"),
+        (
+            [moment_loaded(0.0), moment_loaded(1.0)],
+            {},
+            "dead moments on a free end, couples along the rod and follower loads have none",
+        ),
         (strut(), {"start": 1.5}, "start must lie in 0 to 1"),
         (strut(), {"direction": 2}, "direction must be 1 or -1"),
         (strut(), {"step": 0.2}, "step must be at most max_step"),

@@ -86,10 +86,6 @@ class FrameForm(Form):
         )
 
     @property
-    def has_torsion(self) -> bool:
-        return False
-
-    @property
     def has_potential(self) -> bool:
         return has_potential(self.scene)
 

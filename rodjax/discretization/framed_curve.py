@@ -34,10 +34,6 @@ class FramedCurve(Shape):
     def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> FramePoint:
         return FramePoint(self.quaternions, end_force, total_twist)
 
-    @staticmethod
-    def through(points: Float[Array, "k 3"]) -> "FramedCurve":
-        raise NotImplementedError("frames need more than points: `framed_through`")
-
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "FramedCurve":
         return FramedCurve(self.nodes * scale + shift[None], self.quaternions, self.s)
 

@@ -18,11 +18,6 @@ class Shape(eqx.Module):
     def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> Any:
         """The unknowns of its form, with these."""
 
-    @staticmethod
-    @abstractmethod
-    def through(points: Float[Array, "k 3"]) -> "Shape":
-        """Through equally spaced points."""
-
     @abstractmethod
     def points(self, pieces: int) -> Float[Array, "k 3"]:
         """`pieces` + 1 equally spaced points of it."""

@@ -1,5 +1,6 @@
 """Shape, forces and derivatives of cables, hoses and wires: quasistatic extensible Kirchhoff rods in JAX."""
 
+import importlib
 from typing import TYPE_CHECKING
 
 from rodjax import problems
@@ -27,17 +28,38 @@ from rodjax.tracing import BranchEnd
 
 if TYPE_CHECKING:
     from rodjax.continuum import solve_continuum
+    from rodjax.identification.each import Fits, fit_each
+    from rodjax.identification.fit import fit
+    from rodjax.identification.measurements import (
+        Centerline,
+        CriticalValue,
+        EndForce,
+        EndMoment,
+        Experiment,
+        Reading,
+        orthographic,
+        pinhole,
+    )
+    from rodjax.identification.result import Fit, NotIdentifiableError
+    from rodjax.identification.unknowns import Unknown
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Branch",
     "BranchEnd",
+    "Centerline",
     "Clamp",
     "CriticalPoint",
+    "CriticalValue",
     "DistributedCouple",
     "DistributedForce",
+    "EndForce",
+    "EndMoment",
     "Equilibrium",
+    "Experiment",
+    "Fit",
+    "Fits",
     "Free",
     "Guess",
     "Law",
@@ -46,8 +68,10 @@ __all__ = [
     "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
+    "NotIdentifiableError",
     "Pin",
     "PointForce",
+    "Reading",
     "Rod",
     "Scene",
     "SceneFileError",
@@ -55,15 +79,20 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Unknown",
     "critical_point",
     "critical_points",
     "describe",
     "enable_compilation_cache",
     "end_stiffness",
+    "fit",
+    "fit_each",
     "follow",
     "frame",
     "load",
     "lowest_mode",
+    "orthographic",
+    "pinhole",
     "problems",
     "read_scene",
     "rotate",
@@ -79,10 +108,32 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str):
-    # diffrax and optimistix take a second to import, which a solve without them need not wait for.
-    if name == "solve_continuum":
-        from rodjax.continuum import solve_continuum
+# diffrax, optimistix and scipy take a second to import, which a solve without them need not wait for.
+_LATER = {
+    "solve_continuum": "continuum",
+    "fit": "identification.fit",
+    "Fit": "identification.result",
+    "NotIdentifiableError": "identification.result",
+    "fit_each": "identification.each",
+    "Fits": "identification.each",
+    "Unknown": "identification.unknowns",
+    **dict.fromkeys(
+        (
+            "Centerline",
+            "CriticalValue",
+            "EndForce",
+            "EndMoment",
+            "Experiment",
+            "Reading",
+            "orthographic",
+            "pinhole",
+        ),
+        "identification.measurements",
+    ),
+}
 
-        return solve_continuum
+
+def __getattr__(name: str):
+    if name in _LATER:
+        return getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -60,7 +60,7 @@ def sensitivities(
     """
     instance(scene, "scene", Scene)
     of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
-    wrt = _checked_names("wrt", wrt, tuple(_numbers(scene)), "numbers of this scene")
+    wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
     found = _derivatives(scene, solve(scene, **options), of, wrt)
     return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names
 
@@ -98,11 +98,11 @@ def _end_stiffness(scene: Scene, result: Equilibrium) -> Float[Array, "k k"]:
 
 def moved(scene: Scene, changes: dict[str, Float[Array, "..."]]) -> Scene:
     """The scene with changes added to the numbers of these names; frames are turned by rotation vectors (3,) [rad]."""
-    numbers = _numbers(scene)
+    numbers = named_numbers(scene)
     changed = [
         rotate(numbers[name], change) if _is_frame(name) else numbers[name] + change for name, change in changes.items()
     ]
-    return eqx.tree_at(lambda scene: [_numbers(scene)[name] for name in changes], scene, changed)
+    return eqx.tree_at(lambda scene: [named_numbers(scene)[name] for name in changes], scene, changed)
 
 
 @functools.partial(compiled, static_argnames=("of", "wrt"))
@@ -115,14 +115,14 @@ def _derivatives(
         near = differentiable(moved(scene, changes), result)
         return {name: getattr(near, name) for name in of}
 
-    numbers = _numbers(scene)
+    numbers = named_numbers(scene)
     nowhere = {name: jnp.zeros_like(numbers[name][0] if _is_frame(name) else numbers[name]) for name in wrt}
     outputs = sum(getattr(result, name).size for name in of)
     inputs = sum(change.size for change in nowhere.values())
     return (jax.jacfwd if inputs <= outputs else jax.jacrev)(fields)(nowhere)
 
 
-def _numbers(scene: Scene) -> dict[str, Float[Array, "..."]]:
+def named_numbers(scene: Scene) -> dict[str, Float[Array, "..."]]:
     """The numbers of a scene by their dotted names; turns are whole and have no derivative."""
     leaves, _ = jax.tree.flatten_with_path(scene)
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

@@ -1,0 +1,1 @@
+"""Parameters of rods and rigs from measurements."""

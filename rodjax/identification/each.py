@@ -1,0 +1,252 @@
+"""fit_each(): many experiments, each fitted by itself, in one program."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy import stats
+
+from rodjax.checks import leaf, one_of, positive, whole_number
+from rodjax.compilation import compiled
+from rodjax.equilibrium import Discretization, checked_options
+from rodjax.identification.fit import MAX_STEPS, rtol_of
+from rodjax.identification.least_squares import Coordinates
+from rodjax.identification.loss import THRESHOLDS, Loss
+from rodjax.identification.measurements import Experiment
+from rodjax.identification.problem import (
+    Group,
+    Problem,
+    Structure,
+    information,
+    search,
+    solved_experiment,
+    values,
+)
+from rodjax.identification.setup import LANES, Setup, begun, largest_error, prepared, stacked, structure_of
+from rodjax.identification.statistics import LARGEST_DEVIATION
+from rodjax.identification.unknowns import Unknown
+from rodjax.refinement import SAFETY, SIZES, next_size
+from rodjax.result import Equilibrium
+
+
+@dataclasses.dataclass(frozen=True)
+class Fits:
+    """The fits of e experiments, each by itself. Arrays are in the order of the experiments.
+
+    - `labels`, `units`: of the p unknowns
+    - `estimates` (e, p); `standard_errors` (e, p), NaN of what was not free; `covariances` (e, p, p)
+    - `sigma` (e,): scatter of the deviations, in the unit of the measurement or beside the given standard deviations;
+      `degrees_of_freedom` (e,)
+    - `rms` (e, m): root mean square length of the rows of deviations of each measurement, in its unit
+    - `converged` (e,), `steps` (e,); `determined` (e,): whether the data determine all that was free
+    - `equilibria`: with a leading axis; `error_estimate`: largest of theirs
+    """
+
+    labels: list[str]
+    units: dict[str, str]
+    estimates: Float[np.ndarray, "e p"]
+    standard_errors: Float[np.ndarray, "e p"]
+    covariances: Float[np.ndarray, "e p p"]
+    sigma: Float[np.ndarray, "e"]
+    degrees_of_freedom: Int[np.ndarray, "e"]
+    rms: Float[np.ndarray, "e m"]
+    converged: Bool[np.ndarray, "e"]
+    steps: Int[np.ndarray, "e"]
+    determined: Bool[np.ndarray, "e"]
+    equilibria: Equilibrium
+    error_estimate: float
+    is_log: Bool[np.ndarray, "p"]
+
+    def intervals(self, level: float = 0.95) -> tuple[Float[np.ndarray, "e p"], Float[np.ndarray, "e p"]]:
+        """The ends of the confidence intervals, by Student's distribution; symmetric on the scale of each unknown."""
+        reach = stats.t.ppf((1 + level) / 2, self.degrees_of_freedom)[:, None] * self.standard_errors
+        with np.errstate(over="ignore", invalid="ignore"):
+            factor = np.exp(reach / self.estimates)
+        low = np.where(self.is_log, self.estimates / factor, self.estimates - reach)
+        return low, np.where(self.is_log, self.estimates * factor, self.estimates + reach)
+
+
+def fit_each(
+    experiments: Sequence[Experiment],
+    unknowns: Sequence[Unknown | str],
+    *,
+    free: Any = None,
+    loss: Loss = "linear",
+    threshold: float | None = None,
+    rtol: float | None = None,
+    segments: int | None = None,
+    discretization: Discretization | None = None,
+    planar: bool = False,
+    max_steps: int = MAX_STEPS,
+) -> Fits:
+    """The unknowns of each experiment from its own measurements alone, all in one compiled program.
+
+    **Arguments:** as for `rodjax.fit`, save that
+
+    - `experiments` must be alike: the same supports, loads and kinds of measurements; points may differ in number.
+    - every unknown is one of each experiment, whatever its `per`.
+    - `free`: (e, p) of bool, which unknowns are free in which experiment; the others stay as they are at the start.
+        `None`: all. The same experiment with several choices compares models.
+    - a `loss` other than `"linear"`, and priors, need standard deviations.
+
+    Returns `Fits`; an experiment that does not converge is marked and does not affect others. Raises `ValueError` or
+    `TypeError` for arguments that make no sense.
+    """
+    one_of(loss, "loss", get_args(Loss))
+    threshold = THRESHOLDS[loss] if threshold is None else float(positive(threshold, "threshold"))
+    setup = prepared(experiments, unknowns)
+    labels = [one if isinstance(one, str) else one.label for one in unknowns]
+    both = sorted((*setup.shared, *setup.own), key=lambda unknown: labels.index(unknown.label))
+    setup = setup._replace(shared=tuple(both), own=())
+    if setup.critical:
+        raise ValueError("experiments must be of Experiment for fit_each; rodjax.fit takes CriticalValue too")
+    groups, guesses = stacked(setup)
+    if len(groups) > 1:
+        raise ValueError(
+            f"experiments must be alike in supports, loads and kinds of measurements, got {len(groups)} kinds of them"
+        )
+    if not setup.has_sd and (loss != "linear" or any(unknown.prior for unknown in setup.shared)):
+        raise ValueError("sd must be given for a loss other than 'linear', and for priors")
+    count, p = len(setup.order), len(setup.shared)
+    is_free = np.ones((count, p), bool) if free is None else np.asarray(free)
+    if is_free.shape != (count, p) or is_free.dtype != bool:
+        raise ValueError(f"free must be of bool of shape {(count, p)}, got {is_free.dtype} of shape {is_free.shape}")
+    is_free = is_free[np.array(setup.order)]
+    options, tolerance = checked_options(
+        setup.experiments[0].scene, segments, rtol_of(rtol, segments), discretization, None, None, planar
+    )
+    structure = structure_of(
+        setup,
+        loss=loss,
+        segments=options.segments,
+        discretization=options.discretization,
+        planar=planar,
+        max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
+    )
+    problem, starts = _begun(setup, groups, threshold)
+    shapes: Any = guesses[0]
+    while True:
+        found = _each(structure, problem, starts, leaf(is_free), shapes)
+        error = largest_error((found.equilibria,))
+        finest = SIZES[structure.discretization][-1]
+        if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
+            break
+        finer = next_size(structure.segments, error, tolerance, structure.discretization)
+        structure, shapes, starts = structure._replace(segments=finer), found.equilibria, found.at
+    return _fits(setup, structure, problem, found, is_free, error)
+
+
+def _begun(setup: Setup, groups: tuple[Group, ...], threshold: float) -> tuple[Problem, Float[Array, "e p"]]:
+    """The problem of all, and where each experiment starts."""
+    as_own = setup._replace(own=setup.shared, shared=())
+    problem, start = begun(as_own, groups, threshold)
+    none = jax.tree.map(lambda x: x[:0], problem.shared)
+    p = len(setup.shared)
+    problem = eqx.tree_at(
+        lambda problem: (problem.shared, problem.own, problem.critical.at, problem.critical.slope),
+        problem,
+        (problem.own, none, leaf(np.zeros(p, problem.scale.dtype)), leaf(np.zeros((0, p), problem.scale.dtype))),
+    )
+    return problem, start.own
+
+
+class _Found(eqx.Module):
+    at: Float[Array, "e p"]
+    values: Float[Array, "e p"]
+    information: Float[Array, "e p p"]
+    squares: Float[Array, "e"]
+    slope: Float[Array, "e"]
+    rms: Float[Array, "e m"]
+    converged: Bool[Array, "e"]
+    steps: Int[Array, "e"]
+    equilibria: Equilibrium
+
+
+@functools.partial(compiled, static_argnames=("structure",))
+def _each(
+    structure: Structure, problem: Problem, starts: Float[Array, "e p"], is_free: Bool[Array, "e p"], shapes: Any
+) -> _Found:
+    nothing = jnp.zeros((1, 0), starts.dtype)
+
+    def one(experiment: Experiment, start: Float[Array, "p"], is_free: Bool[Array, "p"], shape: Any) -> _Found:
+        alone = Group(jax.tree.map(lambda x: x[None], experiment), jnp.ones(1, starts.dtype))
+        here = eqx.tree_at(
+            lambda problem: (problem.groups, problem.is_free),
+            problem,
+            ((alone,), Coordinates(is_free, jnp.zeros((1, 0), bool))),
+        )
+        at = Coordinates(start, nothing)
+        first = solved_experiment(structure, experiment, values(structure, here, at)[0], nothing[0], shape)[1]
+        found = search(structure, here, at, (jax.tree.map(lambda x: x[None], first),))
+        info = information(structure, here, found.at, found.beside)
+        result = jax.tree.map(lambda x: x[0], found.beside[0])
+        weights = [measured.weights for measured in experiment.measured]
+        lengths = [
+            jnp.sum(_by_weight(x[0], weight) ** 2) / jnp.sum(weight > 0)
+            for x, weight in zip(info.rows[0], weights, strict=True)
+        ]
+        return _Found(
+            at=found.at.shared,
+            values=values(structure, here, found.at)[0],
+            information=info.normal.ss,
+            squares=info.squares,
+            slope=info.slope,
+            rms=problem.scale * jnp.sqrt(jnp.stack(lengths)),
+            converged=found.converged & first.converged & result.converged,
+            steps=found.steps,
+            equilibria=result,
+        )
+
+    each = (problem.groups[0].experiments, starts, is_free, shapes)
+    return jax.lax.map(lambda one_of: one(*one_of), each, batch_size=LANES)
+
+
+def _by_weight(rows: Float[Array, "k d"], weights: Float[Array, "k"]) -> Float[Array, "k d"]:
+    return rows / jnp.where(weights > 0, weights, 1.0)[:, None]
+
+
+def _fits(
+    setup: Setup, structure: Structure, problem: Problem, found: _Found, is_free: Bool[np.ndarray, "e p"], error: float
+) -> Fits:
+    order = np.argsort(np.array(setup.order))
+    matrix = np.asarray(found.information, float) + np.eye(is_free.shape[1])[None] * ~is_free[..., None]
+    numbers = np.array([sum(m.numbers * len(m.weights) for m in setup.experiments[k].measured) for k in setup.order])
+    priors = np.array([unknown.prior is not None for unknown in setup.shared])
+    freedom = numbers + np.sum(is_free & priors[None], axis=1) - np.sum(is_free, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        estimated = np.asarray(found.squares) / freedom / np.asarray(found.slope) ** 2
+    dispersion = np.where(freedom > 0, estimated, 1.0 if setup.has_sd else np.nan)
+    finite = np.all(np.isfinite(matrix), axis=(1, 2))
+    eigenvalues, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, np.eye(matrix.shape[1])))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = (vectors / np.maximum(eigenvalues, np.finfo(float).tiny)[:, None]) @ np.swapaxes(vectors, 1, 2)
+        covariance = np.where(finite[:, None, None], covariance * dispersion[:, None, None], np.nan)
+        deviations = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    is_log = np.array([unknown.scale == "log" for unknown in setup.shared])
+    estimates = np.asarray(found.values, float)
+    rates = np.where(is_log, estimates, 1.0) * np.asarray(problem.shared.size)[None]
+    covariance = covariance * rates[:, :, None] * rates[:, None, :]
+    errors = np.where(is_free, deviations * rates, np.nan)
+    determined = np.all((deviations < LARGEST_DEVIATION) | ~is_free, axis=1)
+    return Fits(
+        labels=[unknown.label for unknown in setup.shared],
+        units={unknown.label: unknown.unit for unknown in setup.shared},
+        estimates=estimates[order],
+        standard_errors=errors[order],
+        covariances=covariance[order],
+        sigma=(np.sqrt(dispersion) * float(problem.scale))[order],
+        degrees_of_freedom=freedom[order],
+        rms=np.asarray(found.rms)[order],
+        converged=np.asarray(found.converged)[order],
+        steps=np.asarray(found.steps)[order],
+        determined=determined[order],
+        equilibria=jax.tree.map(lambda x: x[order], found.equilibria),
+        error_estimate=error,
+        is_log=is_log,
+    )

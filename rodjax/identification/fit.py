@@ -1,0 +1,236 @@
+"""fit(): parameters of rods and rigs from what was measured on them."""
+
+import functools
+import math
+import warnings
+from collections.abc import Sequence
+from typing import get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import stats
+
+from rodjax.checks import leaf, one_of, positive, whole_number
+from rodjax.continuation import critical_point
+from rodjax.equilibrium import Discretization, checked_options
+from rodjax.identification.least_squares import Coordinates, LeastSquares
+from rodjax.identification.loss import THRESHOLDS, Loss
+from rodjax.identification.measurements import CriticalValue, Experiment
+from rodjax.identification.problem import (
+    Critical,
+    Information,
+    Problem,
+    Ranges,
+    Structure,
+    in_units,
+    information,
+    search_compiled,
+)
+from rodjax.identification.result import Fit, NotIdentifiableError
+from rodjax.identification.setup import (
+    Setup,
+    begun,
+    largest_error,
+    only_converged,
+    prepared,
+    solutions,
+    stacked,
+    structure_of,
+)
+from rodjax.identification.unknowns import Unknown, nominal, with_values
+from rodjax.refinement import SAFETY, SIZES, next_size
+from rodjax.result import Equilibrium, NotConvergedWarning
+
+DEFAULT_RTOL = 1e-4
+MAX_STEPS = 100
+# The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.
+MAX_ROUNDS = 20
+SETTLED = 1e-6
+
+
+def fit(
+    experiments: Sequence[Experiment | CriticalValue],
+    unknowns: Sequence[Unknown | str],
+    *,
+    loss: Loss = "linear",
+    threshold: float | None = None,
+    rtol: float | None = None,
+    segments: int | None = None,
+    discretization: Discretization | None = None,
+    planar: bool = False,
+    max_steps: int = MAX_STEPS,
+) -> Fit:
+    """The numbers of scenes and rigs with which the computed rods agree best with the measured ones.
+
+    Levenberg and Marquardt's method on implicit derivatives: all experiments of one structure are one batch, compiled
+    once, each solve warm-started from the last.
+
+    **Arguments:**
+
+    - `experiments`: `Experiment`s, of any structures, and `CriticalValue`s.
+    - `unknowns`: `Unknown`s, or their names.
+    - `loss`: `"linear"`: least squares; `"huber"`, `"cauchy"`, `"welsch"`: deviations beyond `threshold` standard
+        deviations count less, those of `"welsch"` in the end not at all. `threshold`: `None` for 95 % efficiency
+        without outliers. Where no standard deviations are given the scatter is found with the fit.
+    - `rtol`: relative error of the shapes from the mesh, 1e-4; or `segments`: a fixed mesh. `discretization`, `planar`:
+        as for `rodjax.solve`.
+    - `max_steps`: of the method, evaluations of all experiments.
+
+    Returns a `Fit`. Raises `NotIdentifiableError` where the data do not determine a combination of the unknowns, which
+    it names; `ValueError` or `TypeError` for arguments that make no sense. Experiments without an equilibrium at the
+    start are left out, with a `NotConvergedWarning`.
+    """
+    one_of(loss, "loss", get_args(Loss))
+    if threshold is not None and loss == "linear":
+        raise ValueError("threshold must be None where loss is 'linear', which has none")
+    threshold = THRESHOLDS[loss] if threshold is None else float(positive(threshold, "threshold"))
+    setup = prepared(experiments, unknowns)
+    options, tolerance = checked_options(
+        setup.experiments[0].scene, segments, rtol_of(rtol, segments), discretization, None, None, planar
+    )
+    structure = structure_of(
+        setup,
+        loss=loss,
+        segments=options.segments,
+        discretization=options.discretization,
+        planar=planar,
+        max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
+    )
+    groups, guesses = stacked(setup)
+    problem, at = begun(setup, groups, threshold)
+    structure, results = solutions(structure, problem, at, guesses, tolerance)
+    problem = only_converged(setup, problem, results)
+    while True:
+        found, problem = _settled(setup, structure, problem, at, results)
+        at, results = found.at, found.beside
+        error = largest_error(results)
+        if (
+            tolerance is None
+            or SAFETY * error <= tolerance
+            or structure.segments >= SIZES[structure.discretization][-1]
+        ):
+            break
+        finer = next_size(structure.segments, error, tolerance, structure.discretization)
+        structure, results = solutions(structure._replace(segments=finer), problem, at, results, None)
+    if not found.converged:
+        warnings.warn(
+            f"the fit has not converged in {int(found.steps)} steps: better values to start from, bounds or priors may "
+            "help",
+            NotConvergedWarning,
+            stacklevel=2,
+        )
+    held = _held_numbers(setup)
+    info = information(*_with_held(setup, structure, problem, found.at, held), found.beside)
+    result = Fit.of(setup, structure, problem, found, info, held, error)
+    if result.undetermined:
+        raise NotIdentifiableError(result)
+    return result
+
+
+def rtol_of(rtol: float | None, segments: int | None) -> float | None:
+    return DEFAULT_RTOL if rtol is None and segments is None else rtol
+
+
+def _settled(
+    setup: Setup, structure: Structure, problem: Problem, at: Coordinates, results: tuple[Equilibrium, ...]
+) -> tuple[LeastSquares, Problem]:
+    """Searched until the scatter and the critical values, which are found between searches, stay as they are."""
+    needs_scale = not setup.has_sd and (structure.loss != "linear" or _has_priors(problem))
+    found = None
+    for _ in range(MAX_ROUNDS):
+        if setup.critical:
+            problem = eqx.tree_at(lambda problem: problem.critical, problem, _critical(setup, structure, problem, at))
+        found = search_compiled(structure, problem, at, results)
+        change = float(jnp.max(jnp.abs(found.at.shared - at.shared), initial=0.0)) if setup.critical else 0.0
+        at, results = found.at, found.beside
+        if needs_scale:
+            info = information(structure, problem, at, results)
+            scale = float(problem.scale) * _scatter(setup, info, structure.loss)
+            change = max(change, abs(scale / float(problem.scale) - 1) * 1e-3)
+            problem = eqx.tree_at(lambda p: p.scale, problem, leaf(np.asarray(scale, problem.scale.dtype)))
+        if change < SETTLED or not found.converged:
+            break
+    assert found is not None, "there is at least one round"
+    return found, problem
+
+
+def _has_priors(problem: Problem) -> bool:
+    return bool(np.any(np.asarray(problem.shared.information)) or np.any(np.asarray(problem.own.information)))
+
+
+def _scatter(setup: Setup, info: Information, loss: Loss) -> float:
+    """The scatter of deviations in their present scale: of a robust fit from the median, which outliers do not move."""
+    pairs = zip(setup.order, (x for group in info.rows for x in zip(*group, strict=True)), strict=True)
+    rows = [
+        np.asarray(x)[: len(measured.weights)]
+        for k, of_one in pairs
+        for x, measured in zip(of_one, setup.experiments[k].measured, strict=True)
+    ]
+    if loss == "linear":
+        numbers = sum(m.numbers * len(m.weights) for one in setup.experiments for m in one.measured)
+        return float(np.sqrt(sum(np.sum(x**2) for x in rows) / numbers))
+    # Of the lengths of rows of d normal deviations the median is that of the chi distribution.
+    d = max(m.numbers for one in setup.experiments for m in one.measured)
+    return float(np.median(np.concatenate([np.linalg.norm(x, axis=1) for x in rows])) / stats.chi.median(d))
+
+
+def _held_numbers(setup: Setup) -> list[Unknown]:
+    """Material numbers of all rods that are not sought: whether the data would tell them is worth a sentence."""
+    sought = {name for unknown in (*setup.shared, *setup.own) for name in unknown.names}
+    found = []
+    for name in ("rod.EI", "rod.GJ", "rod.EA", "rod.mass_per_length"):
+        numbers = [nominal((name,), experiment) for experiment in setup.experiments]
+        if name not in sought and all(number is not None and float(number) > 0 for number in numbers):
+            found.append(Unknown(name))
+    return found
+
+
+def _with_held(
+    setup: Setup, structure: Structure, problem: Problem, at: Coordinates, held: Sequence[Unknown]
+) -> tuple[Structure, Problem, Coordinates]:
+    """With what was held as unknowns in common behind the others, each by a factor of what it is in each scene."""
+    more = structure._replace(factors=tuple(unknown.names[0] for unknown in held))
+    k = len(held)
+
+    def longer(x: Float[Array, "p"], fill: float) -> Float[Array, "p+k"]:
+        return jnp.concatenate([x, jnp.full(k, fill, x.dtype)])
+
+    ranges = Ranges(
+        longer(problem.shared.size, 1.0),
+        longer(problem.shared.low, -math.inf),
+        longer(problem.shared.high, math.inf),
+        longer(problem.shared.prior, 0.0),
+        longer(problem.shared.information, 0.0),
+    )
+    critical = eqx.tree_at(
+        lambda critical: (critical.at, critical.slope),
+        problem.critical,
+        (longer(problem.critical.at, 0.0), jnp.pad(problem.critical.slope, ((0, 0), (0, k)))),
+    )
+    is_free = jnp.concatenate([problem.is_free.shared, jnp.ones(k, bool)])
+    extended = eqx.tree_at(
+        lambda problem: (problem.shared, problem.critical, problem.is_free.shared), problem, (ranges, critical, is_free)
+    )
+    return more, extended, Coordinates(longer(at.shared, 0.0), at.own)
+
+
+def _critical(setup: Setup, structure: Structure, problem: Problem, at: Coordinates) -> Critical:
+    """The deviations of critical values at a point, and their derivatives by the unknowns in common."""
+    sought = structure.shared
+    here = problem.shared.coordinates(at.shared)
+
+    def parameter(value: CriticalValue, coordinates: Float[Array, "p"]) -> Float[Array, ""]:
+        numbers = in_units(sought, coordinates)
+        names, scales = [one.names for one in sought], [one.scale for one in sought]
+        scenes = jax.vmap(lambda scene: with_values(scene, names, scales, list(numbers)))(value.scenes)
+        return critical_point(scenes, **dict(value.options)).parameter
+
+    deviations, slopes = [], []
+    for value in setup.critical:
+        computed, slope = jax.value_and_grad(functools.partial(parameter, value))(here)
+        deviations.append((value.value - computed) / value.sd)
+        slopes.append(-slope / value.sd)
+    return Critical(here, jnp.stack(deviations), jnp.stack(slopes))

@@ -1,0 +1,181 @@
+"""A fit in words and tables, verdict first, and as plain data."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rodjax.identification.setup import name_of
+from rodjax.status import Status
+
+if TYPE_CHECKING:
+    from rodjax.identification.result import Fit
+
+# Clusters that scatter by so much more than single deviations say are told in words.
+UNDERSTATED = 1.5
+# Correlations beyond this are told in words.
+CORRELATED = 0.95
+# Rows of the table of experiments; of more the worst.
+MOST_ROWS = 30
+LEVEL = 0.95
+
+
+def text(fit: "Fit") -> str:
+    parts = [_headline(fit), _shared_table(fit), _scatter(fit), *_remarks(fit), _experiments(fit)]
+    return "\n".join(part for part in parts if part)
+
+
+def _headline(fit: "Fit") -> str:
+    count = len(fit.setup.experiments) + len(fit.setup.critical)
+    outcome = f"converged in {fit.steps} steps" if fit.converged else f"NOT converged in {fit.steps} steps"
+    unknowns = len(fit.setup.shared) + len(fit.setup.own)
+    return (
+        f"{_counted(count, 'experiment')} in {_counted(fit.clusters, 'cluster')}, {fit.numbers} numbers measured, "
+        f"{_counted(unknowns, 'unknown')}: {outcome}"
+    )
+
+
+def _counted(count: int, name: str) -> str:
+    return f"{count} {name}{'' if count == 1 else 's'}"
+
+
+def _shared_table(fit: "Fit") -> str:
+    if not fit.labels:
+        return ""
+    width = max(len(_title(fit, label)) for label in fit.labels)
+    rows = [
+        f"{'':{width}}  {'estimate':>12}  {'formal error':>12}  {'95 % interval':>25}  "
+        f"{'by clusters':>12}  {'95 % interval':>25}"
+    ]
+    for label in fit.labels:
+        rows.append(
+            f"{_title(fit, label):{width}}  {fit.estimate[label]:12.6g}  {fit.standard_error[label]:12.3g}  "
+            f"{_interval(fit, label, False):>25}  {_number(fit.clustered_error[label]):>12}  "
+            f"{_interval(fit, label, True):>25}"
+        )
+    return "\n".join(rows)
+
+
+def _title(fit: "Fit", label: str) -> str:
+    unit = fit.units[label]
+    return f"{label} [{unit}]" if unit else label
+
+
+def _interval(fit: "Fit", label: str, clustered: bool) -> str:
+    low, high = fit.interval(label, LEVEL, clustered=clustered)
+    return "-" if math.isnan(low) else f"{low:.5g} to {high:.5g}"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def _scatter(fit: "Fit") -> str:
+    if fit.setup.has_sd:
+        told = f"scatter {fit.sigma:.3g} times the given standard deviations"
+    else:
+        unit = fit.setup.experiments[0].measured[0].unit
+        told = f"scatter {fit.sigma:.3g} {unit} in each number"
+    return f"{told}, {fit.degrees_of_freedom} degrees of freedom; meshes within {fit.error_estimate:.0e} of the length"
+
+
+def _remarks(fit: "Fit") -> list[str]:
+    told = [f"not determined: {combination.words}" for combination in fit.undetermined]
+    told += [f"{label} is at its bound, where its standard error means nothing" for label in fit.at_bounds]
+    if fit.setup.has_sd and fit.degrees_of_freedom > 0 and not 0.5 < fit.sigma < 2:
+        told.append("the scatter is far from the given standard deviations: these are wrong, or the model is")
+    for label in fit.labels:
+        ratio = fit.clustered_error[label] / fit.standard_error[label] if fit.standard_error[label] else math.nan
+        if ratio > UNDERSTATED:
+            told.append(
+                f"formal errors understate the scatter between repeats: by clusters {label} is {ratio:.1f} times less "
+                "certain, as deviations of one experiment go together; believe the interval by clusters"
+            )
+    if fit.clusters < 2:
+        told.append("one cluster only: how repeats scatter is not known, and the formal errors may be too small")
+    correlation = fit.correlation if fit.labels else np.zeros((0, 0))
+    for j in range(len(fit.labels)):
+        for k in range(j):
+            if abs(correlation[j, k]) > CORRELATED:
+                told.append(
+                    f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
+                )
+    told += fit.held
+    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status is not Status.CONVERGED]
+    if lost:
+        told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
+    return [f"- {remark}" for remark in told]
+
+
+def _names(fit: "Fit") -> list[str]:
+    return [name_of(fit.setup, k) for k in range(len(fit.setup.experiments))]
+
+
+def _experiments(fit: "Fit") -> str:
+    names, rms = _names(fit), fit.rms
+    own = [unknown.label for unknown in fit.setup.own]
+    order = list(range(len(names)))
+    title = "experiments"
+    if len(order) > MOST_ROWS:
+        order = sorted(order, key=lambda k: -float(np.nanmax(rms[k])))[:MOST_ROWS]
+        title = f"the {MOST_ROWS} experiments with the largest deviations"
+    width = max(len(title), *(len(names[k]) for k in order))
+    heads = [*(_title(fit, label) for label in own), "rms deviation of each measurement"]
+    rows = [f"{title:{width}}" + "".join(f"  {head:>24}" for head in heads[:-1]) + f"  {heads[-1]}"]
+    for k in order:
+        values = "".join(f"  {_value(fit, label, k):>24}" for label in own)
+        units = [measured.unit for measured in fit.setup.experiments[k].measured]
+        deviations = ", ".join(f"{x:.3g} {unit}".strip() for x, unit in zip(rms[k], units, strict=True))
+        rows.append(f"{names[k]:{width}}{values}  {deviations}")
+    return "\n".join(rows)
+
+
+def _value(fit: "Fit", label: str, k: int) -> str:
+    value, error = fit.estimate[label][k], fit.standard_error[label][k]
+    return "-" if math.isnan(value) else f"{value:.5g} +- {error:.2g}"
+
+
+def plain(fit: "Fit") -> dict[str, Any]:
+    def intervals(clustered: bool) -> dict[str, list[float | None]]:
+        return {label: _plain(fit.interval(label, LEVEL, clustered=clustered)) for label in fit.labels}
+
+    return {
+        "converged": fit.converged,
+        "steps": fit.steps,
+        "unknowns": {label: {"unit": unit} for label, unit in fit.units.items()},
+        "estimate": {label: _plain(value) for label, value in fit.estimate.items()},
+        "standard_error": {label: _plain(value) for label, value in fit.standard_error.items()},
+        "interval_95": intervals(False),
+        "clustered_error": {label: _plain(value) for label, value in fit.clustered_error.items()},
+        "clustered_interval_95": intervals(True),
+        "covariance": _plain(fit.covariance),
+        "clustered_covariance": _plain(fit.clustered_covariance),
+        "correlation": _plain(fit.correlation) if fit.labels else [],
+        "sigma": _plain(fit.sigma),
+        "degrees_of_freedom": fit.degrees_of_freedom,
+        "clusters": fit.clusters,
+        "error_estimate": _plain(fit.error_estimate),
+        "remarks": [remark.removeprefix("- ") for remark in _remarks(fit)],
+        "experiments": [
+            {
+                "name": name,
+                "cluster": experiment.cluster,
+                "status": status.name.lower(),
+                "rms": _plain(rms),
+                "units": [measured.unit for measured in experiment.measured],
+                "residuals": [_plain(rows) for rows in residuals],
+            }
+            for name, experiment, status, rms, residuals in zip(
+                _names(fit), fit.setup.experiments, fit.statuses, fit.rms, fit.residuals, strict=True
+            )
+        ],
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as JSON knows them, which has none that is no number."""
+    if isinstance(value, np.ndarray | Sequence):
+        return [_plain(x) for x in value]
+    number = float(value)
+    return number if math.isfinite(number) else None

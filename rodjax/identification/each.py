@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, get_args
 
@@ -16,19 +17,20 @@ from rodjax.checks import leaf, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.equilibrium import Discretization, checked_options
 from rodjax.identification.fit import MAX_STEPS, rtol_of
+from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import THRESHOLDS, Loss
 from rodjax.identification.measurements import Experiment
-from rodjax.identification.problem import (
-    Group,
-    Problem,
-    Structure,
-    information,
-    search,
-    solved_experiment,
-    values,
+from rodjax.identification.problem import Group, Problem, Structure, search, values
+from rodjax.identification.setup import (
+    Setup,
+    beginnings,
+    begun,
+    largest_error,
+    prepared,
+    stacked,
+    structure_of,
 )
-from rodjax.identification.setup import LANES, Setup, begun, largest_error, prepared, stacked, structure_of
 from rodjax.identification.statistics import LARGEST_DEVIATION
 from rodjax.identification.unknowns import Unknown
 from rodjax.refinement import SAFETY, SIZES, next_size
@@ -130,15 +132,20 @@ def fit_each(
         max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
     )
     problem, starts = _begun(setup, groups, threshold)
-    shapes: Any = guesses[0]
+    first = Coordinates(jnp.zeros(0, starts.dtype), starts)
+    as_own = structure._replace(shared=(), own=structure.shared)
+    at_start = eqx.tree_at(lambda p: (p.shared, p.own), problem, (problem.own, problem.shared))
+    shapes = beginnings(as_own, at_start, first, guesses)[0]
     while True:
         found = _each(structure, problem, starts, leaf(is_free), shapes)
-        error = largest_error((found.equilibria,))
+        error = math.nan if tolerance is None else largest_error((found.equilibria,))
         finest = SIZES[structure.discretization][-1]
         if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
             break
         finer = next_size(structure.segments, error, tolerance, structure.discretization)
-        structure, shapes, starts = structure._replace(segments=finer), found.equilibria, found.at
+        structure, starts = structure._replace(segments=finer), found.at
+        as_own = as_own._replace(segments=finer)
+        shapes = beginnings(as_own, at_start, first._replace(own=starts), (found.equilibria,))[0]
     return _fits(setup, structure, problem, found, is_free, error)
 
 
@@ -170,41 +177,40 @@ class _Found(eqx.Module):
 
 @functools.partial(compiled, static_argnames=("structure",))
 def _each(
-    structure: Structure, problem: Problem, starts: Float[Array, "e p"], is_free: Bool[Array, "e p"], shapes: Any
+    structure: Structure,
+    problem: Problem,
+    starts: Float[Array, "e p"],
+    is_free: Bool[Array, "e p"],
+    shapes: Equilibrium,
 ) -> _Found:
-    nothing = jnp.zeros((1, 0), starts.dtype)
-
-    def one(experiment: Experiment, start: Float[Array, "p"], is_free: Bool[Array, "p"], shape: Any) -> _Found:
+    def one(experiment: Experiment, start: Float[Array, "p"], is_free: Bool[Array, "p"], shape: Equilibrium) -> _Found:
         alone = Group(jax.tree.map(lambda x: x[None], experiment), jnp.ones(1, starts.dtype))
         here = eqx.tree_at(
             lambda problem: (problem.groups, problem.is_free),
             problem,
             ((alone,), Coordinates(is_free, jnp.zeros((1, 0), bool))),
         )
-        at = Coordinates(start, nothing)
-        first = solved_experiment(structure, experiment, values(structure, here, at)[0], nothing[0], shape)[1]
-        found = search(structure, here, at, (jax.tree.map(lambda x: x[None], first),))
-        info = information(structure, here, found.at, found.beside)
-        result = jax.tree.map(lambda x: x[0], found.beside[0])
+        at = Coordinates(start, jnp.zeros((1, 0), starts.dtype))
+        found = search(structure, here, at, (jax.tree.map(lambda x: x[None], shape),))
         weights = [measured.weights for measured in experiment.measured]
         lengths = [
-            jnp.sum(_by_weight(x[0], weight) ** 2) / jnp.sum(weight > 0)
-            for x, weight in zip(info.rows[0], weights, strict=True)
+            jnp.sum(_by_weight(x[0], weight) ** 2) / jnp.sum(weight > 0).astype(weight.dtype)
+            for x, weight in zip(found.evaluation.rows[0], weights, strict=True)
         ]
         return _Found(
             at=found.at.shared,
             values=values(structure, here, found.at)[0],
-            information=info.normal.ss,
-            squares=info.squares,
-            slope=info.slope,
-            rms=problem.scale * jnp.sqrt(jnp.stack(lengths)),
-            converged=found.converged & first.converged & result.converged,
+            information=found.information.ss,
+            squares=found.counted,
+            slope=found.slope,
+            rms=jnp.sqrt(jnp.stack(lengths)),
+            converged=found.converged,
             steps=found.steps,
-            equilibria=result,
+            equilibria=jax.tree.map(lambda x: x[0], found.evaluation.results[0]),
         )
 
     each = (problem.groups[0].experiments, starts, is_free, shapes)
-    return jax.lax.map(lambda one_of: one(*one_of), each, batch_size=LANES)
+    return in_lanes(one, each)
 
 
 def _by_weight(rows: Float[Array, "k d"], weights: Float[Array, "k"]) -> Float[Array, "k d"]:

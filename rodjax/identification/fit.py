@@ -16,31 +16,22 @@ from scipy import stats
 from rodjax.checks import leaf, one_of, positive, whole_number
 from rodjax.continuation import critical_point
 from rodjax.equilibrium import Discretization, checked_options
-from rodjax.identification.least_squares import Coordinates, LeastSquares
+from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import THRESHOLDS, Loss
 from rodjax.identification.measurements import CriticalValue, Experiment
-from rodjax.identification.problem import (
-    Critical,
-    Information,
-    Problem,
-    Ranges,
-    Structure,
-    in_units,
-    information,
-    search_compiled,
-)
+from rodjax.identification.problem import Critical, Found, Group, Problem, Ranges, Structure, in_units, search_compiled
 from rodjax.identification.result import Fit, NotIdentifiableError
 from rodjax.identification.setup import (
     Setup,
+    beginnings,
     begun,
     largest_error,
-    only_converged,
     prepared,
-    solutions,
     stacked,
     structure_of,
+    warn_of_lost,
 )
-from rodjax.identification.unknowns import Unknown, nominal, with_values
+from rodjax.identification.unknowns import Unknown, with_values
 from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium, NotConvergedWarning
 
@@ -101,20 +92,20 @@ def fit(
     )
     groups, guesses = stacked(setup)
     problem, at = begun(setup, groups, threshold)
-    structure, results = solutions(structure, problem, at, guesses, tolerance)
-    problem = only_converged(setup, problem, results)
+    held = _held_numbers(setup, groups)
+    structure, problem, at = _with_held(setup, structure, problem, at, held)
+    results = beginnings(structure, problem, at, guesses)
     while True:
         found, problem = _settled(setup, structure, problem, at, results)
-        at, results = found.at, found.beside
-        error = largest_error(results)
-        if (
-            tolerance is None
-            or SAFETY * error <= tolerance
-            or structure.segments >= SIZES[structure.discretization][-1]
-        ):
+        at, results = found.at, found.evaluation.results
+        error = math.nan if tolerance is None else largest_error(results)
+        finest = SIZES[structure.discretization][-1]
+        if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
             break
         finer = next_size(structure.segments, error, tolerance, structure.discretization)
-        structure, results = solutions(structure._replace(segments=finer), problem, at, results, None)
+        structure = structure._replace(segments=finer)
+        results = beginnings(structure, problem, at, results)
+    warn_of_lost(setup, np.asarray(found.evaluation.is_used))
     if not found.converged:
         warnings.warn(
             f"the fit has not converged in {int(found.steps)} steps: better values to start from, bounds or priors may "
@@ -122,9 +113,7 @@ def fit(
             NotConvergedWarning,
             stacklevel=2,
         )
-    held = _held_numbers(setup)
-    info = information(*_with_held(setup, structure, problem, found.at, held), found.beside)
-    result = Fit.of(setup, structure, problem, found, info, held, error)
+    result = Fit.of(setup, structure, problem, found, held, error)
     if result.undetermined:
         raise NotIdentifiableError(result)
     return result
@@ -136,7 +125,7 @@ def rtol_of(rtol: float | None, segments: int | None) -> float | None:
 
 def _settled(
     setup: Setup, structure: Structure, problem: Problem, at: Coordinates, results: tuple[Equilibrium, ...]
-) -> tuple[LeastSquares, Problem]:
+) -> tuple[Found, Problem]:
     """Searched until the scatter and the critical values, which are found between searches, stay as they are."""
     needs_scale = not setup.has_sd and (structure.loss != "linear" or _has_priors(problem))
     found = None
@@ -145,10 +134,9 @@ def _settled(
             problem = eqx.tree_at(lambda problem: problem.critical, problem, _critical(setup, structure, problem, at))
         found = search_compiled(structure, problem, at, results)
         change = float(jnp.max(jnp.abs(found.at.shared - at.shared), initial=0.0)) if setup.critical else 0.0
-        at, results = found.at, found.beside
+        at, results = found.at, found.evaluation.results
         if needs_scale:
-            info = information(structure, problem, at, results)
-            scale = float(problem.scale) * _scatter(setup, info, structure.loss)
+            scale = _scatter(setup, found, structure.loss)
             change = max(change, abs(scale / float(problem.scale) - 1) * 1e-3)
             problem = eqx.tree_at(lambda p: p.scale, problem, leaf(np.asarray(scale, problem.scale.dtype)))
         if change < SETTLED or not found.converged:
@@ -161,9 +149,9 @@ def _has_priors(problem: Problem) -> bool:
     return bool(np.any(np.asarray(problem.shared.information)) or np.any(np.asarray(problem.own.information)))
 
 
-def _scatter(setup: Setup, info: Information, loss: Loss) -> float:
-    """The scatter of deviations in their present scale: of a robust fit from the median, which outliers do not move."""
-    pairs = zip(setup.order, (x for group in info.rows for x in zip(*group, strict=True)), strict=True)
+def _scatter(setup: Setup, found: Found, loss: Loss) -> float:
+    """The scatter of single deviations: of a robust fit from the median, which outliers do not move."""
+    pairs = zip(setup.order, (x for group in found.evaluation.rows for x in zip(*group, strict=True)), strict=True)
     rows = [
         np.asarray(x)[: len(measured.weights)]
         for k, of_one in pairs
@@ -177,14 +165,16 @@ def _scatter(setup: Setup, info: Information, loss: Loss) -> float:
     return float(np.median(np.concatenate([np.linalg.norm(x, axis=1) for x in rows])) / stats.chi.median(d))
 
 
-def _held_numbers(setup: Setup) -> list[Unknown]:
+def _held_numbers(setup: Setup, groups: Sequence[Group]) -> list[Unknown]:
     """Material numbers of all rods that are not sought: whether the data would tell them is worth a sentence."""
     sought = {name for unknown in (*setup.shared, *setup.own) for name in unknown.names}
+    rods = [group.experiments.scene.rod for group in groups]
     found = []
-    for name in ("rod.EI", "rod.GJ", "rod.EA", "rod.mass_per_length"):
-        numbers = [nominal((name,), experiment) for experiment in setup.experiments]
-        if name not in sought and all(number is not None and float(number) > 0 for number in numbers):
-            found.append(Unknown(name))
+    for name in ("EI", "GJ", "EA", "mass_per_length"):
+        values = [getattr(rod, name) for rod in rods]
+        is_number = all(isinstance(value, jax.Array) for value in values)
+        if is_number and f"rod.{name}" not in sought and all(np.all(np.asarray(value) > 0) for value in values):
+            found.append(Unknown(f"rod.{name}"))
     return found
 
 
@@ -210,7 +200,7 @@ def _with_held(
         problem.critical,
         (longer(problem.critical.at, 0.0), jnp.pad(problem.critical.slope, ((0, 0), (0, k)))),
     )
-    is_free = jnp.concatenate([problem.is_free.shared, jnp.ones(k, bool)])
+    is_free = jnp.concatenate([problem.is_free.shared, jnp.zeros(k, bool)])
     extended = eqx.tree_at(
         lambda problem: (problem.shared, problem.critical, problem.is_free.shared), problem, (ranges, critical, is_free)
     )
@@ -220,7 +210,9 @@ def _with_held(
 def _critical(setup: Setup, structure: Structure, problem: Problem, at: Coordinates) -> Critical:
     """The deviations of critical values at a point, and their derivatives by the unknowns in common."""
     sought = structure.shared
-    here = problem.shared.coordinates(at.shared)
+    coordinates = problem.shared.coordinates(at.shared)
+    here = coordinates[: len(sought)]
+    held = len(structure.factors)
 
     def parameter(value: CriticalValue, coordinates: Float[Array, "p"]) -> Float[Array, ""]:
         numbers = in_units(sought, coordinates)
@@ -233,4 +225,4 @@ def _critical(setup: Setup, structure: Structure, problem: Problem, at: Coordina
         computed, slope = jax.value_and_grad(functools.partial(parameter, value))(here)
         deviations.append((value.value - computed) / value.sd)
         slopes.append(-slope / value.sd)
-    return Critical(here, jnp.stack(deviations), jnp.stack(slopes))
+    return Critical(coordinates, jnp.stack(deviations), jnp.pad(jnp.stack(slopes), ((0, 0), (0, held))))

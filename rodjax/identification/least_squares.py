@@ -1,8 +1,7 @@
 """Levenberg and Marquardt's method for many experiments with unknowns in common and of their own.
 
-optimistix has the trust region, what is accepted and when it ends. Here is what it cannot know: the Jacobian is one of
-blocks, as the own unknowns of an experiment change nothing in others, so that a step costs as much as there are
-experiments, and each solve starts from the shape of the last accepted step.
+The own unknowns of an experiment change nothing in others, so that a step costs as much as there are experiments. The
+trust region is optimistix's.
 """
 
 from collections.abc import Callable
@@ -12,12 +11,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as linalg
+import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-# Inverse of the first damping, of unknowns that are large at 1, and of that at which nothing is found any more.
+# Inverse of the first damping, of unknowns that are large at 1: near the solution the method is Gauss's.
 FIRST_STEP = 1e3
+# Inverse of the damping at which nothing is found any more.
 LEAST_STEP = 1e-12
+# A step that moves no estimate by more than this part of its standard error, or of its size, is the last.
+LAST_STEP = 1e-5
+LEAST_CHANGE = 1e-10
+# A reduction of the sum of squares by this part of it is lost in rounding.
+ROUNDING = 1e-11
 
 
 class Coordinates(NamedTuple):
@@ -28,10 +34,13 @@ class Coordinates(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of each experiment (e, m), and those that depend on the unknowns in common alone (k,)."""
+    """Of each experiment (e, m), and those that depend on the unknowns in common alone (k,).
 
-    own: Float[Array, "e m"]
-    shared: Float[Array, "k"]
+    Or their derivatives, by the unknowns in common and then by those of each experiment, along a leading axis p + q.
+    """
+
+    own: Float[Array, "... e m"]
+    shared: Float[Array, "... k"]
 
 
 class NormalEquations(eqx.Module):
@@ -49,28 +58,17 @@ class NormalEquations(eqx.Module):
     scores: Float[Array, "e p"]
 
     @staticmethod
-    def of(jacobian: Callable[[Coordinates], Residuals], residuals: Residuals, at: Coordinates) -> "NormalEquations":
-        """`jacobian`: changes of the unknowns to those of the residuals."""
-        p, q = at.shared.shape[0], at.own.shape[1]
-        dtype = at.shared.dtype
-
-        def by_shared(way: Float[Array, "p"]) -> Residuals:
-            return jacobian(Coordinates(way, jnp.zeros_like(at.own)))
-
-        def by_own(way: Float[Array, "q"]) -> Residuals:
-            return jacobian(Coordinates(jnp.zeros_like(at.shared), jnp.broadcast_to(way[None], at.own.shape)))
-
-        shared = jax.vmap(by_shared)(jnp.eye(p, dtype=dtype))
-        own = jax.vmap(by_own)(jnp.eye(q, dtype=dtype)).own
-        scores = jnp.einsum("pem,em->ep", shared.own, residuals.own)
+    def of(jacobian: Residuals, residuals: Residuals, p: int) -> "NormalEquations":
+        by_shared, by_own = jacobian.own[:p], jacobian.own[p:]
+        alone = jacobian.shared[:p]
+        scores = jnp.einsum("pem,em->ep", by_shared, residuals.own)
         return NormalEquations(
-            each=jnp.einsum("pem,rem->epr", shared.own, shared.own),
-            alone=shared.shared @ shared.shared.T,
-            so=jnp.einsum("pem,qem->epq", shared.own, own),
-            oo=jnp.einsum("qem,rem->eqr", own, own),
+            each=jnp.einsum("pem,rem->epr", by_shared, by_shared),
+            alone=alone @ alone.T,
+            so=jnp.einsum("pem,qem->epq", by_shared, by_own),
+            oo=jnp.einsum("qem,rem->eqr", by_own, by_own),
             gradient=Coordinates(
-                jnp.sum(scores, axis=0) + shared.shared @ residuals.shared,
-                jnp.einsum("qem,em->eq", own, residuals.own),
+                jnp.sum(scores, axis=0) + alone @ residuals.shared, jnp.einsum("qem,em->eq", by_own, residuals.own)
             ),
             scores=scores,
         )
@@ -78,6 +76,12 @@ class NormalEquations(eqx.Module):
     @property
     def ss(self) -> Float[Array, "p p"]:
         return jnp.sum(self.each, axis=0) + self.alone
+
+    def times(self, change: Coordinates) -> Coordinates:
+        return Coordinates(
+            self.ss @ change.shared + jnp.einsum("epq,eq->p", self.so, change.own),
+            jnp.einsum("epq,p->eq", self.so, change.shared) + jnp.einsum("eqr,er->eq", self.oo, change.own),
+        )
 
     def damped(self, damping: Float[Array, ""], is_free: Coordinates) -> "NormalEquations":
         """With a number added to the diagonal, and 1 there of what is not free."""
@@ -88,15 +92,11 @@ class NormalEquations(eqx.Module):
             (self.alone + jnp.diag(added.shared), self.oo + jax.vmap(jnp.diag)(added.own)),
         )
 
-    def eliminated(self) -> tuple[Float[Array, "p p"], Float[Array, "e q p"]]:
-        """What is left for the unknowns in common, and how those of experiments follow: o = -W s."""
-        following = jax.vmap(_solved)(self.oo, jnp.swapaxes(self.so, 1, 2))
-        return self.ss - jnp.einsum("epq,eqr->pr", self.so, following), following
-
     def solution(self) -> Coordinates:
-        """The unknowns that take the gradient."""
-        left, following = self.eliminated()
+        """The unknowns that take the gradient: those of the experiments are eliminated."""
+        following = jax.vmap(_solved)(self.oo, jnp.swapaxes(self.so, 1, 2))
         alone = jax.vmap(_solved)(self.oo, self.gradient.own[..., None])[..., 0]
+        left = self.ss - jnp.einsum("epq,eqr->pr", self.so, following)
         right = self.gradient.shared - jnp.einsum("epq,eq->p", self.so, alone)
         shared = _solved(left, right[:, None])[:, 0]
         return Coordinates(shared, alone - jnp.einsum("eqp,p->eq", following, shared))
@@ -108,41 +108,8 @@ def _solved(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Float[Ar
     return linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right)
 
 
-class _State(eqx.Module):
-    normal: NormalEquations
-
-
-class _DampedDescent(optx.AbstractDescent):
-    is_free: Coordinates
-
-    def init(self, y: Coordinates, f_info_struct: Any) -> _State:
-        def nothing(*shape: int) -> Array:
-            return jnp.zeros(shape, y.shared.dtype)
-
-        (p,), (e, q) = y.shared.shape, y.own.shape
-        gradient = Coordinates(nothing(p), nothing(e, q))
-        blocks = nothing(e, p, p), nothing(p, p), nothing(e, p, q), nothing(e, q, q)
-        return _State(NormalEquations(*blocks, gradient, nothing(e, p)))
-
-    def query(self, y: Coordinates, f_info: Any, state: _State) -> _State:
-        return _State(NormalEquations.of(f_info.jac.mv, f_info.residual, y))
-
-    def step(self, step_size: Float[Array, ""], state: _State) -> tuple[Coordinates, optx.RESULTS]:
-        found = state.normal.damped(1 / step_size, self.is_free).solution()
-        return jax.tree.map(jnp.negative, found), optx.RESULTS.successful
-
-
-class _LevenbergMarquardt(optx.AbstractGaussNewton):
-    rtol: float
-    atol: float
-    norm: Callable[[Any], Array] = eqx.field(static=True)
-    descent: Any
-    search: Any
-    verbose: Callable[..., None] = eqx.field(static=True)
-
-
 class LeastSquares(eqx.Module):
-    """Where the search ended: the unknowns, what the residuals gave beside, their sum of squares, whether converged."""
+    """Where the search ended: the unknowns, what was evaluated there, the sum of squares, whether it has converged."""
 
     at: Coordinates
     beside: Any
@@ -151,49 +118,82 @@ class LeastSquares(eqx.Module):
     steps: Int[Array, ""]
 
 
+class _Point(NamedTuple):
+    at: Coordinates
+    beside: Any
+    normal: NormalEquations
+    squares: Float[Array, ""]
+
+
+class _State(NamedTuple):
+    here: _Point
+    following: Coordinates
+    region: Any
+    steps: Int[Array, ""]
+    is_done: Bool[Array, ""]
+
+
 def least_squares(
-    residuals: Callable[[Coordinates, Any], tuple[Residuals, Any]],
+    evaluated: Callable[[Coordinates, Any, Bool[Array, ""]], tuple[NormalEquations, Float[Array, ""], Any]],
     start: Coordinates,
     beside: Any,
     is_free: Coordinates,
-    tolerance: float,
+    numbers: Float[Array, ""],
     max_steps: int,
 ) -> LeastSquares:
-    """The unknowns at which the sum of squares is least.
+    """The unknowns at which a sum of squares is least.
 
-    `residuals`: of the unknowns, and of what the last accepted evaluation gave beside the residuals, at first `beside`;
-    `tolerance`: of the unknowns, and of the residuals by the largest of them.
+    `evaluated(at, beside, is_first)`: the normal equations and the sum of squares, not a number where there is none;
+    and what the next evaluation begins from, at first `beside`. `numbers`: how many residuals there are.
     """
-    solver = _LevenbergMarquardt(
-        rtol=tolerance,
-        atol=tolerance,
-        norm=optx.max_norm,
-        descent=_DampedDescent(is_free),
-        search=optx.ClassicalTrustRegion(),
-        verbose=_silent,
+    search = optx.ClassicalTrustRegion()
+
+    def before(here: _Point) -> Any:
+        unknowns = jax.eval_shape(lambda: here.at)
+        hessian = lx.FunctionLinearOperator(here.normal.times, unknowns, lx.positive_semidefinite_tag)
+        return optx.FunctionInfo.EvalGradHessian(here.squares / 2, here.normal.gradient, hessian)
+
+    def step(state: _State) -> _State:
+        is_first = state.steps == 0
+        here = state.here
+        there = _point(evaluated, state.following, here.beside, is_first)
+        change = jax.tree.map(jnp.subtract, there.at, here.at)
+        size, is_better, _, region = search.step(
+            is_first, here.at, there.at, before(here), optx.FunctionInfo.Eval(there.squares / 2), state.region
+        )
+        predicted = -search.predict_reduction(change, before(here))
+        squared = _dot(change, here.normal.times(change))
+        largest = jnp.max(jnp.abs(jnp.concatenate([change.shared, change.own.reshape(-1)])), initial=0.0)
+        free = jnp.sum(is_free.shared) + jnp.sum(is_free.own)
+        freedom = jnp.maximum(numbers - free.astype(numbers.dtype), 1.0)
+        is_last = (squared <= LAST_STEP**2 * there.squares / freedom) | (largest < LEAST_CHANGE)
+        is_lost = ~is_better & (predicted <= ROUNDING * here.squares)
+        kept = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), there, here)
+        found = kept.normal.damped(1 / size, is_free).solution()
+        following = jax.tree.map(jnp.subtract, kept.at, found)
+        is_done = ~is_first & ((is_better & is_last) | is_lost)
+        return _State(kept, following, region, state.steps + 1, is_done)
+
+    def is_running(state: _State) -> Bool[Array, ""]:
+        is_stuck = state.region.step_size < LEAST_STEP
+        return ~state.is_done & (state.steps < max_steps) & ~is_stuck
+
+    shapes = jax.eval_shape(lambda: _point(evaluated, start, beside, jnp.array(True)))
+    nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+    begin = _Point(start, beside, nothing.normal, nothing.squares)
+    region = eqx.tree_at(
+        lambda region: region.step_size,
+        search.init(start, before(begin)),
+        jnp.asarray(FIRST_STEP, start.shared.dtype),
     )
-    no_tags: frozenset[object] = frozenset()
-    shapes, beside_shapes = jax.eval_shape(residuals, start, beside)
-    begin = solver.init(residuals, start, beside, {}, shapes, beside_shapes, no_tags)
-    # At first the trust region is wide: near the solution the method is Newton's.
-    wide = eqx.tree_at(lambda state: state.search_state.step_size, begin, jnp.asarray(FIRST_STEP, start.shared.dtype))
-    numbers, rest = eqx.partition(wide, eqx.is_array)
-
-    def is_running(carry: Any) -> Bool[Array, ""]:
-        _, numbers, _ = carry
-        state = eqx.combine(numbers, rest)
-        is_stuck = state.search_state.step_size < LEAST_STEP
-        return ~state.terminate & (state.num_steps < max_steps) & ~is_stuck
-
-    def step(carry: Any) -> Any:
-        y, numbers, beside = carry
-        y, state, _ = solver.step(residuals, y, beside, {}, eqx.combine(numbers, rest), no_tags)
-        return y, eqx.filter(state, eqx.is_array), state.aux
-
-    at, numbers, beside = jax.lax.while_loop(is_running, step, (start, numbers, beside))
-    state = eqx.combine(numbers, rest)
-    squares = sum(jnp.sum(x**2) for x in state.f_info.residual)
-    return LeastSquares(at, beside, jnp.asarray(squares), state.terminate, state.num_steps)
+    end = jax.lax.while_loop(is_running, step, _State(begin, start, region, jnp.zeros((), int), jnp.array(False)))
+    return LeastSquares(end.here.at, end.here.beside, end.here.squares, end.is_done, end.steps)
 
 
-def _silent(**kwargs: Any) -> None: ...
+def _point(evaluated: Callable[..., Any], at: Coordinates, beside: Any, is_first: Bool[Array, ""]) -> _Point:
+    normal, squares, beside = evaluated(at, beside, is_first)
+    return _Point(at, beside, normal, squares)
+
+
+def _dot(a: Coordinates, b: Coordinates) -> Float[Array, ""]:
+    return jnp.sum(a.shared * b.shared) + jnp.sum(a.own * b.own)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from rodjax.checks import instance, is_known, leaf, number_array, number_list, one_of, positive, shown, vector
 from rodjax.guess import Guess
@@ -54,6 +55,11 @@ class Measurement(eqx.Module):
     @abstractmethod
     def values(self) -> Float[Array, "..."]:
         """The measured numbers."""
+
+    @property
+    def kind(self) -> Any:
+        """What measurements must have in common to be stacked."""
+        return jax.tree.structure(self), tuple(leaf.shape for leaf in jax.tree.leaves(self))
 
     @abstractmethod
     def moved(self, change: Float[Array, "k d"]) -> "Measurement":
@@ -126,16 +132,22 @@ class Centerline(Measurement):
 
     @property
     def unit(self) -> str:
-        return "m" if self.camera is None else "px"
+        return "m" if self.is_affine else "px"
 
     @property
     def values(self) -> Float[Array, "m d"]:
         return self.points
 
+    @property
+    def kind(self) -> Any:
+        return jax.tree.structure(self), self.points.shape[1]
+
     def moved(self, change: Float[Array, "m d"]) -> "Centerline":
         return eqx.tree_at(lambda measured: measured.points, self, self.points + change)
 
     def with_rows(self, count: int) -> "Centerline":
+        if count == len(self.weights):
+            return self
         rows = np.minimum(np.arange(count), len(self.weights) - 1)
         weights = np.asarray(self.weights)[rows] * (np.arange(count) < len(self.weights))
         new = [leaf(np.asarray(self.points)[rows]), leaf(weights)]
@@ -148,6 +160,16 @@ class Centerline(Measurement):
     def is_affine(self) -> bool:
         """Whether what is measured is a linear function of the positions, but for a constant."""
         return self.camera is None or bool(np.all(np.asarray(self.camera)[2] == (0, 0, 0, 1)))
+
+    def lifted(self, through: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3"]:
+        """The points in the scene, where `is_affine`; those of a picture at the depth of a point of the scene."""
+        linear = float(self.scale) * Rotation.from_rotvec(np.array(self.turn)).as_matrix()
+        constant = np.asarray(self.offset)
+        if self.camera is not None:
+            camera = np.asarray(self.camera)
+            linear, constant = camera[:2, :3] @ linear, camera[:2, :3] @ constant + camera[:2, 3]
+        beyond = np.asarray(self.points) - (linear @ through + constant)
+        return through + beyond @ np.linalg.pinv(linear).T
 
     def seen(self, positions: Float[Array, "k 3"]) -> Float[Array, "k d"]:
         """Positions in the scene as the rig measures them."""

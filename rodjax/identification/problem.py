@@ -1,25 +1,24 @@
 """Experiments and unknowns as one problem of least squares: arrays to be compiled, and what programs depend on."""
 
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.compilation import compiled
 from rodjax.equilibrium import Discretization, solve
-from rodjax.identification.least_squares import Coordinates, LeastSquares, NormalEquations, Residuals, least_squares
+from rodjax.identification.least_squares import Coordinates, NormalEquations, Residuals, least_squares
 from rodjax.identification.loss import Loss, influence, robust
 from rodjax.identification.measurements import Experiment
 from rodjax.identification.unknowns import Scale, inside, nominal, with_values
 from rodjax.result import Equilibrium
-
-# Of the unknowns, those of large size being 1, and of the residuals by the largest of them.
-TOLERANCE = 1e-8
+from rodjax.scene import Scene
 
 
 class Sought(NamedTuple):
@@ -97,6 +96,19 @@ class Problem(eqx.Module):
     threshold: Float[Array, ""]
     critical: "Critical"
 
+    @property
+    def places(self) -> list[slice]:
+        """Of the experiments of each group among all."""
+        ends = np.cumsum([0, *(group.weights.shape[0] for group in self.groups)]).tolist()
+        return [slice(first, end) for first, end in itertools.pairwise(ends)]
+
+    @property
+    def unbounded(self) -> "Problem":
+        """What is varied are then the unknowns by their sizes."""
+        return eqx.tree_at(
+            lambda problem: (problem.shared, problem.own), self, (self.shared.unbounded, self.own.unbounded)
+        )
+
 
 class Critical(eqx.Module):
     """Deviations of critical values by their standard deviations, linear about a point in coordinates.
@@ -126,144 +138,230 @@ def values(structure: Structure, problem: Problem, at: Coordinates) -> tuple[Flo
     return shared, in_units(structure.own, problem.own.coordinates(at.own))
 
 
-def solved_experiment(
-    structure: Structure, experiment: Experiment, shared: Float[Array, "p"], own: Float[Array, "q"], guess: Any
-) -> tuple[Experiment, Equilibrium]:
-    """The experiment with these values of the unknowns, and its equilibrium."""
+def with_unknowns(
+    structure: Structure, experiment: Experiment, shared: Float[Array, "p"], own: Float[Array, "q"]
+) -> Experiment:
+    """The experiment with these values of the unknowns."""
     sought = (*structure.shared, *structure.own)
     numbers = [*shared[: len(structure.shared)], *own]
     experiment = with_values(experiment, [one.names for one in sought], [one.scale for one in sought], numbers)
-    if structure.factors:
-        factors = shared[len(structure.shared) :]
-        names = [(name,) for name in structure.factors]
-        held = [nominal(name, experiment) for name in names]
-        numbers = [jnp.asarray(number) * factor for number, factor in zip(held, factors, strict=True)]
-        experiment = with_values(experiment, names, ["linear"] * len(names), numbers)
-    result = solve(
-        experiment.scene,
+    if not structure.factors:
+        return experiment
+    names = [(name,) for name in structure.factors]
+    held = [nominal(name, experiment) for name in names]
+    factors = shared[len(structure.shared) :]
+    numbers = [jnp.asarray(number) * factor for number, factor in zip(held, factors, strict=True)]
+    return with_values(experiment, names, ["linear"] * len(names), numbers)
+
+
+def solved(structure: Structure, scene: Scene, guess: Equilibrium) -> Equilibrium:
+    return solve(
+        scene,
         segments=structure.segments,
         discretization=structure.discretization,
         planar=structure.planar,
         guess=guess,
     )
-    return experiment, result
-
-
-def rows(experiment: Experiment, result: Equilibrium) -> list[Float[Array, "k d"]]:
-    """The deviations of each measurement by their standard deviations."""
-    return [measurement.weights[:, None] * measurement.deviations(result) for measurement in experiment.measured]
 
 
 Rows = list[Float[Array, "e k d"]]
 
 
-def deviations(
-    structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Equilibrium, ...]
-) -> tuple[tuple[Rows, ...], tuple[Equilibrium, ...]]:
-    """Of each measurement of each group by their scale, 0 of experiments that are left out; and the equilibria.
+class Evaluation(eqx.Module):
+    """The experiments with some values of the unknowns.
 
-    Not a number where a solve did not converge, so that the step is not accepted.
+    `rows`: deviations of each measurement of each group by their weights; `changes`: their derivatives by the unknowns
+    in common and then by those of each experiment, by their sizes, along a leading axis p + q; `results`: the
+    equilibria; `is_used` (e,): the experiments that count.
     """
-    shared, own = values(structure, problem, at)
 
-    def one(experiment: Experiment, own: Float[Array, "q"], guess: Equilibrium):
-        experiment, result = solved_experiment(structure, experiment, shared, own, guess)
-        return rows(experiment, result), result
+    rows: tuple[Rows, ...]
+    changes: tuple[Rows, ...]
+    results: tuple[Equilibrium, ...]
+    is_used: Bool[Array, "e"]
 
-    found, results = [], []
-    first = 0
-    for group, guess in zip(problem.groups, guesses, strict=True):
-        count = group.weights.shape[0]
-        here, result = jax.vmap(one)(group.experiments, own[first : first + count], guess)
-        is_used, is_found = (x[:, None, None] for x in (group.weights > 0, result.converged))
-        found.append([jnp.where(is_used, jnp.where(is_found, x, jnp.nan) / problem.scale, 0.0) for x in here])
-        results.append(result)
-        first += count
-    return tuple(found), tuple(results)
+    @property
+    def converged(self) -> Bool[Array, "e"]:
+        return jnp.concatenate([result.converged for result in self.results])
 
 
-def laid_out(problem: Problem, at: Coordinates, found: tuple[Rows, ...]) -> Residuals:
-    """Deviations as residuals: those of one experiment, with the prior of its own unknowns, in one row."""
-    priors = problem.own.deviations(at.own)
+def evaluation(
+    structure: Structure, problem: Problem, z: Coordinates, guesses: tuple[Equilibrium, ...], is_used: Bool[Array, "e"]
+) -> Evaluation:
+    """At unknowns by their sizes, on the scale on which they are sought."""
+
+    def rows(z: Coordinates) -> tuple[tuple[Rows, ...], tuple[Equilibrium, ...]]:
+        shared, own = values(structure, problem.unbounded, z)
+
+        def one(experiment: Experiment, own: Float[Array, "q"], guess: Equilibrium):
+            experiment = with_unknowns(structure, experiment, shared, own)
+            result = solved(structure, experiment.scene, guess)
+            found = [measured.weights[:, None] * measured.deviations(result) for measured in experiment.measured]
+            return found, result
+
+        pairs = [
+            jax.vmap(one)(group.experiments, own[here], guess)
+            for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
+        ]
+        return tuple([found for found, _ in pairs]), tuple([result for _, result in pairs])
+
+    found, tangent, results = jax.linearize(rows, z, has_aux=True)
+    (p,), (e, q) = z.shared.shape, z.own.shape
+    ways = jnp.eye(p + q, dtype=z.shared.dtype)
+    of_own = jnp.broadcast_to(ways[:, None, p:], (p + q, e, q))
+    changes = jax.vmap(tangent)(Coordinates(ways[:, :p], of_own))
+    return Evaluation(found, changes, results, is_used)
+
+
+def _laid_out(problem: Problem, rows: tuple[Rows, ...], own: Float[Array, "e j"]) -> Float[Array, "e m"]:
+    """The deviations of each experiment in one row, with `own` behind them."""
     parts = []
-    first = 0
-    for group in found:
-        count = group[0].shape[0]
-        flat = [x.reshape(count, -1) for x in group]
-        parts.append(jnp.concatenate([*flat, priors[first : first + count]], axis=1))
-        first += count
+    for group, here in zip(rows, problem.places, strict=True):
+        count = here.stop - here.start
+        parts.append(jnp.concatenate([*(x.reshape(count, -1) for x in group), own[here]], axis=1))
     width = max(part.shape[1] for part in parts)
-    own = jnp.concatenate([jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
-    critical = problem.critical(problem.shared.coordinates(at.shared))
-    return Residuals(own, jnp.concatenate([problem.shared.deviations(at.shared), critical]))
+    return jnp.concatenate([jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
 
 
-def search(
-    structure: Structure, problem: Problem, start: Coordinates, guesses: tuple[Equilibrium, ...]
-) -> LeastSquares:
-    """The least squares of a problem, from a start with its equilibria."""
+def _used(problem: Problem, rows: tuple[Rows, ...], is_used: Bool[Array, "e"]) -> tuple[Rows, ...]:
+    """Rows by the scale, 0 of experiments that do not count."""
+    return tuple(
+        [jnp.where(is_used[here][:, None, None], x / problem.scale, 0.0) for x in group]
+        for group, here in zip(rows, problem.places, strict=True)
+    )
 
-    def counted(at: Coordinates, guesses: tuple[Equilibrium, ...]) -> tuple[Residuals, tuple[Equilibrium, ...]]:
-        free = jax.tree.map(lambda x, x0, free: jnp.where(free, x, x0), at, start, problem.is_free)
-        found, results = deviations(structure, problem, free, guesses)
-        robustly = functools.partial(robust, loss=structure.loss, threshold=problem.threshold)
-        return laid_out(problem, free, jax.tree.map(jax.vmap(robustly), found)), results
 
-    return least_squares(counted, start, guesses, problem.is_free, TOLERANCE, structure.max_steps)
+def _normal_equations(
+    problem: Problem,
+    at: Coordinates,
+    found: Evaluation,
+    transform: Callable[[Float[Array, "k d"]], Float[Array, "k d"]],
+) -> tuple[NormalEquations, Residuals]:
+    """Of deviations so transformed and of priors and critical values, by the unknowns that a solver varies."""
+    ways = found.changes
+
+    def counted(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
+        return jax.tree.map(jax.vmap(transform), _used(problem, rows, found.is_used))
+
+    def beyond(at: Coordinates) -> tuple[Float[Array, "e q"], Float[Array, "k"]]:
+        critical = problem.critical(problem.shared.coordinates(at.shared))
+        return problem.own.deviations(at.own), jnp.concatenate([problem.shared.deviations(at.shared), critical])
+
+    def within(at: Coordinates) -> Coordinates:
+        return Coordinates(problem.shared.within(at.shared), problem.own.within(at.own))
+
+    (p,), (e, q) = at.shared.shape, at.own.shape
+    units = jnp.eye(p + q, dtype=at.shared.dtype)
+    bases = Coordinates(units[:, :p], jnp.broadcast_to(units[:, None, p:], (p + q, e, q)))
+
+    def column(base: Coordinates, way: tuple[Rows, ...]) -> Residuals:
+        base = jax.tree.map(lambda x, free: jnp.where(free, x, 0.0), base, problem.is_free)
+        _, rates = jax.jvp(within, (at,), (base,))
+        # Of unknowns in common the same rate for all, of the others that of each experiment.
+        rate = jnp.sum(rates.shared) + jnp.sum(rates.own, axis=1)
+        _, change = jax.jvp(counted, (found.rows,), (way,))
+        scaled = tuple(
+            [x * rate[here][:, None, None] for x in group] for group, here in zip(change, problem.places, strict=True)
+        )
+        _, (own, alone) = jax.jvp(beyond, (at,), (base,))
+        return Residuals(_laid_out(problem, scaled, own), alone)
+
+    own, alone = beyond(at)
+    residuals = Residuals(_laid_out(problem, counted(found.rows), own), alone)
+    return NormalEquations.of(jax.vmap(column)(bases, ways), residuals, p), residuals
+
+
+class Found(eqx.Module):
+    """Where a search ended, and what the data say there.
+
+    `information`: the normal equations of the deviations themselves, whatever the loss, by the unknowns' sizes, with
+    the gradient of how much they count; `counted`: sum of squares of how much they count; `slope`: mean of its
+    derivative.
+    """
+
+    at: Coordinates
+    evaluation: Evaluation
+    squares: Float[Array, ""]
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]
+    information: NormalEquations
+    counted: Float[Array, ""]
+    slope: Float[Array, ""]
+
+
+def search(structure: Structure, problem: Problem, start: Coordinates, guesses: tuple[Equilibrium, ...]) -> Found:
+    """The least squares of a problem, from a start.
+
+    Experiments without an equilibrium there do not count.
+    """
+    robustly = functools.partial(robust, loss=structure.loss, threshold=problem.threshold)
+    weights = jnp.concatenate([group.weights for group in problem.groups]) > 0
+
+    def evaluated(
+        at: Coordinates, last: Evaluation, is_first: Bool[Array, ""]
+    ) -> tuple[NormalEquations, Float[Array, ""], Evaluation]:
+        z = Coordinates(problem.shared.within(at.shared), problem.own.within(at.own))
+        found = evaluation(structure, problem, z, last.results, last.is_used)
+        is_used = jnp.where(is_first, weights & found.converged, last.is_used)
+        found = eqx.tree_at(lambda found: found.is_used, found, is_used)
+        normal, residuals = _normal_equations(problem, at, found, robustly)
+        squares = jnp.sum(residuals.own**2) + jnp.sum(residuals.shared**2)
+        # A step to where there is no equilibrium is taken back.
+        return normal, jnp.where(jnp.all(found.converged | ~is_used), squares, jnp.nan), found
+
+    def first() -> Evaluation:
+        z = Coordinates(problem.shared.within(start.shared), problem.own.within(start.own))
+        return evaluation(structure, problem, z, guesses, weights)
+
+    blank = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(first))
+    before = eqx.tree_at(lambda found: (found.results, found.is_used), blank, (guesses, weights))
+    numbers = jnp.asarray(float(sum(x.size for group in blank.rows for x in group)), problem.scale.dtype)
+    end = least_squares(evaluated, start, before, problem.is_free, numbers, structure.max_steps)
+    found = end.beside
+    told = _information(structure, problem, end.at, found)
+    return Found(end.at, found, end.squares, end.converged & jnp.any(found.is_used), end.steps, *told)
 
 
 search_compiled = functools.partial(compiled, static_argnames=("structure",))(search)
 
 
-class Information(eqx.Module):
-    """What the data say about the unknowns where a search ended, by the sizes of the unknowns.
-
-    `normal`: of the deviations themselves, whatever the loss, with the gradient of how much they count; `squares`: sum
-    of the squares of how much they count; `slope`: mean of its derivative; `rows`: deviations of each measurement of
-    each group by their scale.
-    """
-
-    normal: NormalEquations
-    squares: Float[Array, ""]
-    slope: Float[Array, ""]
-    rows: tuple[Rows, ...]
-
-
 @functools.partial(compiled, static_argnames=("structure",))
-def information(
-    structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Equilibrium, ...]
-) -> Information:
-    here = Coordinates(problem.shared.within(at.shared), problem.own.within(at.own))
-    # Statistics are on the scale of the unknowns, not on that which the bounds bend.
-    problem = eqx.tree_at(
-        lambda problem: (problem.shared, problem.own), problem, (problem.shared.unbounded, problem.own.unbounded)
-    )
+def looked_at(structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Equilibrium, ...]) -> Found:
+    """What a search that takes no step finds."""
+    weights = jnp.concatenate([group.weights for group in problem.groups]) > 0
+    z = Coordinates(problem.shared.within(at.shared), problem.own.within(at.own))
+    found = evaluation(structure, problem, z, guesses, weights)
+    found = eqx.tree_at(lambda found: found.is_used, found, found.is_used & found.converged)
+    told = _information(structure, problem, at, found)
+    return Found(at, found, jnp.zeros_like(problem.scale), jnp.array(True), jnp.zeros((), int), *told)
 
-    def plain(z: Coordinates) -> tuple[Residuals, tuple[Rows, ...]]:
-        found, _ = deviations(structure, problem, z, guesses)
-        return laid_out(problem, z, found), found
 
-    _, jacobian, found = jax.linearize(plain, here, has_aux=True)
-
-    def by_free(change: Coordinates) -> Residuals:
-        return jacobian(jax.tree.map(lambda x, free: jnp.where(free, x, 0.0), change, problem.is_free))
-
+def _information(
+    structure: Structure, problem: Problem, at: Coordinates, found: Evaluation
+) -> tuple[NormalEquations, Float[Array, ""], Float[Array, ""]]:
+    z = Coordinates(problem.shared.within(at.shared), problem.own.within(at.own))
+    # Statistics are on the scale of the unknowns, not on that which the bounds bend; and of what is held, too.
+    is_factor = jnp.arange(at.shared.shape[0]) >= len(structure.shared)
+    natural = eqx.tree_at(lambda problem: problem.is_free.shared, problem.unbounded, problem.is_free.shared | is_factor)
+    normal, _ = _normal_equations(natural, z, found, lambda rows: rows)
+    rows = _used(problem, found.rows, found.is_used)
     how_much = functools.partial(influence, loss=structure.loss, threshold=problem.threshold)
-    pairs = [[jax.vmap(how_much)(x) for x in group] for group in found]
+    pairs = [[jax.vmap(how_much)(x) for x in group] for group in rows]
     counts = tuple([count for count, _ in group] for group in pairs)
-    weights = [
-        [(measurement.weights > 0) & (group.weights > 0)[:, None] for measurement in group.experiments.measured]
-        for group in problem.groups
-    ]
-    slopes = [
-        jnp.sum(jnp.where(weight, slope, 0.0))
-        for of_group, weight_of_group in zip(pairs, weights, strict=True)
-        for (_, slope), weight in zip(of_group, weight_of_group, strict=True)
-    ]
-    numbers = [jnp.sum(weight).astype(problem.scale.dtype) for of_group in weights for weight in of_group]
-    return Information(
-        normal=NormalEquations.of(by_free, laid_out(problem, here, counts), here),
-        squares=sum((jnp.sum(x**2) for group in counts for x in group), jnp.zeros_like(problem.scale)),
-        slope=sum(slopes[1:], slopes[0]) / sum(numbers[1:], numbers[0]),
-        rows=found,
-    )
+    squares = sum((jnp.sum(x**2) for group in counts for x in group), jnp.zeros_like(problem.scale))
+    slopes, numbers = jnp.zeros_like(squares), jnp.zeros_like(squares)
+    for of_group, group, here in zip(pairs, problem.groups, problem.places, strict=True):
+        for (_, slope), measured in zip(of_group, group.experiments.measured, strict=True):
+            weight = (measured.weights > 0) & found.is_used[here][:, None]
+            slopes += jnp.sum(jnp.where(weight, slope, 0.0))
+            numbers += jnp.sum(weight).astype(numbers.dtype)
+    if structure.loss != "linear":
+        # The gradient of how much deviations count.
+        plain = Evaluation(
+            jax.tree.map(lambda x: x * problem.scale, counts), found.changes, found.results, found.is_used
+        )
+        weighted, _ = _normal_equations(natural, z, plain, lambda rows: rows)
+        normal = eqx.tree_at(
+            lambda normal: (normal.gradient, normal.scores), normal, (weighted.gradient, weighted.scores)
+        )
+    return normal, squares, slopes / numbers

@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rodjax.checks import leaf, number_list, whole_number
 from rodjax.compilation import compiled
-from rodjax.identification.least_squares import Coordinates, LeastSquares
+from rodjax.identification.lanes import in_lanes
+from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment
-from rodjax.identification.problem import Problem, Structure, deviations, information, search, values
-from rodjax.identification.setup import LANES, Setup, begun, name_of, prepared, solutions, stacked, structure_of
+from rodjax.identification.problem import Found, Problem, Rows, Structure, looked_at, search, values
+from rodjax.identification.setup import Setup, beginnings, begun, name_of, prepared, stacked, structure_of
 from rodjax.identification.statistics import Blocks
 from rodjax.identification.unknowns import outside
 from rodjax.result import Equilibrium
@@ -35,26 +36,19 @@ def _refit(structure: Structure, problem: Problem, start: Coordinates, guesses: 
     return _Refit(values(structure, problem, found.at)[0], found.squares, found.converged)
 
 
-def _side_by_side(problem: Problem) -> int:
-    """As many fits at a time as fill the lanes."""
-    return max(1, LANES // problem.is_free.own.shape[0])
-
-
 # --- without a cluster -----------------------------------------------------------------------------------------------
 
 
-def leave_one_out(
-    setup: Setup, structure: Structure, problem: Problem, found: LeastSquares
-) -> dict[str, dict[str, float]]:
+def leave_one_out(setup: Setup, structure: Structure, problem: Problem, found: Found) -> dict[str, dict[str, float]]:
     labels = np.array([setup.experiments[k].cluster or name_of(setup, k) for k in setup.order])
     clusters = sorted(set(labels.tolist()))
     if len(clusters) < 2:
         raise ValueError(f"experiments must be of at least two clusters to leave one out, got {len(clusters)}")
     given = np.concatenate([np.asarray(group.weights) for group in problem.groups])
     weights = leaf(np.stack([given * (labels != name) for name in clusters]))
-    fits = _without(structure, problem, found.at, found.beside, weights)
-    estimates = np.where(np.asarray(fits.converged)[:, None], np.asarray(fits.shared), np.nan)
+    fits = _without(structure, problem, found.at, found.evaluation.results, weights)
     names = [unknown.label for unknown in setup.shared]
+    estimates = np.where(np.asarray(fits.converged)[:, None], np.asarray(fits.shared), np.nan)[:, : len(names)]
     return {name: dict(zip(names, row, strict=True)) for name, row in zip(clusters, estimates.tolist(), strict=True)}
 
 
@@ -70,7 +64,7 @@ def _without(
         less = eqx.tree_at(lambda problem: [group.weights for group in problem.groups], problem, parts)
         return _refit(structure, less, at, guesses)
 
-    return jax.lax.map(one, weights, batch_size=_side_by_side(problem))
+    return in_lanes(one, (weights,), weights.shape[1])
 
 
 # --- with an unknown held --------------------------------------------------------------------------------------------
@@ -106,7 +100,7 @@ class Profile:
 
 
 def profile(
-    setup: Setup, structure: Structure, problem: Problem, found: LeastSquares, k: int, at: Any, dispersion: float
+    setup: Setup, structure: Structure, problem: Problem, found: Found, k: int, at: Any, dispersion: float
 ) -> Profile:
     unknown = setup.shared[k]
     chosen = np.asarray(number_list(at, "at"), float)
@@ -122,7 +116,7 @@ def profile(
     held = eqx.tree_at(lambda problem: problem.is_free.shared, problem, leaf(is_free))
     starts = np.tile(np.asarray(found.at.shared), (len(x), 1))
     starts[:, k] = x
-    fits = _held(structure, held, leaf(starts), found.at.own, found.beside)
+    fits = _held(structure, held, leaf(starts), found.at.own, found.evaluation.results)
     converged = np.asarray(fits.converged)
     deviance = (np.asarray(fits.squares) - float(found.squares)) / dispersion
     return Profile(
@@ -130,7 +124,7 @@ def profile(
         unknown.unit,
         chosen,
         np.where(converged, deviance, np.nan),
-        np.where(converged[:, None], np.asarray(fits.shared), np.nan),
+        np.where(converged[:, None], np.asarray(fits.shared), np.nan)[:, : len(setup.shared)],
     )
 
 
@@ -138,10 +132,8 @@ def profile(
 def _held(
     structure: Structure, problem: Problem, starts: Float[Array, "k p"], own: Float[Array, "e q"], guesses: Equilibria
 ) -> _Refit:
-    return jax.lax.map(
-        lambda shared: _refit(structure, problem, Coordinates(shared, own), guesses),
-        starts,
-        batch_size=_side_by_side(problem),
+    return in_lanes(
+        lambda shared: _refit(structure, problem, Coordinates(shared, own), guesses), (starts,), own.shape[0]
     )
 
 
@@ -149,7 +141,7 @@ def _held(
 
 
 def bootstrap(
-    setup: Setup, structure: Structure, problem: Problem, found: LeastSquares, count: int, seed: int, dispersion: float
+    setup: Setup, structure: Structure, problem: Problem, found: Found, count: int, seed: int, dispersion: float
 ) -> dict[str, Float[np.ndarray, "count"]]:
     if setup.critical:
         raise ValueError("bootstrap is not made for critical values, which are not part of a compiled program")
@@ -157,9 +149,10 @@ def bootstrap(
     whole_number(seed, "seed", 0, 2**31)
     keys = jax.random.split(jax.random.key(seed), count)
     scatter = leaf(np.asarray(np.sqrt(dispersion), problem.scale.dtype))
-    fits = _made_up(structure, problem, found.at, found.beside, keys, scatter)
+    rows = found.evaluation.rows
+    fits = _made_up(structure, problem, found.at, found.evaluation.results, rows, keys, scatter)
     estimates = np.where(np.asarray(fits.converged)[:, None], np.asarray(fits.shared), np.nan)
-    return dict(zip([unknown.label for unknown in setup.shared], estimates.T, strict=True))
+    return dict(zip([unknown.label for unknown in setup.shared], estimates.T, strict=False))
 
 
 @functools.partial(compiled, static_argnames=("structure",))
@@ -168,10 +161,11 @@ def _made_up(
     problem: Problem,
     at: Coordinates,
     guesses: Equilibria,
+    found: tuple[Rows, ...],
     keys: PRNGKeyArray,
     scatter: Float[Array, ""],
 ) -> _Refit:
-    found, _ = deviations(structure, problem, at, guesses)
+    """`found`: the deviations, whose opposite leads from what was measured to what is computed."""
 
     def one(key: PRNGKeyArray) -> _Refit:
         groups = []
@@ -181,12 +175,12 @@ def _made_up(
                 key, own_key = jax.random.split(key)
                 noise = scatter * jax.random.normal(own_key, x.shape, x.dtype)
                 weights = measurement.weights[..., None]
-                change = problem.scale * (noise - x) / jnp.where(weights > 0, weights, 1.0)
+                change = (problem.scale * noise - x) / jnp.where(weights > 0, weights, 1.0)
                 measured.append(jax.vmap(lambda m, change: m.moved(change))(measurement, change))
             groups.append(eqx.tree_at(lambda group: group.experiments.measured, group, tuple(measured)))
         return _refit(structure, eqx.tree_at(lambda problem: problem.groups, problem, tuple(groups)), at, guesses)
 
-    return jax.lax.map(one, keys, batch_size=_side_by_side(problem))
+    return in_lanes(one, (keys,), at.own.shape[0])
 
 
 # --- which to do next ------------------------------------------------------------------------------------------------
@@ -208,7 +202,7 @@ def next_experiment(
     setup: Setup,
     structure: Structure,
     problem: Problem,
-    found: LeastSquares,
+    found: Found,
     candidates: Sequence[Experiment],
     dispersion: float,
 ) -> Ranking:
@@ -218,17 +212,17 @@ def next_experiment(
     groups, guesses = stacked(planned)
     there, start = begun(planned, groups, float(problem.threshold))
     there = eqx.tree_at(lambda p: p.scale, there, problem.scale)
-    at = Coordinates(found.at.shared, start.own)
-    settings = structure._asdict()
+    p = len(setup.shared)
+    at = Coordinates(found.at.shared[:p], start.own)
+    settings = structure._replace(factors=())._asdict()
     of_candidates = structure_of(planned, **{k: v for k, v in settings.items() if k not in ("shared", "own")})
-    _, results = solutions(of_candidates, there, at, guesses, None)
-    known = _on_shared(structure, problem, found.at, found.beside, setup)
-    told = information(of_candidates, there, at, results)
-    normal = told.normal
+    told = looked_at(of_candidates, there, at, beginnings(of_candidates, there, at, guesses))
+    normal = told.information
     is_free = np.asarray(there.is_free.own)
     own = np.asarray(normal.oo) + np.eye(is_free.shape[1])[None] * ~is_free[..., None]
+    known = _on_shared(problem, found)[:p, :p]
+    converged = np.asarray(told.evaluation.is_used)
     gains, errors = np.full(len(planned.order), np.nan), np.full((len(planned.order), len(setup.shared)), np.nan)
-    converged = np.concatenate([np.asarray(result.converged) for result in results])
     for row, k in enumerate(planned.order):
         if not converged[row]:
             continue
@@ -237,17 +231,17 @@ def next_experiment(
         gains[k] = 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(known)[1])
         errors[k] = np.sqrt(dispersion * np.diag(np.linalg.inv(both)))
     shared = np.asarray(values(structure, problem, found.at)[0])
-    sizes = [float(x) for x in problem.shared.size]
-    rates = [x * size if one.scale == "log" else size for one, x, size in zip(setup.shared, shared, sizes, strict=True)]
+    sizes = [float(x) for x in problem.shared.size[:p]]
+    rates = [
+        x * size if one.scale == "log" else size for one, x, size in zip(setup.shared, shared[:p], sizes, strict=True)
+    ]
     order = [int(k) for k in np.argsort(-np.where(np.isnan(gains), -np.inf, gains))]
     labels = [unknown.label for unknown in setup.shared]
     return Ranking(order, gains, {label: errors[:, k] * rates[k] for k, label in enumerate(labels)})
 
 
-def _on_shared(
-    structure: Structure, problem: Problem, at: Coordinates, guesses: Equilibria, setup: Setup
-) -> Float[np.ndarray, "p p"]:
-    normal = information(structure, problem, at, guesses).normal
+def _on_shared(problem: Problem, found: Found) -> Float[np.ndarray, "p p"]:
+    normal = found.information
     is_free = np.asarray(problem.is_free.own)
     fixed = np.eye(is_free.shape[1])[None] * ~is_free[..., None]
     return Blocks(np.asarray(normal.ss), np.asarray(normal.so), np.asarray(normal.oo) + fixed).on_shared

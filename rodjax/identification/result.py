@@ -12,9 +12,9 @@ from scipy import stats
 
 from rodjax.checks import number_array
 from rodjax.identification import refits
-from rodjax.identification.least_squares import Coordinates, LeastSquares
+from rodjax.identification.least_squares import Coordinates, NormalEquations
 from rodjax.identification.measurements import Experiment
-from rodjax.identification.problem import Information, Problem, Structure, values
+from rodjax.identification.problem import Found, Problem, Structure, values
 from rodjax.identification.setup import Setup, name_of
 from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, undetermined
 from rodjax.identification.unknowns import Unknown
@@ -55,7 +55,7 @@ class Fit:
     setup: Setup
     structure: Structure
     problem: Problem
-    found: LeastSquares
+    found: Found
     estimate: dict[str, Any]
     standard_error: dict[str, Any]
     clustered_error: dict[str, float]
@@ -78,29 +78,29 @@ class Fit:
         setup: Setup,
         structure: Structure,
         problem: Problem,
-        found: LeastSquares,
-        info: Information,
+        found: Found,
         held: Sequence[Unknown],
         error: float,
     ) -> "Fit":
         length = float(setup.experiments[0].scene.rod.length)
         p, q = len(setup.shared), len(setup.own)
         is_free = np.asarray(problem.is_free.own)
-        whole = blocks_of(info, is_free, p + len(held))
+        whole = blocks_of(found.information, is_free)
         blocks = Blocks(whole.ss[:p, :p], whole.so[:, :p], whole.oo)
-        is_used = np.concatenate([np.asarray(group.weights) > 0 for group in problem.groups])
+        is_used = np.asarray(found.evaluation.is_used)
         numbers = count_of_numbers(setup, is_used)
         priors = int(np.sum(np.asarray(problem.shared.information) > 0))
         priors += int(np.sum(is_free * (np.asarray(problem.own.information) > 0)[None]))
         count = p + int(np.sum(is_free[is_used]))
         freedom = numbers + priors - count
-        slope = float(info.slope)
-        scatter = float(info.squares) + float(np.sum(np.asarray(problem.critical.deviation) ** 2))
+        slope = float(found.slope)
+        scatter = float(found.counted) + float(np.sum(np.asarray(problem.critical.deviation) ** 2))
         dispersion = scatter / freedom / slope**2 if freedom > 0 else (1.0 if setup.has_sd else math.nan)
         shared, own = (np.asarray(x, float) for x in values(structure, problem, found.at))
+        shared = shared[:p]
         covariance, own_covariance = blocks.covariance()
         labels = [setup.experiments[k].cluster or name_of(setup, k) for k in setup.order]
-        scores = np.asarray(info.normal.scores, float)[:, :p]
+        scores = np.asarray(found.information.scores, float)[:, :p]
         robust, clusters = clustered(blocks, scores, labels, slope, numbers, count, is_used)
         rates = _rates(setup.shared, shared, length)
         own_rates = np.stack([_rates(setup.own, row, length) for row in own]) if q else np.zeros_like(own)
@@ -129,7 +129,7 @@ class Fit:
             degrees_of_freedom=freedom,
             clusters=clusters,
             numbers=numbers,
-            residuals=_residuals(setup, problem, info),
+            residuals=_residuals(setup, found),
             statuses=_statuses(setup, found),
             undetermined=undetermined(blocks, dispersion, setup.shared, setup.own, length) if is_lost else [],
             held=held_numbers(whole, dispersion, setup.shared, held, length) if is_lost else [],
@@ -185,7 +185,7 @@ class Fit:
     def equilibrium(self, k: int) -> Equilibrium:
         """That of the k-th experiment with the estimate."""
         row = self.setup.order.index(k)
-        for result in self.found.beside:
+        for result in self.found.evaluation.results:
             count = result.s.shape[0]
             if row < count:
                 return jax.tree.map(lambda leaf, row=row: leaf[row], result)
@@ -239,12 +239,9 @@ class Fit:
         return self.labels.index(label)
 
 
-def blocks_of(info: Information, is_free: Bool[np.ndarray, "e q"], p: int) -> Blocks:
-    normal = info.normal
+def blocks_of(normal: NormalEquations, is_free: Bool[np.ndarray, "e q"]) -> Blocks:
     fixed = np.eye(is_free.shape[1])[None] * ~is_free[..., None]
-    return Blocks(
-        np.asarray(normal.ss, float)[:p, :p], np.asarray(normal.so, float)[:, :p], np.asarray(normal.oo, float) + fixed
-    )
+    return Blocks(np.asarray(normal.ss, float), np.asarray(normal.so, float), np.asarray(normal.oo, float) + fixed)
 
 
 def _rates(unknowns: Sequence[Unknown], at: Float[np.ndarray, "n"], length: float) -> Float[np.ndarray, "n"]:
@@ -259,22 +256,17 @@ def count_of_numbers(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> int:
     return sum(m.numbers * len(m.weights) for one in used for m in one.measured) + len(setup.critical)
 
 
-def _residuals(setup: Setup, problem: Problem, info: Information) -> list[list[Float[np.ndarray, "k d"]]]:
-    found: dict[int, list[np.ndarray]] = {}
-    places = iter(setup.order)
-    for group, rows in zip(problem.groups, info.rows, strict=True):
-        for row in range(group.weights.shape[0]):
-            k = next(places)
-            parts = []
-            for of_measurement, measured in zip(rows, setup.experiments[k].measured, strict=True):
-                weights = np.asarray(measured.weights)
-                parts.append(float(problem.scale) * np.asarray(of_measurement[row])[: len(weights)] / weights[:, None])
-            found[k] = parts
-    return [found[k] for k in range(len(setup.experiments))]
+def _residuals(setup: Setup, found: Found) -> list[list[Float[np.ndarray, "k d"]]]:
+    of_experiments = (x for group in found.evaluation.rows for x in zip(*group, strict=True))
+    residuals: dict[int, list[np.ndarray]] = {}
+    for k, rows in zip(setup.order, of_experiments, strict=True):
+        weights = [np.asarray(measured.weights) for measured in setup.experiments[k].measured]
+        residuals[k] = [np.asarray(x)[: len(w)] / w[:, None] for x, w in zip(rows, weights, strict=True)]
+    return [residuals[k] for k in range(len(setup.experiments))]
 
 
-def _statuses(setup: Setup, found: LeastSquares) -> list[Status]:
-    codes = np.concatenate([np.asarray(result.status) for result in found.beside])
+def _statuses(setup: Setup, found: Found) -> list[Status]:
+    codes = np.concatenate([np.asarray(result.status) for result in found.evaluation.results])
     return [Status(int(code)) for code in codes[np.argsort(np.array(setup.order))]]
 
 

@@ -1,6 +1,7 @@
 """From experiments and unknowns as a user gives them to the arrays of a problem, with the first equilibria."""
 
 import functools
+import itertools
 import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,26 +10,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, leaf, sequence
 from rodjax.compilation import compiled
+from rodjax.equilibrium import checked_options, first_state, solve
 from rodjax.guess import Guess
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Centerline, CriticalValue, Experiment
-from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, solved_experiment, values
+from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
-from rodjax.refinement import SAFETY, SIZES, next_size
+from rodjax.path import stack_scenes
 from rodjax.result import Equilibrium, NotConvergedWarning, estimated_errors
-from rodjax.scene import Scene
 from rodjax.supports import Held
 
 # Points of a first shape, as all of a group have the same number.
 GUESS_POINTS = 65
 # Of a rod that a measured centerline must span to serve for the first shape.
 SPANNED = 0.9
-# Solved side by side, as many as fit into a processor's cache.
-LANES = 16
 # Without standard deviations: of the scatter of the measured numbers, what deviations are first compared with.
 FIRST_SCALE = 0.01
 
@@ -91,14 +90,9 @@ def _one_scene(value: CriticalValue) -> Any:
 
 def _kind(experiment: Experiment) -> Any:
     """What experiments must have in common to be stacked."""
-    bare = _bare(experiment, 1)
-    return jax.tree.structure(bare), tuple(x.shape for x in jax.tree.leaves(bare)), first_guess(experiment) is None
-
-
-def _bare(experiment: Experiment, rows: int) -> Experiment:
-    """Without what differs between experiments of a kind and does not enter programs."""
-    measured = tuple(measurement.with_rows(rows) for measurement in experiment.measured)
-    return Experiment(experiment.scene, measured)
+    scene = experiment.scene
+    shapes = tuple(leaf.shape for leaf in jax.tree.leaves(scene))
+    return jax.tree.structure(scene), shapes, tuple(m.kind for m in experiment.measured), _tells_shape(experiment)
 
 
 def _has_sd(experiments: Sequence[Experiment], critical: Sequence[CriticalValue]) -> bool:
@@ -113,27 +107,35 @@ def _has_sd(experiments: Sequence[Experiment], critical: Sequence[CriticalValue]
     return False
 
 
-def first_guess(experiment: Experiment) -> Guess | None:
-    """The first shape that an experiment tells."""
-    if experiment.guess is not None:
-        return experiment.guess
+def _tells_shape(experiment: Experiment) -> bool:
+    """Whether there is a first shape in what was given or measured."""
+    return experiment.guess is not None or _spanning(experiment) is not None
+
+
+def _spanning(experiment: Experiment) -> Centerline | None:
+    """The measured centerline that spans the rod, if there is one."""
     length = float(experiment.scene.rod.length)
     for measured in experiment.measured:
         if isinstance(measured, Centerline) and measured.s is not None and measured.is_affine:
             s = np.asarray(measured.s)
             if np.ptp(s) >= SPANNED * length:
-                points = _lifted(measured, experiment.scene)
-                return Guess(_resampled(s, points, np.linspace(0, length, GUESS_POINTS)))
+                return measured
     return None
 
 
-def _lifted(measured: Centerline, scene: Scene) -> Float[np.ndarray, "m 3"]:
-    """Measured points in the scene; those of a picture at the depth of a held end."""
+def _first_guess(experiment: Experiment) -> Guess:
+    """The first shape of an experiment that tells one."""
+    if experiment.guess is not None:
+        points, twist = np.asarray(experiment.guess.points), experiment.guess.total_twist
+        return Guess(_resampled(np.linspace(0, 1, len(points)), points, np.linspace(0, 1, GUESS_POINTS)), twist)
+    measured, scene = _spanning(experiment), experiment.scene
+    assert measured is not None
+    assert measured.s is not None
     held = scene.start if isinstance(scene.start, Held) else scene.end
     assert isinstance(held, Held), "a scene holds at least one position"
-    origin = held.position[None]
-    linear = np.asarray(measured.seen(jnp.eye(3)) - measured.seen(jnp.zeros((3, 3))))
-    return np.asarray(origin) + np.asarray(measured.points - measured.seen(origin)) @ np.linalg.pinv(linear)
+    points = measured.lifted(np.asarray(held.position))
+    at = np.linspace(0, float(scene.rod.length), GUESS_POINTS)
+    return Guess(_resampled(np.asarray(measured.s), points, at))
 
 
 def _resampled(s: np.ndarray, points: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -144,26 +146,17 @@ def _resampled(s: np.ndarray, points: np.ndarray, at: np.ndarray) -> np.ndarray:
 def stacked(setup: Setup) -> tuple[tuple[Group, ...], tuple[Guess | None, ...]]:
     """The experiments of each kind as one, in the order of `setup.order`, and their first shapes."""
     groups, guesses = [], []
-    members: list[list[int]] = []
-    for k in setup.order:
-        if members and _kind(setup.experiments[members[-1][0]]) == _kind(setup.experiments[k]):
-            members[-1].append(k)
-        else:
-            members.append([k])
-    for of_kind in members:
-        chosen = [setup.experiments[k] for k in of_kind]
-        most = max(len(m.weights) for one in chosen for m in one.measured)
-        experiments = _stack([_bare(one, most) for one in chosen])
-        groups.append(Group(experiments, leaf(np.ones(len(chosen), experiments.scene.rod.length.dtype))))
-        shapes = [first_guess(one) for one in chosen]
-        known = [Guess(_spread(np.asarray(g.points)), g.total_twist) for g in shapes if g is not None]
-        guesses.append(_stack(known) if known else None)
+    kinds = [_kind(setup.experiments[k]) for k in setup.order]
+    for _, places in itertools.groupby(range(len(kinds)), key=lambda place: kinds[place]):
+        chosen = [setup.experiments[setup.order[place]] for place in places]
+        most = [max(len(m.weights) for m in same) for same in zip(*(one.measured for one in chosen), strict=True)]
+        measured = [tuple(m.with_rows(rows) for m, rows in zip(one.measured, most, strict=True)) for one in chosen]
+        bare = Experiment(chosen[0].scene, chosen[0].measured)
+        scenes = stack_scenes([one.scene for one in chosen])
+        experiments = eqx.tree_at(lambda one: (one.scene, one.measured), bare, (scenes, _stack(measured)))
+        groups.append(Group(experiments, leaf(np.ones(len(chosen), scenes.rod.length.dtype))))
+        guesses.append(_stack([_first_guess(one) for one in chosen]) if _tells_shape(chosen[0]) else None)
     return tuple(groups), tuple(guesses)
-
-
-def _spread(points: np.ndarray) -> np.ndarray:
-    places = np.linspace(0, 1, len(points))
-    return _resampled(places, points, np.linspace(0, 1, GUESS_POINTS))
 
 
 def _stack(parts: Sequence[Any]) -> Any:
@@ -174,25 +167,23 @@ def begun(setup: Setup, groups: tuple[Group, ...], threshold: float) -> tuple[Pr
     """The problem, and the unknowns as nominal."""
     length = float(setup.experiments[0].scene.rod.length)
     subjects: list[Subject] = [*setup.experiments, *(_one_scene(value) for value in setup.critical)]
-    ordered = [setup.experiments[k] for k in setup.order]
     shared = [_start(unknown, _first_with(unknown, subjects)) for unknown in setup.shared]
-    own = [[_start(unknown, experiment) for unknown in setup.own] for experiment in ordered]
-    is_free = [[nominal(unknown.names, one) is not None for unknown in setup.own] for one in ordered]
+    own, is_free = (np.concatenate(x) for x in zip(*(_of_group(setup.own, group) for group in groups), strict=True))
     dtype = np.asarray(groups[0].weights).dtype
     of_shared, of_own = _ranges(setup.shared, length, dtype), _ranges(setup.own, length, dtype)
-    p, q = len(setup.shared), len(setup.own)
+    p = len(setup.shared)
     problem = Problem(
         groups=groups,
         shared=of_shared,
         own=of_own,
-        is_free=Coordinates(leaf(np.ones(p, bool)), leaf(np.array(is_free, bool).reshape(len(ordered), q))),
+        is_free=Coordinates(leaf(np.ones(p, bool)), leaf(is_free)),
         scale=leaf(np.asarray(1.0 if setup.has_sd else _first_scale(setup), dtype)),
         threshold=leaf(np.asarray(threshold, dtype)),
         critical=Critical(leaf(np.zeros(p, dtype)), leaf(np.zeros(0, dtype)), leaf(np.zeros((0, p), dtype))),
     )
     start = Coordinates(
         _varied(np.array(shared, dtype), of_shared, setup.shared),
-        _varied(np.array(own, dtype).reshape(len(ordered), q), of_own, setup.own),
+        _varied(own.astype(dtype), of_own, setup.own),
     )
     return problem, start
 
@@ -201,17 +192,36 @@ def _first_with(unknown: Unknown, subjects: Sequence[Subject]) -> Subject:
     return next((x for x in subjects if nominal(unknown.names, x) is not None), subjects[0])
 
 
+def _of_group(unknowns: Sequence[Unknown], group: Group) -> tuple[Float[np.ndarray, "e q"], Bool[np.ndarray, "e q"]]:
+    """Where the unknowns of each experiment start; and whether there are such numbers, all over the group."""
+    count = group.weights.shape[0]
+    columns, are_there = [], []
+    for unknown in unknowns:
+        numbers = jax.vmap(functools.partial(_nominal, unknown))(group.experiments)
+        columns.append(np.zeros(count) if numbers is None else _started(unknown, np.asarray(numbers)))
+        are_there.append(np.full(count, numbers is not None))
+    nothing = np.zeros((count, 0))
+    return np.stack(columns, axis=1) if columns else nothing, np.stack(are_there, 1) if columns else nothing > 0
+
+
+def _nominal(unknown: Unknown, experiment: Experiment) -> Float[Array, ""] | None:
+    return nominal(unknown.names, experiment)
+
+
 def _start(unknown: Unknown, subject: Subject) -> float:
-    """On the scale on which it is sought; anything where there is no such number."""
     number = nominal(unknown.names, subject)
-    if number is None:
-        return 0.0
-    value = float(number) if unknown.start is None else unknown.start
-    if unknown.scale == "log":
-        if not value > 0:
-            raise ValueError(f"start of {unknown.label} must be positive on a log scale, got {value:g}")
-        value = float(np.log(value))
-    return value
+    return 0.0 if number is None else float(_started(unknown, np.asarray(number)))
+
+
+def _started(unknown: Unknown, numbers: Float[np.ndarray, "*e"]) -> Float[np.ndarray, "*e"]:
+    """On the scale on which it is sought."""
+    if unknown.start is not None:
+        numbers = np.full_like(numbers, unknown.start)
+    if unknown.scale == "linear":
+        return numbers
+    if not np.all(numbers > 0):
+        raise ValueError(f"start of {unknown.label} must be positive on a log scale, got {float(np.min(numbers)):g}")
+    return np.log(numbers)
 
 
 def _ranges(unknowns: Sequence[Unknown], length: float, dtype: Any) -> Ranges:
@@ -255,36 +265,31 @@ def structure_of(setup: Setup, **settings: Any) -> Structure:
 
 
 @functools.partial(compiled, static_argnames=("structure",))
-def _solutions(
+def beginnings(
     structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Any, ...]
 ) -> tuple[Equilibrium, ...]:
+    """What a solve begins from, with some values of the unknowns: equilibria of which only the state is one.
+
+    `guesses`: for each group first shapes, `None`, or equilibria on another mesh.
+    """
     shared, own = values(structure, problem, at)
-    results = []
-    first = 0
-    for group, guess in zip(problem.groups, guesses, strict=True):
-        count = group.weights.shape[0]
-        each = (group.experiments, own[first : first + count], guess)
-        results.append(
-            jax.lax.map(
-                lambda one: solved_experiment(structure, one[0], shared, one[1], one[2])[1], each, batch_size=LANES
-            )
+
+    def one(experiment: Experiment, own: Float[Array, "q"], guess: Guess | Equilibrium | None) -> Equilibrium:
+        scene = with_unknowns(structure, experiment, shared, own).scene
+        options, _ = checked_options(
+            scene, structure.segments, None, structure.discretization, None, guess, structure.planar
         )
-        first += count
-    return tuple(results)
+        state, twist = first_state(scene, guess, options)
+        solve_it = functools.partial(
+            solve, segments=structure.segments, discretization=structure.discretization, planar=structure.planar
+        )
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solve_it, scene))
+        return eqx.tree_at(lambda result: (result.state, result.total_twist), blank, (state, twist))
 
-
-def solutions(
-    structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Any, ...], rtol: float | None
-) -> tuple[Structure, tuple[Equilibrium, ...]]:
-    """The equilibria at some values of the unknowns, on a mesh fine enough for `rtol` (`None`: that of `structure`)."""
-    while True:
-        results = _solutions(structure, problem, at, guesses)
-        error = largest_error(results)
-        finest = SIZES[structure.discretization][-1]
-        if rtol is None or SAFETY * error <= rtol or structure.segments >= finest:
-            return structure, results
-        structure = structure._replace(segments=next_size(structure.segments, error, rtol, structure.discretization))
-        guesses = results
+    return tuple(
+        jax.vmap(one)(group.experiments, own[here], guess)
+        for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
+    )
 
 
 def largest_error(results: tuple[Equilibrium, ...]) -> float:
@@ -296,13 +301,11 @@ def largest_error(results: tuple[Equilibrium, ...]) -> float:
     return float(np.max(np.concatenate(errors), initial=0.0))
 
 
-def only_converged(setup: Setup, problem: Problem, results: tuple[Equilibrium, ...]) -> Problem:
-    """The problem without the experiments that have no equilibrium to begin with, which a warning names."""
-    converged = [np.asarray(result.converged) for result in results]
-    pairs = zip(setup.order, np.concatenate(converged), strict=True)
-    names = [name_of(setup, k) for k, is_found in pairs if not is_found]
+def warn_of_lost(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> None:
+    """Names the experiments that have no equilibrium to begin with."""
+    names = [name_of(setup, k) for k, is_in in zip(setup.order, is_used, strict=True) if not is_in]
     if not names:
-        return problem
+        return
     if len(names) == len(setup.order):
         raise ValueError(
             "experiments must have an equilibrium where the search begins, but no solve converged: better values to "
@@ -314,9 +317,6 @@ def only_converged(setup: Setup, problem: Problem, results: tuple[Equilibrium, .
         NotConvergedWarning,
         stacklevel=3,
     )
-    dtype = problem.scale.dtype
-    weights = [leaf(found.astype(dtype)) for found in converged]
-    return eqx.tree_at(lambda problem: [group.weights for group in problem.groups], problem, weights)
 
 
 def name_of(setup: Setup, k: int) -> str:

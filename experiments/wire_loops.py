@@ -2,9 +2,9 @@
 
     python experiments/wire_loops.py --data DIR --out DIR
 
-`--data`: the folder with `loops.csv` and `wires.csv`: 3 wires, 5 repeats of a loop of 1.5 m in a vertical plane, 51 nodes
-each (Chen, Bretl & Pham, arXiv:2310.00911, MIT licence). The wire leaves a holder level and comes back to it level after
-a whole turn. Writes `fits.csv`, one row a model and loop:
+`--data`: the folder with `loops.csv` and `wires.csv`: 3 wires, 5 repeats of a loop of 1.5 m in a vertical plane, 51
+nodes each (Chen, Bretl & Pham, arXiv:2310.00911, MIT licence). The wire leaves a holder level and comes back to it
+level after a whole turn. Writes `fits.csv`, one row a model and loop:
 
 - `EI`: the stiffness alone, clamps level, the end where the last node was measured.
 - `EI+angles`: the turns of both clamps in the plane too, positive downwards.
@@ -49,7 +49,7 @@ class Row(NamedTuple):
     se: str
     rms_m: str
     theta0_deg: str
-    thetaL_deg: str
+    thetaL_deg: str  # noqa: N815
     converged: str
 
 

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells
+from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm, FramePoint, of_cells, stacked
-from rodjax.discretization.hermite import interleaved
+from rodjax.discretization.hermite import Curve, interleaved
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist
 from rodjax.guess import cubic, first_shape
@@ -115,15 +116,10 @@ def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
 
 def framed_through(scene: Scene, points: Float[Array, "k 3"], of_joints: bool) -> FramedCurve:
     """Through points, as many as a mesh has nodes, or nodes and middles of elements; twisted as the rod at rest."""
+    shape = (Polyline if of_joints else Curve).through(points)
+    nodes, tangents = shape.nodes, shape.tangents
     if of_joints:
-        nodes = points
-        edges = jnp.diff(points, axis=0).T
-        slopes = jnp.concatenate([edges[:, :1], edges, edges[:, -1:]], axis=1)
-    else:
-        nodes = points[::2]
-        ends = (-3 * points[0] + 4 * points[1] - points[2], points[-3] - 4 * points[-2] + 3 * points[-1])
-        slopes = jnp.concatenate([ends[0][None], points[2:] - points[:-2], ends[1][None]]).T
-    tangents = slopes / jnp.sqrt(dot(slopes, slopes))[None]
+        tangents = jnp.concatenate([tangents[:, :1], tangents, tangents[:, -1:]], axis=1)
     s = jnp.linspace(0.0, 1.0, len(nodes), dtype=points.dtype)
     first = from_frame(scene.start.frame) if isinstance(scene.start, Clamp) else jnp.eye(1, 4, dtype=s.dtype)[0]
     # Not opposite to the first tangent.

@@ -45,7 +45,7 @@ from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rest import RestStrain, SpaceCurve
 from rodjax.result import Equilibrium, SolverState, form_and_point
 from rodjax.rod import Law
-from rodjax.rotations import columns, from_frame, nearer, product
+from rodjax.rotations import columns, from_frame, nearer, product, unit
 from rodjax.scene import Scene, nondimensional
 from rodjax.status import Status, is_converged
 from rodjax.supports import Clamp, Free, Held
@@ -424,8 +424,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     def between(places: Float[Array, "m"], values: Float[Array, "c m"]) -> Float[Array, "c k"]:
         return jnp.stack([jnp.interp(fixed_s, places, component) for component in values])
 
-    quaternions = between(along.frame_places, along.quaternions)
-    quaternions /= jnp.sqrt(dot(quaternions, quaternions))[None]
+    quaternions = unit(between(along.frame_places, along.quaternions))
     reference = jnp.moveaxis(columns(quaternions), 2, 0)
     force, moment = between(along.places, along.forces).T, between(along.places, along.moments).T
     position = (guess.position_at(fixed_s * guess.s[-1]) - fixed_units.origin[None]) / fixed_units.length

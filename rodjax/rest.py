@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Pair, Spline, Steps, Value, scaled, value_at
 from rodjax.checks import direction, is_known, number_array, rotation, vector
-from rodjax.rotations import columns, from_frame, inverse, product, rotated, screw, swung
+from rodjax.rotations import columns, from_frame, inverse, product, rotated, screw, swung, unit
 from rodjax.vectors import cross, dot
 
 # Steps in which a varying curvature is integrated between two neighbouring points of a mesh.
@@ -66,8 +66,7 @@ class RestStrain(eqx.Module):
             position, quaternion = carry
             turn, way = step
             position = position + rotated(quaternion, way)
-            quaternion = product(quaternion, turn)
-            quaternion /= jnp.sqrt(jnp.sum(quaternion**2))
+            quaternion = unit(product(quaternion, turn))
             return (position, quaternion), (position, quaternion)
 
         begin = jnp.zeros(3, s.dtype), jnp.array([1.0, 0.0, 0.0, 0.0], s.dtype)

@@ -22,7 +22,7 @@ from rodjax.discretization.hermite import SIMPSON, interleaved, with_nodes_at
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod
-from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product
+from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product, unit
 from rodjax.scene import Scene
 from rodjax.staging import staged
 
@@ -67,6 +67,10 @@ class Cells(Protocol):
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c p n"]: ...
 
+    def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 nodes"]:
+        """The frames at the nodes."""
+        ...
+
     def assembled(self, by_cell: Float[Array, "... p n"]) -> Float[Array, "... m"]:
         """Sums over the cells at each frame."""
         ...
@@ -105,10 +109,6 @@ class JointCells(eqx.Module):
 
     s: Float[Array, "n+1"]
 
-    @staticmethod
-    def of(scene: Scene, s: Float[Array, "n+1"]) -> "JointCells":
-        return JointCells(s)
-
     @property
     def segments(self) -> int:
         return len(self.s) - 1
@@ -143,6 +143,11 @@ class JointCells(eqx.Module):
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
         return jnp.stack([by_frame[:, :-1], by_frame[:, 1:]], axis=1)
+
+    def at_nodes(self, quaternions: Float[Array, "4 n+2"]) -> Float[Array, "4 n+1"]:
+        """Half way between those of the edges beside."""
+        between = unit(quaternions[:, 1:-2] + quaternions[:, 2:-1])
+        return jnp.concatenate([quaternions[:, :1], between, quaternions[:, -1:]], axis=1)
 
     def assembled(self, by_cell: Float[Array, "... 2 n"]) -> Float[Array, "... m"]:
         none = jnp.zeros_like(by_cell[..., 0, :1])
@@ -234,6 +239,9 @@ class ElementCells(eqx.Module):
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
         return jnp.stack([by_frame[:, 0:-1:2], by_frame[:, 1::2], by_frame[:, 2::2]], axis=1)
+
+    def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 n+1"]:
+        return quaternions[:, ::2]
 
     def assembled(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
         start, middle, end = (by_cell[..., k, :] for k in range(3))

@@ -45,7 +45,7 @@ from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rest import RestStrain, SpaceCurve
 from rodjax.result import Equilibrium, SolverState, form_and_point
 from rodjax.rod import Law
-from rodjax.rotations import columns, from_frame, nearer, product, unit
+from rodjax.rotations import columns, continuous, from_frame, product, unit
 from rodjax.scene import Scene, nondimensional
 from rodjax.status import Status, is_converged
 from rodjax.supports import Clamp, Free, Held
@@ -522,12 +522,5 @@ def _warm_start(scene: Scene, s: Float[Array, "n+1"], points: Section, last: Sec
     """What a discrete solve from here begins with."""
     is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
     end_force = last.force if is_held else jnp.zeros_like(last.force)
-    quaternions = jax.vmap(from_frame)(points.frame)
-
-    # Of the two quaternions of a frame the one nearer to that before.
-    def onward(before, q):
-        q = nearer(q, before)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, quaternions[0], quaternions)
-    return SolverState(FramedCurve(points.position[::2], quaternions.T, s), end_force, units)
+    quaternions = continuous(jax.vmap(from_frame, out_axes=1)(points.frame))
+    return SolverState(FramedCurve(points.position[::2], quaternions, s), end_force, units)

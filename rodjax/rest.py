@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Pair, Spline, Steps, Value, scaled, value_at
 from rodjax.checks import direction, is_known, number_array, rotation, vector
-from rodjax.rotations import columns, from_frame, inverse, product, rotated, screw, swung, unit
+from rodjax.rotations import carried, columns, continuous, from_frame, inverse, product, rotated, screw, unit
 from rodjax.vectors import cross, dot
 
 # Steps in which a varying curvature is integrated between two neighbouring points of a mesh.
@@ -136,13 +136,13 @@ class SpaceCurve(eqx.Module):
         """In the axes in which the points are given."""
         positions, frames = self._frames(s)
         quaternions = jax.vmap(from_frame, 2, 1)(frames)
-        return Poses(positions, _continuous(quaternions))
+        return Poses(positions, continuous(quaternions))
 
     def poses(self, s: Float[Array, "k"]) -> Poses:
         world = self.world(s)
         first = inverse(world.quaternions[:, :1]) + 0 * world.quaternions
         return Poses(
-            rotated(first, world.positions - world.positions[:, :1]), _continuous(product(first, world.quaternions))
+            rotated(first, world.positions - world.positions[:, :1]), continuous(product(first, world.quaternions))
         )
 
     def at(self, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
@@ -158,13 +158,7 @@ RestShape = RestStrain | SpaceCurve
 def _carried(d1: Float[Array, "3"], tangents: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
     """A director at the first tangent, carried along all of them without twist."""
     first = from_frame(jnp.stack([d1, jnp.cross(tangents[:, 0], d1), tangents[:, 0]], axis=1))
-
-    def onward(q, tangent):
-        q = swung(q, tangent)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, first, tangents.T)
-    return columns(quaternions.T)[:, 0]
+    return columns(carried(first, tangents))[:, 0]
 
 
 def _slope(spline: Spline, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
@@ -173,13 +167,6 @@ def _slope(spline: Spline, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
 
 def _size(vectors: Float[Array, "3 *k"]) -> Float[Array, "*k"]:
     return jnp.sqrt(dot(vectors, vectors))
-
-
-def _continuous(quaternions: Float[Array, "4 k"]) -> Float[Array, "4 k"]:
-    """Of the two quaternions of each frame the one that is nearer to that of the last."""
-    products = dot(quaternions[:, 1:], quaternions[:, :-1])
-    signs = jnp.concatenate([jnp.ones_like(products[:1]), jnp.cumprod(jnp.where(products < 0, -1.0, 1.0))])
-    return signs.astype(quaternions.dtype)[None] * quaternions
 
 
 def ends(

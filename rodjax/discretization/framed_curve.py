@@ -15,7 +15,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist
 from rodjax.guess import cubic, first_shape
 from rodjax.rest import RestStrain
-from rodjax.rotations import from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
+from rodjax.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
 from rodjax.scene import Scene, held_at_both_ends
 from rodjax.supports import Clamp, Directed, Held, Swivel
 from rodjax.vectors import dot
@@ -110,14 +110,8 @@ def framed_through(scene: Scene, points: Float[Array, "k 3"], of_joints: bool) -
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-
-    def onward(q, tangent):
-        q = swung(q, tangent)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, first, tangents.T)
     twist = _twist_at_rest(scene, _cells(s, of_joints).places)
-    return FramedCurve(nodes, spun(quaternions.T, twist), s)
+    return FramedCurve(nodes, spun(carried(first, tangents), twist), s)
 
 
 def rest_twist(scene: Scene) -> Float[Array, ""]:

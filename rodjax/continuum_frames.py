@@ -42,7 +42,7 @@ from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.framed_results import own_moments, strains_under
 from rodjax.energy import Sections, dead_load_energy
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.rest import RestStrain, SpaceCurve
+from rodjax.rest import RestStrain, SpaceCurve, SplinedCurve
 from rodjax.result import Equilibrium, SolverState, form_and_point
 from rodjax.rod import Law
 from rodjax.rotations import columns, continuous, from_frame, product, unit
@@ -61,12 +61,12 @@ Prepared = Any
 class Material(eqx.Module):
     """What a rod is made of and the loads that follow it, splines already made of their values.
 
-    `rest`: curvature along d1 and d2 and twist, or splines of a curve in space and of its directors d1.
+    `rest`: curvature along d1 and d2 and twist, or a curve in space.
     """
 
     stiffnesses: tuple[Prepared, Prepared, Prepared, Prepared]
     mass: Prepared
-    rest: tuple[Prepared, Prepared, Prepared] | tuple[Spline, Spline] | None
+    rest: tuple[Prepared, Prepared, Prepared] | SplinedCurve | None
     law: Law | None
     force: Float[Array, "3"] | None
     couple: Float[Array, "3"] | None
@@ -82,7 +82,7 @@ class Material(eqx.Module):
             k1, k2, twist = (_prepared(value) for value in (*(rest.curvature or (zero, zero)), twist))
             prepared = (k1, k2, twist)
         elif isinstance(rest, SpaceCurve):
-            prepared = (Spline.through(rest.s, rest.points), Spline.through(rest.s, rest.d1))
+            prepared = rest.splined
         EI1, EI2, GJ, EA = (_prepared(value) for value in (*rod.bending_pair, rod.GJ, rod.EA))
         return Material(
             (EI1, EI2, GJ, EA),
@@ -100,11 +100,9 @@ class Material(eqx.Module):
     def rest_strains(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Float[Array, "3"]:
         if self.rest is None:
             return jnp.zeros_like(s, shape=3)
-        if len(self.rest) == 3:
-            return jnp.stack([_at(value, s, interval) for value in self.rest])
-        frame, rate = jax.jvp(functools.partial(_frame_of, *self.rest), (s,), (jnp.ones_like(s),))
-        d2, t = frame[:, 1], frame[:, 2]
-        return jnp.stack([jnp.sum(rate[:, 1] * t), -jnp.sum(rate[:, 0] * t), jnp.sum(rate[:, 0] * d2)])
+        if isinstance(self.rest, SplinedCurve):
+            return self.rest.strains(s)
+        return jnp.stack([_at(value, s, interval) for value in self.rest])
 
 
 def _prepared(value: Value) -> Prepared:
@@ -125,16 +123,6 @@ def _splines(material: Material) -> list[Spline]:
         return isinstance(value, Spline)
 
     return [value for value in jax.tree.leaves(material, is_leaf=is_spline) if is_spline(value)]
-
-
-def _frame_of(curve: Spline, directors: Spline, s: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """As of `rest.SpaceCurve`."""
-    _, slope = jax.jvp(curve.at, (s,), (jnp.ones_like(s),))
-    t = slope / jnp.sqrt(jnp.sum(slope**2))
-    d1 = directors.at(s)
-    d1 -= jnp.sum(d1 * t) * t
-    d1 /= jnp.sqrt(jnp.sum(d1**2))
-    return jnp.stack([d1, jnp.cross(t, d1), t], axis=1)
 
 
 def _sum_of_loads(scene: Scene, kind: type, follower: bool) -> Float[Array, "3"] | None:

@@ -76,6 +76,29 @@ class RestStrain(eqx.Module):
         return Poses(positions.T, quaternions.T)
 
 
+class SplinedCurve(eqx.Module):
+    """Splines of a curve in space and of its directors d1, made once for as many places as are asked for."""
+
+    curve: Spline
+    directors: Spline
+
+    def poses(self, s: Float[Array, "*k"]) -> tuple[Float[Array, "3 *k"], Float[Array, "3 3 *k"]]:
+        """Positions and frames."""
+        slope = _slope(self.curve, s)
+        t = slope / _size(slope)[None]
+        d1 = self.directors.at(s)
+        d1 -= dot(d1, t)[None] * t
+        d1 /= _size(d1)[None]
+        return self.curve.at(s), jnp.stack([d1, cross(t, d1), t], axis=1)
+
+    def strains(self, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
+        """Curvature along d1 and d2, and twist."""
+        (_, frames), (_, change) = jax.jvp(self.poses, (s,), (jnp.ones_like(s),))
+        d2, t = frames[:, 1], frames[:, 2]
+        by_d1, by_d2, _ = (change[:, k] for k in range(3))
+        return jnp.stack([dot(by_d2, t), -dot(by_d1, t), dot(by_d1, d2)])
+
+
 class SpaceCurve(eqx.Module):
     """A smooth curve through points [m], the arclengths of these as parts of the whole, and directors d1 there."""
 
@@ -123,18 +146,13 @@ class SpaceCurve(eqx.Module):
     def scaled(self, length: Float[Array, ""]) -> "SpaceCurve":
         return SpaceCurve(self.points / length, self.s, self.d1)
 
-    def _frames(self, s: Float[Array, "*k"]) -> tuple[Float[Array, "3 *k"], Float[Array, "3 3 *k"]]:
-        curve, directors = Spline.through(self.s, self.points), Spline.through(self.s, self.d1)
-        slope = _slope(curve, s)
-        t = slope / _size(slope)[None]
-        d1 = directors.at(s)
-        d1 -= dot(d1, t)[None] * t
-        d1 /= _size(d1)[None]
-        return curve.at(s), jnp.stack([d1, cross(t, d1), t], axis=1)
+    @property
+    def splined(self) -> SplinedCurve:
+        return SplinedCurve(Spline.through(self.s, self.points), Spline.through(self.s, self.d1))
 
     def world(self, s: Float[Array, "k"]) -> Poses:
         """In the axes in which the points are given."""
-        positions, frames = self._frames(s)
+        positions, frames = self.splined.poses(s)
         quaternions = jax.vmap(from_frame, 2, 1)(frames)
         return Poses(positions, continuous(quaternions))
 
@@ -146,10 +164,7 @@ class SpaceCurve(eqx.Module):
         )
 
     def at(self, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
-        (_, frames), (_, change) = jax.jvp(self._frames, (s,), (jnp.ones_like(s),))
-        d2, t = frames[:, 1], frames[:, 2]
-        by_d1, by_d2, _ = (change[:, k] for k in range(3))
-        return jnp.stack([dot(by_d2, t), -dot(by_d1, t), dot(by_d1, d2)])
+        return self.splined.strains(s)
 
 
 RestShape = RestStrain | SpaceCurve

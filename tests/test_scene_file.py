@@ -111,8 +111,8 @@ def general_rods(seed):
     return {
         "pair": Rod(1 / 3, (a[0], b[0]), c[0], d[0], radius=0.01),
         "rest shape": Rod(1 / 3, a[0], b[0], c[0], rest_curvature=awkward(2, seed), rest_twist=-d[0]),
-        "steps": Rod(1 / 3, steps, other, other, steps),
-        "smooth": Rod(1 / 3, smooth, 0.3 * b[0], smooth, smooth, rest_curvature=(rest, 0.0), rest_twist=rest),
+        "steps": Rod(1 / 3, steps, other, other, steps, steps),
+        "smooth": Rod(1 / 3, smooth, 0.3 * b[0], smooth, smooth, smooth, rest_curvature=(rest, 0.0), rest_twist=rest),
         "both": Rod(1 / 3, (steps, smooth), other, c[0], rest_curvature=(other, rest), rest_twist=other),
         "one of a pair": Rod(1 / 3, (a[0], steps), b[0], c[0]),
     }
@@ -261,9 +261,13 @@ STIFF = 'GJ = "3 N mm^2"\nEA = "785 N"\n'
         (
             f'section = "centerline"\npoints = "{[list(point) for point in POINTS]} m"\nEI1 = "4 N mm^2"\n'
             f'EI2 = {{ jumps = "[0.1] m", values = "[2, 3] N mm^2" }}\n{STIFF}'
-            'mass_per_length = "10 g/m"\nradius = "2 mm"\nd2 = [0, 1, 1]',
+            'mass_per_length = "10 g/m"\nradius = { jumps = "[10] cm", values = "[2, 3] mm" }\nd2 = [0, 1, 1]',
             lambda: Rod.from_centerline(
-                POINTS, (4e-6, Steps([0.1], [2e-6, 3e-6])), 3e-6, 785, 0.01, 0.002, d2=(0, 1, 1)
+                POINTS,
+                (4e-6, Steps([0.1], [2e-6, 3e-6])),
+                *(3e-6, 785, 0.01),
+                Steps([0.1], [0.002, 0.003]),
+                d2=(0, 1, 1),
             ),
         ),
         (
@@ -402,6 +406,12 @@ MISTAKES = [
         'youngs_modulus = "1 MPa"\npoisson_ratio = 0.5\n' + START + END,
         "rod.outer_radius - inner_radius must be positive",
         "got -0.001",
+    ),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = { jumps = "[0.5] m", values = "[1, 2] mm" }\n'
+        'youngs_modulus = "1 MPa"\npoisson_ratio = 0.5\n' + START + END,
+        "rod.radius must have a unit",
+        'radius = "5 mm"',
     ),
     # rods that vary, of two stiffnesses, with a rest shape
     (ROD.replace('EI = "4.9e-3 N m^2"', "") + START + END, "rod.EI is missing", "rod.EI1 and rod.EI2"),

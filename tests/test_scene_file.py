@@ -462,7 +462,63 @@ MISTAKES = [
         "rod.EA must be positive",
         "got -4",
     ),
+    (
+        ROD.replace('"785 N"', '{ s = "[0, 0.5, 1] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA.values must be as many as s",
+        "2 values at 3 arclengths",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5, 0.4] m", values = "[1, 4, 2] N" }') + START + END,
+        "rod.EA.jumps must increase",
+        "[0.5, 0.4]",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5] m", s = "[0, 1] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA must be a number and a unit, or a table of jumps and values, or of s and values",
+        "'s': '[0, 1] m'",
+    ),
+    (
+        ROD + 'radius = { jumps = "[0.5] m", values = "[1, 2, 3] mm" }\n' + START + END,
+        "rod.radius.values must be one more than jumps",
+        "3 values and 1 jumps",
+    ),
+    (
+        ROD + 'radius = { s = "[0, 0.5, 1] m", values = "[1, -1, 1] mm" }\n' + START + END,
+        "rod.radius must be positive",
+        "got -0.001",
+    ),
+    (
+        ROD
+        + 'rest_curvature_1 = { jumps = "[2] m", values = "[1, 2] 1/m" }\nrest_curvature_2 = "0 1/m"\n'
+        + START
+        + END,
+        "rod.rest_curvature_1.jumps must lie inside 0 to 1 m",
+        "[2.0]",
+    ),
     # sections
+    (
+        '[rod]\nsection = "rectangular"\nlength = "1 m"\nwidth = "10 mm"\n' + MATERIAL + START + END,
+        "rod.height is missing",
+        'height = "1 mm"',
+    ),
+    (
+        '[rod]\nsection = "rectangular"\nlength = "1 m"\nradius = "5 mm"\n' + MATERIAL + START + END,
+        "rod.radius is not allowed",
+        "length, width, height, youngs_modulus",
+    ),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = "5 mm"\nrest_twist = "1 rad/m"\n'
+        + MATERIAL
+        + START
+        + END,
+        "rod.rest_twist is not allowed",
+        "length, radius, youngs_modulus",
+    ),
+    (
+        '[rod]\nsection = "centerline"\npoints = "[0, 1, 2, 3] m"\nEI = "1 N m^2"\n' + STIFF + START + END,
+        "rod.points must be a list of lists of 3 numbers and a unit",
+        "[0, 0, 0]",
+    ),
     (
         '[rod]\nsection = "bundle"\nlength = "1 m"\nwires = 7.5\nwire_radius = "1 mm"\nstick = 0\n'
         + MATERIAL

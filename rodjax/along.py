@@ -28,6 +28,11 @@ class Along(eqx.Module):
     def integral(self, s: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """From 0 to these arclengths."""
 
+    @property
+    @abstractmethod
+    def samples(self) -> Float[Array, "m"]:
+        """Values close enough to one another to tell the least and the largest."""
+
     def mean(self, a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "*k"]:
         return (self.integral(b) - self.integral(a)) / (b - a)
 
@@ -49,6 +54,10 @@ class Steps(Along):
                 f"values must be one more than jumps, got {len(self.values)} values and {len(self.jumps)} jumps"
             )
         _check_increasing(self.jumps, "jumps")
+
+    @property
+    def samples(self) -> Float[Array, "k+1"]:
+        return self.values
 
     def scaled(self, length: Float[Array, ""], value: Float[Array, ""]) -> "Steps":
         return Steps(self.jumps / length, self.values / value)
@@ -80,6 +89,12 @@ class Smooth(Along):
                 f"values must be as many as s, at least 2, got {len(self.values)} values at {len(self.s)} arclengths"
             )
         _check_increasing(self.s, "s")
+
+    @property
+    def samples(self) -> Float[Array, "m"]:
+        # Between its values a spline may overshoot.
+        fine = jnp.linspace(self.s[0], self.s[-1], 8 * len(self.s))
+        return jnp.concatenate([self.values, self.at(fine, fine, fine)])
 
     def scaled(self, length: Float[Array, ""], value: Float[Array, ""]) -> "Smooth":
         return Smooth(self.s / length, self.values / value)

@@ -20,36 +20,37 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, positive, whole_number
+from rodjax.continuum_frames import growth_of_frames, solve_frames
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.energy import axial_strain_under, dead_load_energy, density
 from rodjax.equilibrium import MAX_SEGMENTS, solve
-from rodjax.result import Equilibrium, NotConvergedWarning, SolverState, warn_if_not_converged
+from rodjax.result import Equilibrium, NotConvergedWarning, warn_if_not_converged
 from rodjax.rod import Rod
 from rodjax.scene import Scene, needs_frames, nondimensional
-from rodjax.status import Status, is_converged
-from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
+from rodjax.shooting import (
+    Reached,
+    Section,
+    Start,
+    Stations,
+    equilibrium,
+    error_growth,
+    from_rodrigues,
+    integrated,
+    met,
+    misses,
+    rotation_of,
+    station_places,
+    turn_between,
+)
+from rodjax.supports import Clamp, Pin
 from rodjax.units import Units
 from rodjax.vectors import root
 
-# The residual at which stations and supports count as met: positions in L, rotations in rad, forces and moments in
-# EI/L^2 and EI/L, or where they are larger than these, relative to the largest in the rod. The rounding floor of
-# |force| eps is far below in these units, so that one figure serves slack wires and taut cables.
-TOLERANCE = 1e-10
-# A full-step Newton from nearby takes 3 to 7 iterations; one that takes more wanders.
-MAX_ITERATIONS = 25
-# Steps of the integrator in one interval; a dozen is usual.
-MAX_STEPS = 1000
-# Its first step, as part of an interval.
-FIRST_STEP = 0.25
-# Singular values below this part of the largest belong to motions that nothing resists.
-RANK_TOLERANCE = 1e-9
 # Of the discrete equilibrium that a solve without a guess begins with.
 GUESS_RTOL = 1e-4
 # Of the mesh on which a result without a guess is given.
@@ -118,10 +119,8 @@ def solve_continuum(
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)
     if needs_frames(scene):
-        from rodjax.continuum_frames import growth, solve_frames  # which itself imports from here
-
         if intervals is None:
-            intervals = _chosen_intervals(growth, fixed_scene, guess)
+            intervals = _chosen_intervals(growth_of_frames, fixed_scene, guess)
         result = solve_frames(scene, guess, rtol, intervals, segments)
     else:
         if intervals is None:
@@ -140,57 +139,6 @@ def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
         # Whether the continuum converges from there is what the caller is told.
         warnings.simplefilter("ignore", NotConvergedWarning)
         return solve(scene, rtol=GUESS_RTOL, discretization="hermite", guess=guess)
-
-
-class Section(eqx.Module):
-    """A cross section: position, material frame, n and m on it, global axes."""
-
-    position: Float[Array, "3"]
-    frame: Float[Array, "3 3"]
-    force: Float[Array, "3"]
-    moment: Float[Array, "3"]
-
-    @property
-    def tangent(self) -> Float[Array, "3"]:
-        return self.frame[:, 2]
-
-    @property
-    def torque(self) -> Float[Array, ""]:
-        return jnp.sum(self.moment * self.tangent)
-
-
-class Stations(eqx.Module):
-    """The unknowns, and the residuals between them. Forces and moments in units of the `Start`'s scales.
-
-    `turn`: Rodrigues vector 2 tan(angle/2) axis of the rotation from the guess's material frame, in the axes of that;
-    its pole, half a turn, is far from an equilibrium near the guess.
-    """
-
-    position: Float[Array, "k 3"]
-    turn: Float[Array, "k 3"]
-    force: Float[Array, "k 3"]
-    moment: Float[Array, "k 3"]
-
-
-class Start(eqx.Module):
-    """Where Newton begins, with what stays fixed while it runs.
-
-    `s`: arclengths of the stations; `force_steps`: point forces at each of them.
-    """
-
-    stations: Stations
-    s: Float[Array, "k"]
-    force_steps: Float[Array, "k 3"]
-    reference: Float[Array, "k 3 3"]
-    force_scale: Float[Array, ""]
-    moment_scale: Float[Array, ""]
-
-    def sections(self, stations: Stations) -> Section:
-        """The cross sections at the stations, each just beyond its point force."""
-        frames = self.reference @ jax.vmap(from_rodrigues)(stations.turn)
-        return Section(
-            stations.position, frames, self.force_scale * stations.force, self.moment_scale * stations.moment
-        )
 
 
 class Piece(eqx.Module):
@@ -214,7 +162,7 @@ class FarEnd(eqx.Module):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _integrated(rtol: float, piece: Piece) -> FarEnd:
+def _far_end(rtol: float, piece: Piece) -> FarEnd:
     """phi' = (1 + e) t, m' = -phi' x n and the frame without twist along a piece, EI = 1, n' = -gravity."""
     rod = Rod(1.0, 1.0, 1.0, piece.EA)
     origin = jnp.zeros(3, piece.length.dtype)
@@ -241,27 +189,13 @@ def _integrated(rtol: float, piece: Piece) -> FarEnd:
         )
         return piece.length * ravel_pytree(by_s)[0]
 
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope),  # pyright: ignore[reportArgumentType]
-        diffrax.Dopri8(),
-        t0=0.0,
-        t1=1.0,
-        dt0=FIRST_STEP,
-        y0=y0,
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    is_done = solution.result == diffrax.RESULTS.successful
-    assert solution.ys is not None
-    return unravel(jnp.where(is_done, solution.ys[-1], jnp.nan))
+    return unravel(integrated(slope, y0, diffrax.PIDController(rtol=rtol, atol=rtol)))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def far_end(rtol: float, piece: Piece) -> FarEnd:
     """The other end of a piece, with derivatives in forward and reverse mode."""
-    return _integrated(rtol, piece)
+    return _far_end(rtol, piece)
 
 
 @far_end.defjvp
@@ -271,7 +205,7 @@ def _far_end_jvp(rtol: float, primals: tuple[Piece], tangents: tuple[Piece]) -> 
     tangent, _ = ravel_pytree(tangents[0])
 
     def along(direction):
-        return jax.jvp(lambda x: _integrated(rtol, unravel(x)), (x,), (direction,))
+        return jax.jvp(lambda x: _far_end(rtol, unravel(x)), (x,), (direction,))
 
     end, jacobian = jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(x), dtype=x.dtype))
     return end, jax.tree.map(lambda columns: columns @ tangent, jacobian)
@@ -299,7 +233,6 @@ def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEn
 def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     scaled, units = nondimensional(scene)
     start = _start(scaled, guess, units, intervals)
-    newton = optx.Newton(rtol=TOLERANCE, atol=TOLERANCE, linear_solver=_linear_solver(scene))
 
     def residual(stations: Stations, args: tuple[Scene, Start]):
         scene, start = args
@@ -307,23 +240,11 @@ def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segmen
         pieces = _intervals(scene, start, sections)
         return _residual(scene, start, stations, jax.vmap(functools.partial(far_end, rtol))(pieces))
 
-    found = optx.root_find(
-        residual,
-        newton,
-        start.stations,
-        (scaled, start),
-        max_steps=MAX_ITERATIONS,
-        adjoint=optx.ImplicitAdjoint(newton.linear_solver),
-        throw=False,
-    )
-    return _equilibrium(scene, start, found.value, found.stats["num_steps"], rtol, segments)
-
-
-def _linear_solver(scene: Scene) -> lx.AbstractLinearSolver:
-    # An unloaded rod between two pins can turn about the line through them: then the smallest step is the one to take.
+    # An unloaded rod between two pins can turn about the line through them.
     is_loaded = scene.gravity is not None or scene.point_forces
     turns_freely = isinstance(scene.start, Pin) and isinstance(scene.end, Pin) and not is_loaded
-    return lx.SVD(rcond=RANK_TOLERANCE) if turns_freely else lx.LU()
+    stations, iterations = met(residual, scaled, start, is_resisted=not turns_freely)
+    return _equilibrium(scene, start, stations, iterations, rtol, segments)
 
 
 def _intervals(scene: Scene, start: Start, sections: Section) -> Piece:
@@ -345,43 +266,6 @@ def _residual(
     return gaps, at_start, at_end
 
 
-def misses(
-    scene: Scene, start: Start, sections: Section, reached: Section
-) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
-    """What is missed between the sections at the stations and those `reached` from each before, and at the supports."""
-    after = jax.tree.map(lambda leaf: leaf[1:], sections)
-    gaps = Stations(
-        position=after.position - reached.position,
-        turn=jax.vmap(turn_between)(reached.frame, after.frame),
-        force=(after.force + start.force_steps[1:] - reached.force) / start.force_scale,
-        moment=(after.moment - reached.moment) / start.moment_scale,
-    )
-    first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
-    return gaps, _missed_support(scene.start, start, first, -1.0), _missed_support(scene.end, start, last, 1.0)
-
-
-def _missed_support(end: Support, start: Start, section: Section, sign: float) -> Float[Array, "6"]:
-    """What a support asks of its cross section; `sign`: of a load on a free end in n and m there. Torque comes last."""
-    moment = section.moment
-    if isinstance(end, Free):
-        loads = (end.force, end.moment)
-        if end.follower:
-            loads = tuple(None if load is None else section.frame @ load for load in loads)
-        force = section.force if loads[0] is None else section.force - sign * loads[0]
-        moment = moment if loads[1] is None else moment - sign * loads[1]
-        position_or_force = force / start.force_scale
-    else:
-        assert isinstance(end, Held)
-        position_or_force = section.position - end.position
-    turn_or_moment = section.frame.T @ moment / start.moment_scale
-    if isinstance(end, Clamp):
-        turn_or_moment = turn_between(end.frame, section.frame)
-    elif isinstance(end, Swivel):
-        # No part of the support's tangent along d1 and d2.
-        turn_or_moment = turn_or_moment.at[:2].set(section.frame[:, :2].T @ end.tangent)
-    return jnp.concatenate([position_or_force, turn_or_moment])
-
-
 def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"]]:
     """Forces at the nodes of a guess, and int sqrt(|n| + curvature^2) ds from the start to there."""
     s = guess.s / guess.s[-1]
@@ -390,10 +274,7 @@ def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float
         force -= s[:, None] * scene.gravity[None]
     for load in scene.point_forces:
         force -= jnp.where(s > load.at, 1.0, 0.0)[:, None] * load.force[None]
-    # At least a turn by 1 rad, so that a rod without loads has its stations equally spaced.
-    rate = jnp.sqrt(jnp.sqrt(jnp.sum(force**2, axis=1)) + (guess.curvature * units.length) ** 2 + 1)
-    steps = (rate[1:] + rate[:-1]) / 2 * jnp.diff(s)
-    return force, jnp.concatenate([jnp.zeros_like(s[:1]), jnp.cumsum(steps)])
+    return force, error_growth(s, jnp.sqrt(jnp.sum(force**2, axis=1)), (guess.curvature * units.length) ** 2)
 
 
 @jax.jit
@@ -418,14 +299,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     fixed, fixed_units = jax.lax.stop_gradient((scene, units))
     x = guess.s / guess.s[-1]
     node_force, growth = _growth_along(fixed, guess, fixed_units)
-    grid = jnp.interp(jnp.linspace(0.0, growth[-1], intervals + 1, dtype=x.dtype), growth, x)
-    grid = grid.at[0].set(0.0).at[-1].set(1.0)
-    unsorted = jnp.concatenate([grid, *(load.at[None] for load in scene.point_forces)])
-    # A stable sort: a force on an end comes behind s = 0 and s = L, and so is part of what the rod exerts there.
-    order = jnp.argsort(unsorted, stable=True)
-    s = unsorted[order]
-    steps = [jnp.zeros((len(grid), 3), x.dtype), *(load.force[None] for load in scene.point_forces)]
-    force_steps = jnp.concatenate(steps)[order]
+    s, force_steps = station_places(scene, x, growth, intervals)
 
     fixed_s = jax.lax.stop_gradient(s)
     reference = _frames_between(x, guess.frames, guess.total_twist, fixed_s)
@@ -437,10 +311,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     moments = across + fixed.rod.GJ * guess.total_twist * tangents
     force = jnp.stack([jnp.interp(fixed_s, x, component) for component in node_force.T], axis=1)
     moment = jnp.stack([jnp.interp(fixed_s, x, component) for component in moments.T], axis=1)
-    position = (guess.position_at(fixed_s * guess.s[-1]) - fixed_units.origin[None]) / fixed_units.length
-    force_scale, moment_scale = (jnp.maximum(1.0, jnp.sqrt(jnp.max(jnp.sum(v**2, axis=1)))) for v in (force, moment))
-    stations = Stations(position, jnp.zeros_like(position), force / force_scale, moment / moment_scale)
-    return Start(stations, s, force_steps, reference, force_scale, moment_scale)
+    return Start.near(guess, fixed_units, s, force_steps, reference, force, moment)
 
 
 def _differences(values: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
@@ -466,8 +337,8 @@ def _frames_between(
 def _equilibrium(
     scene: Scene, start: Start, stations: Stations, iterations: Any, rtol: float, segments: int
 ) -> Equilibrium:
-    """The result in SI units, integrated from each station to the nodes behind it."""
-    scaled, units = nondimensional(scene)
+    """The result, integrated from each station to the nodes behind it."""
+    scaled, _ = nondimensional(scene)
     rod = scaled.rod
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
@@ -486,97 +357,28 @@ def _equilibrium(
     )
     points = jax.vmap(functools.partial(_beyond, scaled))(before, length, node_ends)
     s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
-    first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
 
-    residual = jnp.max(jnp.abs(ravel_pytree(_residual(scaled, start, stations, ends))[0]))
-    status = jnp.where(residual < TOLERANCE, Status.CONVERGED, Status.MAX_ITERATIONS)
-    status = jnp.where(jnp.isfinite(residual), status, Status.NOT_FINITE)
-
-    twist = first.torque / rod.GJ
-    elastic_energy = jnp.sum(ends.elastic_energy) + density(rod, twist=twist)
-    # Potentials are zero at the global origin, not at that of the units.
-    shift = units.origin / units.length
-    energy = elastic_energy
-    if scaled.gravity is not None:
-        heights = sections.position[:-1] + shift[None]
-        by_station = jax.vmap(functools.partial(dead_load_energy, scaled.gravity))(heights)
-        energy += jnp.sum(ends.weight_energy + jnp.diff(start.s) * by_station)
-    if scaled.point_forces:
-        energy += jnp.sum(jax.vmap(dead_load_energy)(start.force_steps, sections.position + shift[None]))
-    for end, section in ((scaled.start, first), (scaled.end, last)):
-        if isinstance(end, Free) and end.force is not None:
-            energy += dead_load_energy(end.force, section.position + shift)
-
-    moments = jax.vmap(lambda node: node.moment - node.torque * node.tangent)(nodes)
-    tension = jax.vmap(lambda node: jnp.sum(node.force * node.tangent))(nodes)
-    none = jnp.zeros((), int)
-    return Equilibrium(
-        s=s * scene.rod.length,
-        nodes=units.origin[None] + units.length * nodes.position,
-        frames=nodes.frame,
-        curvature=jax.vmap(_norm)(moments) / rod.EI / units.length,
-        twist=jnp.full_like(s, twist / units.length),
+    twist = sections.torque[0] / rod.GJ
+    moments = nodes.moment - nodes.torque[:, None] * nodes.tangent
+    result = Reached(
+        s=s,
+        nodes=nodes,
+        curvature=root(jnp.sum(moments**2, axis=1)) / rod.EI,
+        twist=jnp.full_like(s, twist),
+        axial_strain=axial_strain_under(rod, nodes.tension),
         total_twist=twist,
-        tension=tension * units.force,
-        axial_strain=axial_strain_under(rod, tension),
-        energy=energy * units.energy,
-        elastic_energy=elastic_energy * units.energy,
-        start_force=first.force * units.force,
-        start_moment=first.moment * units.energy,
-        end_force=last.force * units.force,
-        end_moment=last.moment * units.energy,
-        converged=is_converged(status),
-        stable=jnp.zeros((), bool),
-        status=status,
-        iterations=jnp.asarray(iterations),
-        evaluations=jnp.asarray(iterations) + 1,
-        substeps=none + 1,
-        residual=residual,
-        scene=scene,
-        state=_warm_start(scaled, s, points, last, units),
-        discretization="continuum",
+        elastic_energy=jnp.sum(ends.elastic_energy) + density(rod, twist=twist),
+        load_energy=jnp.sum(ends.weight_energy),
+        missed=_residual(scaled, start, stations, ends),
+        shape=Curve(nodes.position, points.tangent.T, s),
     )
-
-
-def _warm_start(scene: Scene, s: Float[Array, "n+1"], points: Section, last: Section, units: Units) -> SolverState:
-    """What a discrete solve from here begins with."""
-    is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
-    end_force = last.force if is_held else jnp.zeros_like(last.force)
-    return SolverState(Curve(points.position[::2], points.frame[..., 2].T, s), end_force, units)
-
-
-def _norm(vector: Float[Array, "3"]) -> Float[Array, ""]:
-    return root(jnp.sum(vector**2))
-
-
-def rotation_of(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation of a quaternion (w, x, y, z) of any length."""
-    w, x, y, z = quaternion
-    matrix = jnp.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ]
-    )
-    return matrix / jnp.sum(quaternion**2)
+    return equilibrium(scene, start, stations, iterations, result)
 
 
 def _quaternion_rate(quaternion: Float[Array, "4"], rate: Float[Array, "3"]) -> Float[Array, "4"]:
     """Derivative of a quaternion whose axes turn at `rate`, in fixed axes."""
     w, v = quaternion[0], quaternion[1:]
     return jnp.concatenate([-jnp.sum(rate * v)[None], w * rate + jnp.cross(rate, v)]) / 2
-
-
-def from_rodrigues(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation of a Rodrigues vector 2 tan(angle/2) axis."""
-    return rotation_of(jnp.concatenate([jnp.full_like(turn[:1], 2.0), turn]))
-
-
-def turn_between(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Rodrigues vector of the rotation from frame a to frame b, in the axes of a."""
-    R = a.T @ b
-    return 2 * jnp.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (1 + jnp.trace(R))
 
 
 def _about_tangent(angle: Float[Array, ""]) -> Float[Array, "3 3"]:

@@ -17,38 +17,37 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from rodjax.along import Along, Smooth, Spline, Steps, Value
-from rodjax.continuum import (
-    FIRST_STEP,
-    MAX_ITERATIONS,
-    MAX_STEPS,
-    RANK_TOLERANCE,
-    TOLERANCE,
-    Section,
-    Start,
-    Stations,
-    misses,
-    rotation_of,
-)
+from rodjax.along import Smooth, Spline, Steps, Value
 from rodjax.discretization.cells import ElementCells, varying
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.framed_results import own_moments, strains_under
 from rodjax.energy import Sections, dead_load_energy
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.rest import RestStrain, SpaceCurve
-from rodjax.result import Equilibrium, SolverState, form_and_point
+from rodjax.rest import RestStrain, SpaceCurve, SplinedCurve
+from rodjax.result import Equilibrium, form_and_point
 from rodjax.rod import Law
-from rodjax.rotations import columns, from_frame, nearer, product
+from rodjax.rotations import columns, continuous, from_frame, product, unit
 from rodjax.scene import Scene, nondimensional
-from rodjax.status import Status, is_converged
-from rodjax.supports import Clamp, Free, Held
+from rodjax.shooting import (
+    Reached,
+    Section,
+    Start,
+    Stations,
+    equilibrium,
+    error_growth,
+    integrated,
+    met,
+    misses,
+    rotation_of,
+    station_places,
+    sum_of_loads,
+)
+from rodjax.supports import Clamp
 from rodjax.units import Units
 from rodjax.vectors import dot, root
 
@@ -61,12 +60,12 @@ Prepared = Any
 class Material(eqx.Module):
     """What a rod is made of and the loads that follow it, splines already made of their values.
 
-    `rest`: curvature along d1 and d2 and twist, or splines of a curve in space and of its directors d1.
+    `rest`: curvature along d1 and d2 and twist, or a curve in space.
     """
 
     stiffnesses: tuple[Prepared, Prepared, Prepared, Prepared]
     mass: Prepared
-    rest: tuple[Prepared, Prepared, Prepared] | tuple[Spline, Spline] | None
+    rest: tuple[Prepared, Prepared, Prepared] | SplinedCurve | None
     law: Law | None
     force: Float[Array, "3"] | None
     couple: Float[Array, "3"] | None
@@ -82,15 +81,15 @@ class Material(eqx.Module):
             k1, k2, twist = (_prepared(value) for value in (*(rest.curvature or (zero, zero)), twist))
             prepared = (k1, k2, twist)
         elif isinstance(rest, SpaceCurve):
-            prepared = (Spline.through(rest.s, rest.points), Spline.through(rest.s, rest.d1))
+            prepared = rest.splined
         EI1, EI2, GJ, EA = (_prepared(value) for value in (*rod.bending_pair, rod.GJ, rod.EA))
         return Material(
             (EI1, EI2, GJ, EA),
             _prepared(rod.mass_per_length),
             prepared,
             rod.law,
-            _sum_of_loads(scene, DistributedForce, True),
-            _sum_of_loads(scene, DistributedCouple, True),
+            sum_of_loads(scene, DistributedForce, True),
+            sum_of_loads(scene, DistributedCouple, True),
         )
 
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
@@ -100,11 +99,9 @@ class Material(eqx.Module):
     def rest_strains(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Float[Array, "3"]:
         if self.rest is None:
             return jnp.zeros_like(s, shape=3)
-        if len(self.rest) == 3:
-            return jnp.stack([_at(value, s, interval) for value in self.rest])
-        frame, rate = jax.jvp(functools.partial(_frame_of, *self.rest), (s,), (jnp.ones_like(s),))
-        d2, t = frame[:, 1], frame[:, 2]
-        return jnp.stack([jnp.sum(rate[:, 1] * t), -jnp.sum(rate[:, 0] * t), jnp.sum(rate[:, 0] * d2)])
+        if isinstance(self.rest, SplinedCurve):
+            return self.rest.strains(s)
+        return jnp.stack([_at(value, s, interval) for value in self.rest])
 
 
 def _prepared(value: Value) -> Prepared:
@@ -125,22 +122,6 @@ def _splines(material: Material) -> list[Spline]:
         return isinstance(value, Spline)
 
     return [value for value in jax.tree.leaves(material, is_leaf=is_spline) if is_spline(value)]
-
-
-def _frame_of(curve: Spline, directors: Spline, s: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """As of `rest.SpaceCurve`."""
-    _, slope = jax.jvp(curve.at, (s,), (jnp.ones_like(s),))
-    t = slope / jnp.sqrt(jnp.sum(slope**2))
-    d1 = directors.at(s)
-    d1 -= jnp.sum(d1 * t) * t
-    d1 /= jnp.sqrt(jnp.sum(d1**2))
-    return jnp.stack([d1, jnp.cross(t, d1), t], axis=1)
-
-
-def _sum_of_loads(scene: Scene, kind: type, follower: bool) -> Float[Array, "3"] | None:
-    loads = [load for load in scene.distributed if isinstance(load, kind) and load.follower == follower]
-    values = [load.couple if isinstance(load, DistributedCouple) else load.force for load in loads]
-    return sum(values[1:], values[0]) if values else None
 
 
 # --- between two stations --------------------------------------------------------------------------------------------
@@ -198,7 +179,7 @@ def _strained(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _integrated(rtol: float, piece: Piece) -> FarEnd:
+def _far_end(rtol: float, piece: Piece) -> FarEnd:
     zero = jnp.zeros_like(piece.length)
     origin = jnp.zeros_like(piece.force)
     aligned = jnp.array([1.0, 0.0, 0.0, 0.0], zero.dtype)
@@ -243,27 +224,13 @@ def _integrated(rtol: float, piece: Piece) -> FarEnd:
         inside = jnp.where((inside > 0) & (inside < 1) & (length > 0), inside, 2.0)
         controller = diffrax.ClipStepSizeController(controller, step_ts=jnp.sort(inside))
 
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope),  # pyright: ignore[reportArgumentType]
-        diffrax.Dopri8(),
-        t0=0.0,
-        t1=1.0,
-        dt0=FIRST_STEP,
-        y0=y0,
-        stepsize_controller=controller,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    is_done = solution.result == diffrax.RESULTS.successful
-    assert solution.ys is not None
-    return unravel(jnp.where(is_done, solution.ys[-1], jnp.nan))
+    return unravel(integrated(slope, y0, controller))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def far_end(rtol: float, piece: Piece) -> FarEnd:
     """The other end of a piece, with derivatives in forward and reverse mode."""
-    return _integrated(rtol, piece)
+    return _far_end(rtol, piece)
 
 
 def _far_end_jvp(rtol: float, primals: tuple[Piece], tangents: tuple[Piece]) -> tuple[FarEnd, FarEnd]:
@@ -278,7 +245,7 @@ def _far_end_jvp(rtol: float, primals: tuple[Piece], tangents: tuple[Piece]) -> 
         moved = list(values)
         for k, value in zip(changing, unravel(x), strict=True):
             moved[k] = value
-        return _integrated(rtol, jax.tree.unflatten(structure, moved))
+        return _far_end(rtol, jax.tree.unflatten(structure, moved))
 
     def along(direction):
         return jax.jvp(end_of, (x,), (direction,))
@@ -300,7 +267,7 @@ def _reached(
 ) -> tuple[Section, FarEnd]:
     """The cross sections at the other ends of pieces of rod from cross sections on, and those ends."""
     material = Material.of(scene)
-    along = (_sum_of_loads(scene, kind, False) for kind in (DistributedForce, DistributedCouple))
+    along = (sum_of_loads(scene, kind, False) for kind in (DistributedForce, DistributedCouple))
     dead = (scene.gravity, *along)
 
     def reached(section, start, length, interval):
@@ -337,32 +304,21 @@ def solve_frames(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, 
     """As `solve_continuum`, from a guess with frames."""
     scaled, units = nondimensional(scene)
     start = _start(scaled, guess, units, intervals)
-    # Without a clamp some rods can spin without resistance, others cannot: then the smallest step is the one to take.
-    is_clamped = isinstance(scene.start, Clamp) or isinstance(scene.end, Clamp)
-    newton = optx.Newton(
-        rtol=TOLERANCE, atol=TOLERANCE, linear_solver=lx.LU() if is_clamped else lx.SVD(rcond=RANK_TOLERANCE)
-    )
 
     def residual(stations: Stations, args: tuple[Scene, Start]):
         scene, start = args
         sections = start.sections(stations)
         return misses(scene, start, sections, _over_intervals(scene, rtol, start, sections)[0])
 
-    found = optx.root_find(
-        residual,
-        newton,
-        start.stations,
-        (scaled, start),
-        max_steps=MAX_ITERATIONS,
-        adjoint=optx.ImplicitAdjoint(newton.linear_solver),
-        throw=False,
-    )
-    return _equilibrium(scene, start, found.value, found.stats["num_steps"], rtol, segments)
+    # Without a clamp some rods can spin without resistance, others cannot.
+    is_clamped = isinstance(scene.start, Clamp) or isinstance(scene.end, Clamp)
+    stations, iterations = met(residual, scaled, start, is_resisted=is_clamped)
+    return _equilibrium(scene, start, stations, iterations, rtol, segments)
 
 
 class _Along(eqx.Module):
     """Of a guess, nondimensional: forces, moments and quaternions of the frames at increasing arclengths, and
-    int sqrt(|n| + |kappa|^2) ds to the nodes.
+    the growth of errors to the nodes.
     """
 
     places: Float[Array, "m"]
@@ -391,14 +347,11 @@ def _along(guess: Equilibrium, units: Units) -> _Along:
     s = guess.s / guess.s[-1]
     size = jnp.interp(s, places, jnp.sqrt(dot(forces, forces)))
     squared = (guess.curvature**2 + guess.twist**2) * units.length**2
-    rate = jnp.sqrt(size + squared + 1)
-    steps = (rate[1:] + rate[:-1]) / 2 * jnp.diff(s)
-    growth = jnp.concatenate([jnp.zeros_like(s[:1]), jnp.cumsum(steps)])
-    return _Along(places, forces, moments, form.field.places, point.quaternions, s, growth)
+    return _Along(places, forces, moments, form.field.places, point.quaternions, s, error_growth(s, size, squared))
 
 
 @jax.jit
-def growth(scene: Scene, guess: Equilibrium) -> Float[Array, ""]:
+def growth_of_frames(scene: Scene, guess: Equilibrium) -> Float[Array, ""]:
     """The exponent of the growth of errors from one end of the rod to the other."""
     return _along(guess, nondimensional(scene)[1]).growth[-1]
 
@@ -407,38 +360,24 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     """Stations where errors grow equally, at the point forces and at jumps; their values from a guess."""
     fixed_units = jax.lax.stop_gradient(units)
     along = _along(guess, fixed_units)
-    dtype = along.s.dtype
-    grid = jnp.interp(jnp.linspace(0.0, along.growth[-1], intervals + 1, dtype=dtype), along.growth, along.s)
-    grid = grid.at[0].set(0.0).at[-1].set(1.0)
-    jumps = varying(scene)
-    unsorted = jnp.concatenate([grid, *jumps, *(load.at[None] for load in scene.point_forces)])
-    # A stable sort: a force on an end comes behind s = 0 and s = L, and so is part of what the rod exerts there.
-    order = jnp.argsort(unsorted, stable=True)
-    s = unsorted[order]
-    without_force = len(unsorted) - len(scene.point_forces)
-    steps = [jnp.zeros((without_force, 3), dtype), *(load.force[None] for load in scene.point_forces)]
-    force_steps = jnp.concatenate(steps)[order]
+    s, force_steps = station_places(scene, along.s, along.growth, intervals, varying(scene))
 
     fixed_s = jax.lax.stop_gradient(s)
 
     def between(places: Float[Array, "m"], values: Float[Array, "c m"]) -> Float[Array, "c k"]:
         return jnp.stack([jnp.interp(fixed_s, places, component) for component in values])
 
-    quaternions = between(along.frame_places, along.quaternions)
-    quaternions /= jnp.sqrt(dot(quaternions, quaternions))[None]
+    quaternions = unit(between(along.frame_places, along.quaternions))
     reference = jnp.moveaxis(columns(quaternions), 2, 0)
     force, moment = between(along.places, along.forces).T, between(along.places, along.moments).T
-    position = (guess.position_at(fixed_s * guess.s[-1]) - fixed_units.origin[None]) / fixed_units.length
-    force_scale, moment_scale = (jnp.maximum(1.0, jnp.sqrt(jnp.max(jnp.sum(v**2, axis=1)))) for v in (force, moment))
-    stations = Stations(position, jnp.zeros_like(position), force / force_scale, moment / moment_scale)
-    return Start(stations, s, force_steps, reference, force_scale, moment_scale)
+    return Start.near(guess, fixed_units, s, force_steps, reference, force, moment)
 
 
 def _equilibrium(
     scene: Scene, start: Start, stations: Stations, iterations: Any, rtol: float, segments: int
 ) -> Equilibrium:
-    """The result in SI units, integrated from each station to the nodes behind it."""
-    scaled, units = nondimensional(scene)
+    """The result, integrated from each station to the nodes behind it."""
+    scaled, _ = nondimensional(scene)
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
     s = ElementCells.of(scaled, jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)).places
@@ -453,82 +392,23 @@ def _equilibrium(
     reached, ends = _reached(scaled, rtol, before, start.s[both], lengths, jnp.concatenate([intervals, of_points]))
     points = jax.tree.map(lambda leaf: leaf[count:], reached)
     reached, ends = jax.tree.map(lambda leaf: leaf[:count], (reached, ends))
-    first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
-
-    residual = jnp.max(jnp.abs(ravel_pytree(misses(scaled, start, sections, reached))[0]))
-    status = jnp.where(residual < TOLERANCE, Status.CONVERGED, Status.MAX_ITERATIONS)
-    status = jnp.where(jnp.isfinite(residual), status, Status.NOT_FINITE)
-
-    elastic_energy = jnp.sum(ends.elastic_energy)
-    # Potentials are zero at the global origin, not at that of the units.
-    from_origin = sections.position + (units.origin / units.length)[None]
-    energy = elastic_energy + jnp.sum(ends.load_energy) + _energy_at(scaled, start, from_origin)
-    for end, position in ((scaled.start, from_origin[0]), (scaled.end, from_origin[-1])):
-        if isinstance(end, Free) and end.force is not None and not end.follower:
-            energy += dead_load_energy(end.force, position)
 
     s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
     strained = jax.vmap(functools.partial(_strained, Material.of(scaled)))(
         s, of_points[::2], nodes.frame, nodes.force, nodes.moment
     )
     strains = strained.strains.T
-    none = jnp.zeros((), int)
-    return Equilibrium(
-        s=s * scene.rod.length,
-        nodes=units.origin[None] + units.length * nodes.position,
-        frames=nodes.frame,
-        curvature=root(dot(strains[:2], strains[:2])) / units.length,
-        twist=strains[2] / units.length,
-        total_twist=jnp.sum(ends.twist),
-        tension=jnp.sum(nodes.force * nodes.frame[..., 2], axis=1) * units.force,
+    quaternions = continuous(jax.vmap(from_frame, out_axes=1)(points.frame))
+    result = Reached(
+        s=s,
+        nodes=nodes,
+        curvature=root(dot(strains[:2], strains[:2])),
+        twist=strains[2],
         axial_strain=strained.axial,
-        energy=energy * units.energy,
-        elastic_energy=elastic_energy * units.energy,
-        start_force=first.force * units.force,
-        start_moment=first.moment * units.energy,
-        end_force=last.force * units.force,
-        end_moment=last.moment * units.energy,
-        converged=is_converged(status),
-        stable=jnp.zeros((), bool),
-        status=status,
-        iterations=jnp.asarray(iterations),
-        evaluations=jnp.asarray(iterations) + 1,
-        substeps=none + 1,
-        residual=residual,
-        scene=scene,
-        state=_warm_start(scaled, s, points, last, units),
-        discretization="continuum",
+        total_twist=jnp.sum(ends.twist),
+        elastic_energy=jnp.sum(ends.elastic_energy),
+        load_energy=jnp.sum(ends.load_energy),
+        missed=misses(scaled, start, sections, reached),
+        shape=FramedCurve(nodes.position, quaternions, s),
     )
-
-
-def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Float[Array, ""]:
-    """The potential of the dead loads on each interval as if all of it were at its beginning, and of point forces."""
-    energy = jnp.zeros_like(positions[0, 0])
-    by_interval = [jnp.zeros_like(positions[:-1])]
-    if scene.gravity is not None:
-        mass = scene.rod.mass_per_length
-        before = mass.integral(start.s) if isinstance(mass, Along) else start.s
-        by_interval.append(jnp.diff(before)[:, None] * scene.gravity[None])
-    dead_force = _sum_of_loads(scene, DistributedForce, False)
-    if dead_force is not None:
-        by_interval.append(jnp.diff(start.s)[:, None] * dead_force[None])
-    for forces in by_interval:
-        energy += jnp.sum(jax.vmap(dead_load_energy)(forces, positions[:-1]))
-    if scene.point_forces:
-        energy += jnp.sum(jax.vmap(dead_load_energy)(start.force_steps, positions))
-    return energy
-
-
-def _warm_start(scene: Scene, s: Float[Array, "n+1"], points: Section, last: Section, units: Units) -> SolverState:
-    """What a discrete solve from here begins with."""
-    is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
-    end_force = last.force if is_held else jnp.zeros_like(last.force)
-    quaternions = jax.vmap(from_frame)(points.frame)
-
-    # Of the two quaternions of a frame the one nearer to that before.
-    def onward(before, q):
-        q = nearer(q, before)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, quaternions[0], quaternions)
-    return SolverState(FramedCurve(points.position[::2], quaternions.T, s), end_force, units)
+    return equilibrium(scene, start, stations, iterations, result)

@@ -421,7 +421,7 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
     scene, shape, field = form.scene, guess.shape, form.field
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        quaternions = shape.turned_to_ends(scene, form.field.places, twist)
+        quaternions = shape.turned_to_ends(scene, form.field, twist)
         end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
         return shape, form.holding(FramePoint(quaternions, end_force, twist))
     if isinstance(shape, Polyline):

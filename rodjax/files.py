@@ -79,6 +79,7 @@ FIELDS = {
             ("GJ", "N m^2", "torsional stiffness"),
             ("EA", "N", "axial stiffness"),
             ("mass_per_length", "kg/m", "mass per length"),
+            ("radius", "m", "radius of the rod, for pictures"),
             ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
             ("rest_twist", "rad/m", "twist without stress"),
         )
@@ -89,7 +90,6 @@ FIELDS = {
             ("/values", "", ": values between the jumps, or at the arclengths s"),
         )
     },
-    "scene/rod/radius": ("m", "radius of the rod, for pictures"),
     "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
     "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
     "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),

@@ -55,8 +55,8 @@ def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
     complex pair: by vibrations that grow (flutter). Under follower loads and couples, which have no potential, this is
     what tells stability. The inertia of the sections against turning is left out. O(n^3), eager only.
 
-    Raises `ValueError` where the rod has no mass, or where its tangents suffice (see `rodjax.Rod`): its loads have a
-    potential or are dead moments, and `Equilibrium.index` and `stable` tell.
+    Raises `ValueError` where the solve did not converge or the rod has no mass, or where its tangents suffice (see
+    `rodjax.Rod`): its loads have a potential or are dead moments, and `Equilibrium.index` and `stable` tell.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     if not is_known(equilibrium):
@@ -69,9 +69,9 @@ def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
     mass = float(rod.mean_mass_per_length)
     if not mass > 0:
         raise ValueError(f"equilibrium must be of a rod with a mass_per_length, got {mass:g} kg/m")
-    flexibility, weights = _flexibility(equilibrium)
-    if not np.all(np.isfinite(flexibility)):
+    if not bool(equilibrium.converged):
         raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
+    flexibility, weights = _flexibility(equilibrium)
     values = np.linalg.eigvals(np.asarray(flexibility) * np.repeat(np.asarray(weights), 3)[None])
     values = values[np.argsort(-np.abs(values))][: whole_number(count, "count", 1, len(values))]
     return float(rod.bending_scale) / (mass * float(rod.length) ** 4) / values.astype(complex)

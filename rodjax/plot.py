@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 
+from rodjax.along import Along
 from rodjax.checks import instance, positive
 from rodjax.discretization.twist import angle_about, transport
 from rodjax.result import Equilibrium
+from rodjax.rod import Rod
 
 Field = Literal["curvature", "twist", "tension"]
 LABELS = {"curvature": "curvature [1/m]", "twist": "twist rate [rad/m]", "tension": "tension [N]"}
@@ -54,8 +56,8 @@ def plot_rod(
     - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
     - `color_by`: `"curvature"`, `"twist"` or `"tension"`.
     - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their size.
-    - `radius` [m] of the tube; `None`: that of the rod, or thicker than life, 1.8 % of the picture, where the rod
-      would be too thin to see: the figure says so.
+    - `radius` [m] of the tube, of a rod whose radius varies at the thickest place; `None`: that of the rod, or thicker
+      than life, 1.8 % of the picture, where the rod would be too thin to see: the figure says so.
     - `axes`: 3-D axes to draw in; `None`: a new figure.
 
     The black strip runs along the director d1, the white one along -d1: where the rod twists they wind around it.
@@ -133,8 +135,8 @@ def tube(
 ) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k m 3"]]:
     """A tube around one equilibrium, smooth between the nodes: arclengths, centerline, points of its surface [m].
 
-    The faces of each ring, from point j to j + 1, go around right-handed about the tangent; the middle of the first
-    `STRIP_FACES` is along d1.
+    `radius` [m]: where the rod is thickest. The faces of each ring, from point j to j + 1, go around right-handed about
+    the tangent; the middle of the first `STRIP_FACES` is along d1.
     """
     turns = abs(float(equilibrium.total_twist)) / (2 * np.pi)
     s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], int(max(200, 24 * turns)) + 1)
@@ -145,7 +147,17 @@ def tube(
     angle = 2 * np.pi / FACES_AROUND * (np.arange(FACES_AROUND + 1) - STRIP_FACES / 2)
     around = np.cos(angle)[:, None] * d1[:, None] + np.sin(angle)[:, None] * d2[:, None]
     centerline = np.asarray(centerline)
-    return np.asarray(s), centerline, centerline[:, None] + radius * around
+    rings = radius * np.asarray(_relative_thickness(equilibrium.scene.rod, s))
+    return np.asarray(s), centerline, centerline[:, None] + rings[:, None, None] * around
+
+
+def _relative_thickness(rod: Rod, s: Float[jax.Array, "k"]) -> Float[jax.Array, "k"]:
+    """The radius at equally spaced arclengths, as part of the largest; a jump takes the space from one to the next."""
+    if not isinstance(rod.radius, Along):
+        return jnp.ones_like(s)
+    half = (s[1] - s[0]) / 2
+    before, beyond = jnp.maximum(s - half, s[0]), jnp.minimum(s + half, s[-1])
+    return rod.radius.at(s, before, beyond) / jnp.max(rod.radius.samples)
 
 
 def _directors(
@@ -245,9 +257,9 @@ def _limits(values: Float[np.ndarray, "p"]) -> tuple[float, float]:
 
 
 def _thickness(equilibria: Sequence[Equilibrium], radius: float | None = None) -> tuple[float, str]:
-    """Radius of the tubes [m], the one asked for or one that can be seen, and what to say of it in the picture."""
-    rod = equilibria[0].scene.rod
-    true = 0.0 if rod.radius is None else float(rod.radius)
+    """Radius of the tubes where thickest [m], as asked for or to be seen, and what to say of it in the picture."""
+    given = equilibria[0].scene.rod.radius
+    true = 0.0 if given is None else float(jnp.max(given.samples) if isinstance(given, Along) else given)
     if radius is None:
         nodes = np.concatenate([equilibrium.nodes for equilibrium in equilibria])
         radius = max(LEAST_RADIUS * float(np.max(np.ptp(nodes, axis=0))), true)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Pair, Spline, Steps, Value, scaled, value_at
 from rodjax.checks import direction, is_known, number_array, rotation, vector
-from rodjax.rotations import columns, from_frame, inverse, product, rotated, screw, swung
+from rodjax.rotations import carried, columns, continuous, from_frame, inverse, product, rotated, screw, unit
 from rodjax.vectors import cross, dot
 
 # Steps in which a varying curvature is integrated between two neighbouring points of a mesh.
@@ -66,8 +66,7 @@ class RestStrain(eqx.Module):
             position, quaternion = carry
             turn, way = step
             position = position + rotated(quaternion, way)
-            quaternion = product(quaternion, turn)
-            quaternion /= jnp.sqrt(jnp.sum(quaternion**2))
+            quaternion = unit(product(quaternion, turn))
             return (position, quaternion), (position, quaternion)
 
         begin = jnp.zeros(3, s.dtype), jnp.array([1.0, 0.0, 0.0, 0.0], s.dtype)
@@ -75,6 +74,29 @@ class RestStrain(eqx.Module):
         positions = jnp.concatenate([begin[0][None], positions[STEPS - 1 :: STEPS]])
         quaternions = jnp.concatenate([begin[1][None], quaternions[STEPS - 1 :: STEPS]])
         return Poses(positions.T, quaternions.T)
+
+
+class SplinedCurve(eqx.Module):
+    """Splines of a curve in space and of its directors d1, made once for as many places as are asked for."""
+
+    curve: Spline
+    directors: Spline
+
+    def poses(self, s: Float[Array, "*k"]) -> tuple[Float[Array, "3 *k"], Float[Array, "3 3 *k"]]:
+        """Positions and frames."""
+        slope = _slope(self.curve, s)
+        t = slope / _size(slope)[None]
+        d1 = self.directors.at(s)
+        d1 -= dot(d1, t)[None] * t
+        d1 /= _size(d1)[None]
+        return self.curve.at(s), jnp.stack([d1, cross(t, d1), t], axis=1)
+
+    def strains(self, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
+        """Curvature along d1 and d2, and twist."""
+        (_, frames), (_, change) = jax.jvp(self.poses, (s,), (jnp.ones_like(s),))
+        d2, t = frames[:, 1], frames[:, 2]
+        by_d1, by_d2, _ = (change[:, k] for k in range(3))
+        return jnp.stack([dot(by_d2, t), -dot(by_d1, t), dot(by_d1, d2)])
 
 
 class SpaceCurve(eqx.Module):
@@ -124,33 +146,25 @@ class SpaceCurve(eqx.Module):
     def scaled(self, length: Float[Array, ""]) -> "SpaceCurve":
         return SpaceCurve(self.points / length, self.s, self.d1)
 
-    def _frames(self, s: Float[Array, "*k"]) -> tuple[Float[Array, "3 *k"], Float[Array, "3 3 *k"]]:
-        curve, directors = Spline.through(self.s, self.points), Spline.through(self.s, self.d1)
-        slope = _slope(curve, s)
-        t = slope / _size(slope)[None]
-        d1 = directors.at(s)
-        d1 -= dot(d1, t)[None] * t
-        d1 /= _size(d1)[None]
-        return curve.at(s), jnp.stack([d1, cross(t, d1), t], axis=1)
+    @property
+    def splined(self) -> SplinedCurve:
+        return SplinedCurve(Spline.through(self.s, self.points), Spline.through(self.s, self.d1))
 
     def world(self, s: Float[Array, "k"]) -> Poses:
         """In the axes in which the points are given."""
-        positions, frames = self._frames(s)
+        positions, frames = self.splined.poses(s)
         quaternions = jax.vmap(from_frame, 2, 1)(frames)
-        return Poses(positions, _continuous(quaternions))
+        return Poses(positions, continuous(quaternions))
 
     def poses(self, s: Float[Array, "k"]) -> Poses:
         world = self.world(s)
         first = inverse(world.quaternions[:, :1]) + 0 * world.quaternions
         return Poses(
-            rotated(first, world.positions - world.positions[:, :1]), _continuous(product(first, world.quaternions))
+            rotated(first, world.positions - world.positions[:, :1]), continuous(product(first, world.quaternions))
         )
 
     def at(self, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
-        (_, frames), (_, change) = jax.jvp(self._frames, (s,), (jnp.ones_like(s),))
-        d2, t = frames[:, 1], frames[:, 2]
-        by_d1, by_d2, _ = (change[:, k] for k in range(3))
-        return jnp.stack([dot(by_d2, t), -dot(by_d1, t), dot(by_d1, d2)])
+        return self.splined.strains(s)
 
 
 RestShape = RestStrain | SpaceCurve
@@ -159,13 +173,7 @@ RestShape = RestStrain | SpaceCurve
 def _carried(d1: Float[Array, "3"], tangents: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
     """A director at the first tangent, carried along all of them without twist."""
     first = from_frame(jnp.stack([d1, jnp.cross(tangents[:, 0], d1), tangents[:, 0]], axis=1))
-
-    def onward(q, tangent):
-        q = swung(q, tangent)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, first, tangents.T)
-    return columns(quaternions.T)[:, 0]
+    return columns(carried(first, tangents))[:, 0]
 
 
 def _slope(spline: Spline, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
@@ -174,13 +182,6 @@ def _slope(spline: Spline, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
 
 def _size(vectors: Float[Array, "3 *k"]) -> Float[Array, "*k"]:
     return jnp.sqrt(dot(vectors, vectors))
-
-
-def _continuous(quaternions: Float[Array, "4 k"]) -> Float[Array, "4 k"]:
-    """Of the two quaternions of each frame the one that is nearer to that of the last."""
-    products = dot(quaternions[:, 1:], quaternions[:, :-1])
-    signs = jnp.concatenate([jnp.ones_like(products[:1]), jnp.cumprod(jnp.where(products < 0, -1.0, 1.0))])
-    return signs.astype(quaternions.dtype)[None] * quaternions
 
 
 def ends(

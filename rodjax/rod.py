@@ -73,9 +73,9 @@ class Rod(eqx.Module):
     - `rest_twist` [rad/m] in the shape without stress; `None` for none.
     - `law`: a density of energy of one's own, in place of the quadratic one. The stiffnesses above are then its scale.
 
-    Stiffnesses, mass and components of the rest shape may be `Along`: `rodjax.Steps` or `rodjax.Smooth`. A rod with
-    one EI, nothing that varies, no rest shape and no law of its own needs no angle about its tangent, and is solved
-    faster.
+    Stiffnesses, mass, radius and components of the rest shape may be `Along`: `rodjax.Steps` or `rodjax.Smooth`. A rod
+    with one EI, nothing but its radius that varies, no rest shape and no law of its own needs no angle about its
+    tangent, and is solved faster.
 
     Raises `ValueError` or `TypeError` where a stiffness or the length is not a positive finite number.
     """
@@ -85,7 +85,7 @@ class Rod(eqx.Module):
     GJ: Value
     EA: Value
     mass_per_length: Value
-    radius: Float[Array, ""] | None
+    radius: Value | None
     rest_curvature: Pair | None
     rest_twist: Value | None
     rest_centerline: SpaceCurve | None
@@ -109,7 +109,7 @@ class Rod(eqx.Module):
         self.GJ = _value(GJ, "GJ", positive)
         self.EA = _value(EA, "EA", positive)
         self.mass_per_length = _value(mass_per_length, "mass_per_length", not_negative)
-        self.radius = None if radius is None else leaf(positive(radius, "radius"))
+        self.radius = None if radius is None else _value(radius, "radius", positive)
         if rest_curvature is not None and not _is_pair(rest_curvature):
             raise ValueError(f"rest_curvature must be a pair (k1, k2), got {rest_curvature!r}")
         self.rest_curvature = None if rest_curvature is None else _pair(rest_curvature, "rest_curvature", number_array)
@@ -162,7 +162,7 @@ class Rod(eqx.Module):
     def in_units(self, units: Units) -> "Rod":
         """The same rod with L = 1, EI = 1 and mass per length 1: see `rodjax.scene.nondimensional`."""
         one = jnp.ones_like(self.length)
-        radius = None if self.radius is None else self.radius / units.length
+        radius = None if self.radius is None else scaled(self.radius, units.length, units.length)
         if self.is_plain:
             return Rod(one, one, self.GJ / self.EI, self.EA / units.force, one, radius)
         L, bending = units.length, units.energy * units.length
@@ -452,10 +452,7 @@ def _value(value: Any, name: str, check: Callable[[Any, str], Numbers]) -> Value
     if not isinstance(value, Along):
         return leaf(check(value, name))
     if is_known(value):
-        samples = np.asarray(value.values)
-        if isinstance(value, Smooth):  # between its values it may overshoot
-            fine = jnp.linspace(value.s[0], value.s[-1], 8 * len(value.s))
-            samples = np.concatenate([samples, np.asarray(value.at(fine, fine, fine))])
+        samples = np.asarray(value.samples)
         check(samples[np.argmin(samples)], name)
     return value
 
@@ -465,7 +462,7 @@ def _check_arclengths(rod: Rod) -> None:
     if not is_known(rod):
         return
     length = float(rod.length)
-    for field in ("EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
+    for field in ("EI", "GJ", "EA", "mass_per_length", "radius", "rest_curvature", "rest_twist"):
         values = getattr(rod, field)
         named = {field: values}
         if isinstance(values, tuple):

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -108,6 +109,16 @@ def swung(q: Float[Array, "4 *k"], new: Float[Array, "3 *k"]) -> Float[Array, "4
     return unit(product(unit(swing), q))
 
 
+def carried(q: Float[Array, "4"], tangents: Float[Array, "3 k"]) -> Float[Array, "4 k"]:
+    """A frame carried from one tangent to the next without twist, each not opposite to the last."""
+
+    def onward(q, tangent):
+        q = swung(q, tangent)
+        return q, q
+
+    return jax.lax.scan(onward, q, tangents.T)[1].T
+
+
 def unit(q: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
     """The same direction at the length 1."""
     return q / jnp.sqrt(dot(q, q))[None]
@@ -136,6 +147,13 @@ def from_frame(frame: Float[Array, "3 3"]) -> Float[Array, "4"]:
 def nearer(q: Float[Array, "4 *k"], other: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
     """The one of the two quaternions of a rotation that is nearer to another."""
     return jnp.where(dot(q, other)[None] < 0, -q, q)
+
+
+def continuous(q: Float[Array, "4 k"]) -> Float[Array, "4 k"]:
+    """Of the two quaternions of each frame the one that is nearer to that of the last."""
+    products = dot(q[:, 1:], q[:, :-1])
+    signs = jnp.concatenate([jnp.ones_like(products[:1]), jnp.cumprod(jnp.where(products < 0, -1.0, 1.0))])
+    return signs.astype(q.dtype)[None] * q
 
 
 def screw(

@@ -61,8 +61,8 @@ The keys of a rod, besides its section (optional ones in brackets; all but those
   mass_per_length, radius]
 
 material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
-twist may vary along the rod: constant between jumps, EI = { jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth,
-EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
+twist, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps, EI = {
+jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
 
 The main tables are the first scene of a path. Along it may change: position, tangent, d2, spin, force, moment of the
 two ends, and loads.gravity. Tangents and d2 go along great circles, all else linearly. A step turns an end by less than
@@ -121,7 +121,7 @@ _SECTIONS = {
     None: (Rod, ("length", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", *_REST)),
 }
 # The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
-_VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", *_REST)
+_VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", "radius", *_REST)
 _PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
 _DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
 # The keys that a support must have, may have, and may change along a path.
@@ -224,8 +224,8 @@ def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[s
 
 
 def _written_rod(rod: Rod) -> list[str]:
-    lines = _written(rod, ("length", "radius"))
-    for name in ("EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
+    lines = _written(rod, ("length",))
+    for name in ("radius", "EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
         value = getattr(rod, name)
         values = zip(_PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
         lines += [_written_value(key, value) for key, value in values if value is not None]
@@ -352,7 +352,9 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
     check_keys(table, "rod", required, (*optional, "section"))
-    varying = {key: value for key, value in table.items() if key in _VARYING and isinstance(value, dict)}
+    # Not the radius from which the stiffnesses of a circular section come.
+    may_vary = [key for key in _VARYING if key != "radius" or key in optional]
+    varying = {key: value for key, value in table.items() if key in may_vary and isinstance(value, dict)}
     values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=("section", *varying))
     values |= {key: reader.part(_along, key, value) for key, value in varying.items()}
     if "EI" in optional:

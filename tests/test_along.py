@@ -11,6 +11,7 @@ import pytest
 import rodjax as rj
 from rodjax.along import Spline
 from rodjax.rod import torsion_constant
+from rodjax.scene import nondimensional
 
 LINE = np.stack([np.arange(5.0), np.zeros(5), np.zeros(5)], axis=1)
 FRAMES = np.stack([np.eye(3)] * 5)
@@ -49,6 +50,25 @@ def test_steps_have_the_mean_of_a_stretch():
     np.testing.assert_allclose(steps.mean(a, b), [1, 2, 3, 2], rtol=1e-14)
 
 
+def test_samples_tell_the_largest_value():
+    """Also of a spline that overshoots: a cubic through 0, 1, 1, 0 has its largest value in the middle."""
+    assert float(jnp.max(rj.Steps([0.4, 0.5], [1.0, 3.0, 2.0]).samples)) == 3
+    # 9/2 x (1 - x), of 32 places the nearest to the middle 1/62 off it.
+    largest = float(jnp.max(rj.Smooth([0, 1 / 3, 2 / 3, 1], [0, 1, 1, 0]).samples))
+    assert largest == pytest.approx(9 / 8 - 4.5 / 62**2, rel=1e-12)
+
+
+def test_a_radius_that_varies_leaves_the_rod_plain():
+    """It is for pictures only: no angle about the tangent is needed, and the radius is scaled with the rod."""
+    rod = rj.Rod(2.0, 3.0, 1.0, 1e4, radius=rj.Steps([0.5], [0.01, 0.02]))
+    assert rod.is_plain
+    scene = rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free(force=(0, 0, 1)))
+    scaled, _ = nondimensional(scene)
+    assert scaled.rod.is_plain
+    np.testing.assert_allclose(scaled.rod.radius.jumps, [0.25], rtol=1e-15)
+    np.testing.assert_allclose(scaled.rod.radius.values, [0.005, 0.01], rtol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -59,6 +79,8 @@ def test_steps_have_the_mean_of_a_stretch():
         (lambda: rj.Rod(1.0, 1, rj.Smooth([0, 0.5], [1, 2]), 1), r"GJ.s must run from 0 to 1 m"),
         (lambda: rj.Rod(1.0, rj.Steps([0.5], [1, -2]), 1, 1), "EI must be positive"),
         (lambda: rj.Rod(1.0, rj.Smooth([0, 0.4, 0.5, 1], [1, 0.001, 1, 1]), 1, 1), "EI must be positive"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, radius=rj.Steps([1.5], [1, 2])), r"radius.jumps must lie inside 0 to 1 m"),
+        (lambda: rj.Rod(1.0, 1, 1, 1, radius=rj.Smooth([0, 0.4, 0.5, 1], [1, 0.001, 1, 1])), "radius must be positive"),
         (lambda: rj.Rod(1.0, (1, 2, 3), 1, 1), "EI must be one or a pair"),
         (lambda: rj.Rod(1.0, 1, 1, 1, rest_curvature=3.0), "rest_curvature must be a pair"),
         (lambda: rj.Rod(1.0, 1, 1, 1, law=3), "law must be a Law"),

@@ -84,8 +84,12 @@ def general_scene(name: str) -> Scene:
     couple = DistributedCouple((0, 1e-5, 0), follower=True)
     rod, end, distributed = {
         "numbers": (Rod(1.0, (4e-3, 1 / 300), 3e-3, 500.0, 0.1, None, (0.1, 1 / 3), 1 / 7), Free(), ()),
-        "steps": (Rod(1.0, steps(4e-3), steps(3e-3), steps(1e3), steps(0.1), 0.01), Free(), [follower]),
-        "smooth": (Rod(1.0, smooth(4e-3), smooth(3e-3), smooth(1e3), smooth(0.1)), Free(ORIGIN, ORIGIN, True), ()),
+        "steps": (Rod(1.0, steps(4e-3), steps(3e-3), steps(1e3), steps(0.1), steps(0.01)), Free(), [follower]),
+        "smooth": (
+            Rod(1.0, smooth(4e-3), smooth(3e-3), smooth(1e3), smooth(0.1), smooth(0.01)),
+            Free(ORIGIN, ORIGIN, True),
+            (),
+        ),
         "both": (
             Rod(1.0, (steps(4e-3), smooth(4e-3)), 3e-3, 500.0, 0.0, None, (smooth(0.3), steps(0.2)), smooth(0.2)),
             Free((0.0, 1e-3, 0.0), follower=True),

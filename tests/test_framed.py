@@ -3,6 +3,7 @@
 import math
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,6 +73,75 @@ def test_equal_stiffnesses_give_the_rod_of_one_by_differences(name):
 def test_equal_stiffnesses_give_the_rod_of_one_by_elements(name):
     # Other elements, both of fourth order: 32 of them are off by some 1e-7.
     compare(SCENES[name], "hermite", 32, 2e-6)
+
+
+# --- stiffness, derivatives and stability, beside the rod of one stiffness -------------------------------------------
+
+# The same finite differences, to what the solver's tolerance leaves in derivatives.
+CLOSE = {"segments": 12, "discretization": "finite_difference", "solver": rj.Newton(tolerance=1e-11)}
+
+
+@pytest.fixture(scope="module")
+def stiffnesses() -> tuple[np.ndarray, np.ndarray]:
+    """At the end, of the pair and of the plain rod."""
+    pair, plain = (np.asarray(rj.end_stiffness(SCENES["clamps"](isotropic(pair)), **CLOSE)) for pair in (True, False))
+    return pair, plain
+
+
+@pytest.mark.slow
+def test_the_end_stiffness_is_that_of_the_rod_of_one(stiffnesses):
+    pair, plain = stiffnesses
+    assert pair.shape == (6, 6)
+    largest = np.max(np.abs(plain))
+    np.testing.assert_allclose(pair, pair.T, rtol=0, atol=1e-8 * largest)
+    np.testing.assert_allclose(pair, plain, rtol=0, atol=1e-7 * largest)
+
+
+@pytest.mark.slow
+def test_the_end_stiffness_is_the_hessian_of_the_energy(stiffnesses):
+    scene = SCENES["clamps"](isotropic(True))
+    guess = rj.solve(scene, **CLOSE)
+
+    def energy(displacement):
+        end = rj.Clamp(scene.end.position + displacement, scene.end.frame)
+        return rj.solve(eqx.tree_at(lambda scene: scene.end, scene, end), guess=guess, **CLOSE).energy
+
+    hessian = jax.hessian(energy)(jnp.zeros(3))
+    largest = np.max(np.abs(hessian))
+    np.testing.assert_allclose(hessian, stiffnesses[0][:3, :3], rtol=0, atol=1e-8 * largest)
+
+
+@pytest.mark.slow
+def test_sensitivities_are_those_of_the_rod_of_one():
+    of, wrt = ["nodes", "end_force", "energy"], ["rod.GJ", "rod.EA", "end.frame", "gravity", "point_forces.0.force"]
+    pair, plain = (
+        rj.sensitivities(SCENES["clamps"](isotropic(pair)), of=of, wrt=wrt, **CLOSE) for pair in (True, False)
+    )
+    for field in of:
+        for number in wrt:
+            expected = np.asarray(plain[field][number])
+            size = max(float(np.max(np.abs(expected))), 1e-6)
+            np.testing.assert_allclose(pair[field][number], expected, rtol=0, atol=1e-6 * size, err_msg=number)
+
+
+@pytest.mark.slow
+def test_a_saddle_is_that_of_the_rod_of_one():
+    """A straight strut between a clamp and a free end beyond pi^2/4 EI/L^2, which could bend in both planes."""
+    clamp, push = rj.Clamp((0, 0, 0), LEVEL), rj.Free(force=(-5.0, 0, 0))
+    straight = rj.Guess(np.linspace((0, 0, 0), (1, 0, 0), 5))
+    pair, plain = (
+        rj.solve(rj.Scene(isotropic(pair), clamp, push), segments=12, guess=straight, find="equilibrium")
+        for pair in (True, False)
+    )
+    assert pair.converged
+    assert not pair.stable
+    assert pair.index == plain.index == 2
+    modes = rj.lowest_mode(pair), rj.lowest_mode(plain)
+    # EA = 1e4: the strut is shorter by 5e-4.
+    assert modes[0].stiffness == pytest.approx(math.pi**2 / 4 - 5, abs=5e-3)
+    assert modes[0].stiffness == pytest.approx(float(modes[1].stiffness), abs=1e-5)
+    sizes = [np.linalg.norm(mode.displacement, axis=1) for mode in modes]
+    np.testing.assert_allclose(*sizes, rtol=0, atol=1e-5)
 
 
 def test_bad_input_for_frames_is_refused():
@@ -392,6 +462,15 @@ def test_a_column_under_a_tangential_force_flutters():
     assert np.max(np.abs(below.imag)) < 1e-6 * np.max(np.abs(below))
     assert np.min(below.real) > 0
     assert np.min(np.abs(above.imag)) > 1.0
+
+
+@pytest.mark.slow
+def test_frequencies_are_those_of_an_equilibrium():
+    scene = SCENES["clamps"](isotropic(True))
+    with pytest.warns(rj.NotConvergedWarning, match="largest number of iterations"):
+        result = rj.solve(scene, segments=12, discretization="finite_difference", solver=rj.Newton(max_iterations=1))
+    with pytest.raises(ValueError, match="equilibrium must be one: not converged: stopped at the largest number"):
+        rj.squared_frequencies(result)
 
 
 def test_frequencies_are_refused_where_the_tangents_suffice():

@@ -1,6 +1,7 @@
 import io
 from typing import cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.image import imread
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rodjax import Clamp, Free, PointForce, Rod, Scene, frame, plot, problems, solve
+from rodjax import Clamp, Free, PointForce, Rod, Scene, Smooth, Steps, frame, plot, problems, solve
 from rodjax.discretization.twist import angle_about, transport_along
 
 SEGMENTS = 10
@@ -154,6 +155,27 @@ def test_a_thin_rod_is_drawn_thicker_and_the_picture_says_so(twisted):
     size = float(np.max(np.ptp(np.asarray(twisted.nodes), axis=0)))
     times = plot.LEAST_RADIUS * size / 0.005
     assert notes(plot.plot_rod(twisted)) == [f"drawn {times:.2g} times as thick as it is"]
+
+
+def test_a_rod_that_varies_is_drawn_as_thick_as_it_is(twisted):
+    """In proportion where the thickest place is drawn thicker."""
+    length = float(twisted.s[-1])
+
+    def drawn(radius):
+        rod = Rod(length, 1.0, 1.0, 1.0, radius=radius)
+        changed = eqx.tree_at(lambda found: found.scene.rod.radius, twisted, rod.radius)
+        s, centerline, points = plot.tube(changed, 0.04)
+        distance = np.linalg.norm(points - centerline[:, None], axis=-1)
+        np.testing.assert_allclose(distance, distance[:, :1] * np.ones_like(distance), rtol=1e-12)
+        (note,) = [text.get_text() for text in plot.plot_rod(changed, radius=0.04).axes[0].texts]
+        assert note == "drawn 2 times as thick as it is"
+        return s / length, distance[:, 0]
+
+    s, distance = drawn(Steps([0.3 * length], [0.01, 0.02]))
+    away = np.abs(s - 0.3) > 0.01
+    np.testing.assert_allclose(distance[away], np.where(s < 0.3, 0.02, 0.04)[away], rtol=1e-12)
+    s, distance = drawn(Smooth([0, length], [0.01, 0.02]))
+    np.testing.assert_allclose(distance, 0.02 * (1 + s), rtol=1e-9)
 
 
 def test_loads_are_drawn_with_their_size(twisted):

@@ -5,7 +5,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rodjax.rotations import (
+    carried,
     columns,
+    continuous,
     from_frame,
     inverse,
     nearer,
@@ -63,6 +65,17 @@ def test_turns_spins_and_swings():
     np.testing.assert_allclose(tangent(swing), new, rtol=0, atol=1e-14)
     axis = np.asarray(product(swing, inverse(q)))[1:]
     np.testing.assert_allclose(np.sum(axis * np.asarray(tangent(q)), axis=0), np.zeros(20), rtol=0, atol=1e-14)
+
+
+def test_a_frame_is_carried_without_twist():
+    """Along a circle it turns about the axis of the circle; and of either sign of quaternions one is kept."""
+    angles = np.linspace(0, 6, 25)
+    tangents = jnp.asarray(np.stack([np.sin(angles), 0 * angles, np.cos(angles)]))
+    q = carried(jnp.array([1.0, 0.0, 0.0, 0.0]), tangents)
+    expected = Rotation.from_rotvec(angles[:, None] * np.array([0, 1, 0])).as_matrix()
+    np.testing.assert_allclose(matrices(q), expected, rtol=0, atol=1e-14)
+    signs = np.where(np.arange(25) % 3 == 1, -1.0, 1.0)
+    np.testing.assert_array_equal(continuous(q * signs[None]), q)
 
 
 def test_screws_of_large_and_small_angles():

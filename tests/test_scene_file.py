@@ -111,8 +111,8 @@ def general_rods(seed):
     return {
         "pair": Rod(1 / 3, (a[0], b[0]), c[0], d[0], radius=0.01),
         "rest shape": Rod(1 / 3, a[0], b[0], c[0], rest_curvature=awkward(2, seed), rest_twist=-d[0]),
-        "steps": Rod(1 / 3, steps, other, other, steps),
-        "smooth": Rod(1 / 3, smooth, 0.3 * b[0], smooth, smooth, rest_curvature=(rest, 0.0), rest_twist=rest),
+        "steps": Rod(1 / 3, steps, other, other, steps, steps),
+        "smooth": Rod(1 / 3, smooth, 0.3 * b[0], smooth, smooth, smooth, rest_curvature=(rest, 0.0), rest_twist=rest),
         "both": Rod(1 / 3, (steps, smooth), other, c[0], rest_curvature=(other, rest), rest_twist=other),
         "one of a pair": Rod(1 / 3, (a[0], steps), b[0], c[0]),
     }
@@ -261,9 +261,13 @@ STIFF = 'GJ = "3 N mm^2"\nEA = "785 N"\n'
         (
             f'section = "centerline"\npoints = "{[list(point) for point in POINTS]} m"\nEI1 = "4 N mm^2"\n'
             f'EI2 = {{ jumps = "[0.1] m", values = "[2, 3] N mm^2" }}\n{STIFF}'
-            'mass_per_length = "10 g/m"\nradius = "2 mm"\nd2 = [0, 1, 1]',
+            'mass_per_length = "10 g/m"\nradius = { jumps = "[10] cm", values = "[2, 3] mm" }\nd2 = [0, 1, 1]',
             lambda: Rod.from_centerline(
-                POINTS, (4e-6, Steps([0.1], [2e-6, 3e-6])), 3e-6, 785, 0.01, 0.002, d2=(0, 1, 1)
+                POINTS,
+                (4e-6, Steps([0.1], [2e-6, 3e-6])),
+                *(3e-6, 785, 0.01),
+                Steps([0.1], [0.002, 0.003]),
+                d2=(0, 1, 1),
             ),
         ),
         (
@@ -403,6 +407,12 @@ MISTAKES = [
         "rod.outer_radius - inner_radius must be positive",
         "got -0.001",
     ),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = { jumps = "[0.5] m", values = "[1, 2] mm" }\n'
+        'youngs_modulus = "1 MPa"\npoisson_ratio = 0.5\n' + START + END,
+        "rod.radius must have a unit",
+        'radius = "5 mm"',
+    ),
     # rods that vary, of two stiffnesses, with a rest shape
     (ROD.replace('EI = "4.9e-3 N m^2"', "") + START + END, "rod.EI is missing", "rod.EI1 and rod.EI2"),
     (ROD + 'EI1 = "1 N m^2"\n' + START + END, "rod.EI is not allowed together with", "rod.EI1 and rod.EI2"),
@@ -452,7 +462,63 @@ MISTAKES = [
         "rod.EA must be positive",
         "got -4",
     ),
+    (
+        ROD.replace('"785 N"', '{ s = "[0, 0.5, 1] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA.values must be as many as s",
+        "2 values at 3 arclengths",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5, 0.4] m", values = "[1, 4, 2] N" }') + START + END,
+        "rod.EA.jumps must increase",
+        "[0.5, 0.4]",
+    ),
+    (
+        ROD.replace('"785 N"', '{ jumps = "[0.5] m", s = "[0, 1] m", values = "[1, 4] N" }') + START + END,
+        "rod.EA must be a number and a unit, or a table of jumps and values, or of s and values",
+        "'s': '[0, 1] m'",
+    ),
+    (
+        ROD + 'radius = { jumps = "[0.5] m", values = "[1, 2, 3] mm" }\n' + START + END,
+        "rod.radius.values must be one more than jumps",
+        "3 values and 1 jumps",
+    ),
+    (
+        ROD + 'radius = { s = "[0, 0.5, 1] m", values = "[1, -1, 1] mm" }\n' + START + END,
+        "rod.radius must be positive",
+        "got -0.001",
+    ),
+    (
+        ROD
+        + 'rest_curvature_1 = { jumps = "[2] m", values = "[1, 2] 1/m" }\nrest_curvature_2 = "0 1/m"\n'
+        + START
+        + END,
+        "rod.rest_curvature_1.jumps must lie inside 0 to 1 m",
+        "[2.0]",
+    ),
     # sections
+    (
+        '[rod]\nsection = "rectangular"\nlength = "1 m"\nwidth = "10 mm"\n' + MATERIAL + START + END,
+        "rod.height is missing",
+        'height = "1 mm"',
+    ),
+    (
+        '[rod]\nsection = "rectangular"\nlength = "1 m"\nradius = "5 mm"\n' + MATERIAL + START + END,
+        "rod.radius is not allowed",
+        "length, width, height, youngs_modulus",
+    ),
+    (
+        '[rod]\nsection = "circular"\nlength = "1 m"\nradius = "5 mm"\nrest_twist = "1 rad/m"\n'
+        + MATERIAL
+        + START
+        + END,
+        "rod.rest_twist is not allowed",
+        "length, radius, youngs_modulus",
+    ),
+    (
+        '[rod]\nsection = "centerline"\npoints = "[0, 1, 2, 3] m"\nEI = "1 N m^2"\n' + STIFF + START + END,
+        "rod.points must be a list of lists of 3 numbers and a unit",
+        "[0, 0, 0]",
+    ),
     (
         '[rod]\nsection = "bundle"\nlength = "1 m"\nwires = 7.5\nwire_radius = "1 mm"\nstick = 0\n'
         + MATERIAL

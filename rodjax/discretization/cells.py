@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.along import Steps, stiffness_at
-from rodjax.discretization.hermite import SIMPSON, interleaved, with_nodes_at
+from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before, with_nodes_at
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod
-from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product
+from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product, unit
 from rodjax.scene import Scene
 from rodjax.staging import staged
 
@@ -67,6 +67,10 @@ class Cells(Protocol):
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c p n"]: ...
 
+    def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 nodes"]:
+        """The frames at the nodes."""
+        ...
+
     def assembled(self, by_cell: Float[Array, "... p n"]) -> Float[Array, "... m"]:
         """Sums over the cells at each frame."""
         ...
@@ -105,10 +109,6 @@ class JointCells(eqx.Module):
 
     s: Float[Array, "n+1"]
 
-    @staticmethod
-    def of(scene: Scene, s: Float[Array, "n+1"]) -> "JointCells":
-        return JointCells(s)
-
     @property
     def segments(self) -> int:
         return len(self.s) - 1
@@ -143,6 +143,11 @@ class JointCells(eqx.Module):
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
         return jnp.stack([by_frame[:, :-1], by_frame[:, 1:]], axis=1)
+
+    def at_nodes(self, quaternions: Float[Array, "4 n+2"]) -> Float[Array, "4 n+1"]:
+        """Half way between those of the edges beside."""
+        between = unit(quaternions[:, 1:-2] + quaternions[:, 2:-1])
+        return jnp.concatenate([quaternions[:, :1], between, quaternions[:, -1:]], axis=1)
 
     def assembled(self, by_cell: Float[Array, "... 2 n"]) -> Float[Array, "... m"]:
         none = jnp.zeros_like(by_cell[..., 0, :1])
@@ -233,13 +238,13 @@ class ElementCells(eqx.Module):
         return jnp.stack([self.s[:-1], (self.s[:-1] + self.s[1:]) / 2, self.s[1:]])
 
     def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
-        return jnp.stack([by_frame[:, 0:-1:2], by_frame[:, 1::2], by_frame[:, 2::2]], axis=1)
+        return jnp.stack(of_elements(by_frame), axis=1)
+
+    def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 n+1"]:
+        return quaternions[:, ::2]
 
     def assembled(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
-        start, middle, end = (by_cell[..., k, :] for k in range(3))
-        none = jnp.zeros_like(start[..., :1])
-        nodes = jnp.concatenate([start, none], axis=-1) + jnp.concatenate([none, end], axis=-1)
-        return interleaved(nodes, middle)
+        return assembled(*(by_cell[..., k, :] for k in range(3)))
 
     def strains(self, frames: Frames) -> tuple[Vector, ...]:
         middle = inverse(frames[1])
@@ -266,13 +271,11 @@ class ElementCells(eqx.Module):
         return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
-        x = jnp.clip((at - self.s[:-1]) / self.h, 0.0, 1.0)
-        parts = (x - 3 * x**2 / 2 + 2 * x**3 / 3, 2 * x**2 - 4 * x**3 / 3, 2 * x**3 / 3 - x**2 / 2)
-        return jnp.stack([part / weight for part, weight in zip(parts, SIMPSON, strict=True)])
+        return parts_before(self.s, at)
 
     def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 3 n"], Float[Array, "3"]]:
         """By parabolas through the three points of each element."""
-        a, b, c = (part[:, 0] for part in jnp.split(self.of_cells(by_frame), 3, axis=1))
+        a, b, c = of_elements(by_frame)
         whole = self.h[None] * (SIMPSON[0] * (a + c) + SIMPSON[1] * b)
         second_half = self.h[None] * (-a + 8 * b + 5 * c) / 24
         sums = jnp.cumsum(whole[:, ::-1], axis=1)[:, ::-1]

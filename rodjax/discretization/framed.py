@@ -20,10 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.along import Along
-from rodjax.discretization.cells import REFERENCE, Cells, Frames, JointCells
+from rodjax.discretization.cells import REFERENCE, Cells, ElementCells, Frames, JointCells
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
-from rodjax.discretization.hermite import interleaved
 from rodjax.energy import Sections
 from rodjax.linalg import DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
@@ -429,9 +428,7 @@ def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, 
         return None, None
     # At the nodes and between them, so that both are at hand: of finite differences the frames of the inner nodes are
     # left out.
-    nodes = cells.s
-    middles = (nodes[:-1] + nodes[1:]) / 2
-    poses = rest.poses(interleaved(nodes, middles))
+    poses = rest.poses(ElementCells(cells.s).places)
     is_joints = isinstance(cells, JointCells)
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q

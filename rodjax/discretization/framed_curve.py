@@ -7,14 +7,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells
+from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm, FramePoint, of_cells, stacked
-from rodjax.discretization.hermite import interleaved
+from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist
 from rodjax.guess import cubic, first_shape
 from rodjax.rest import RestStrain
-from rodjax.rotations import from_frame, inverse, nearer, product, rotated, spun, swung, tangent
+from rodjax.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
 from rodjax.scene import Scene, held_at_both_ends
 from rodjax.supports import Clamp, Directed, Held, Swivel
 from rodjax.vectors import dot
@@ -46,37 +47,28 @@ class FramedCurve(Shape):
     def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> "FramedCurve":
         before = nearer(older.quaternions, self.quaternions)
         quaternions = self.quaternions + ratio * (self.quaternions - before)
-        return FramedCurve(self.nodes, quaternions / jnp.sqrt(dot(quaternions, quaternions))[None], self.s)
+        return FramedCurve(self.nodes, unit(quaternions), self.s)
 
     def points(self, pieces: int) -> Float[Array, "k 3"]:
         s = jnp.linspace(0.0, 1.0, pieces + 1, dtype=self.s.dtype)
-        return cubic(self.s, self.nodes, tangent(self.node_quaternions).T, s)
-
-    @property
-    def node_quaternions(self) -> Float[Array, "4 n+1"]:
-        if not self.is_of_joints:
-            return self.quaternions[:, ::2]
-        inner = self.quaternions[:, 1:-2] + self.quaternions[:, 2:-1]
-        inner /= jnp.sqrt(dot(inner, inner))[None]
-        return jnp.concatenate([self.quaternions[:, :1], inner, self.quaternions[:, -1:]], axis=1)
+        return cubic(self.s, self.nodes, tangent(self.cells.at_nodes(self.quaternions)).T, s)
 
     def on(self, s: Float[Array, "n+1"], of_joints: bool) -> "FramedCurve":
         """The same on other nodes, to begin a solve with."""
-        quaternions = jax.vmap(lambda component: jnp.interp(_places(s, of_joints), self.places, component))(
-            self.quaternions
-        )
+        old, new = self.cells.places, _cells(s, of_joints).places
+        quaternions = jax.vmap(lambda component: jnp.interp(new, old, component))(self.quaternions)
         nodes = jax.vmap(lambda coordinate: jnp.interp(s, self.s, coordinate), 1, 1)(self.nodes)
-        return FramedCurve(nodes, quaternions / jnp.sqrt(dot(quaternions, quaternions))[None], s)
+        return FramedCurve(nodes, unit(quaternions), s)
 
     @property
-    def places(self) -> Float[Array, "m"]:
-        return _places(self.s, self.is_of_joints)
+    def cells(self) -> Cells:
+        return _cells(self.s, self.is_of_joints)
 
-    def turned_to_ends(self, scene: Scene, places: Float[Array, "m"], twist: Float[Array, ""]) -> Float[Array, "4 m"]:
+    def turned_to_ends(self, scene: Scene, cells: Cells, twist: Float[Array, ""]) -> Float[Array, "4 m"]:
         """The frames turned to those that the supports hold, by less and less away from them; and between two clamps
         spun by whole turns to the total twist nearest to `twist`, or to the turns of the scene.
         """
-        q = self.quaternions
+        q, places = self.quaternions, cells.places
         for end, k, part in ((scene.start, 0, 1.0 - places), (scene.end, -1, places)):
             if isinstance(end, Directed):
                 first = q[:, k]
@@ -92,7 +84,6 @@ class FramedCurve(Shape):
                 turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half)[None] * axis[:, None]])
                 q = jnp.where(is_turned, product(turn, q), q)
         if isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp):
-            cells = _cells(scene, self)
             here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
             principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
             turns = jnp.round((nearest_twist(principal, twist, scene.turns) - here) / (2 * jnp.pi))
@@ -100,43 +91,27 @@ class FramedCurve(Shape):
         return q
 
 
-def _places(s: Float[Array, "n+1"], of_joints: bool) -> Float[Array, "m"]:
-    middles = (s[:-1] + s[1:]) / 2
-    return jnp.concatenate([s[:1], middles, s[-1:]]) if of_joints else interleaved(s, middles)
-
-
-def _cells(scene: Scene, shape: FramedCurve) -> Cells:
-    return JointCells.of(scene, shape.s) if shape.is_of_joints else ElementCells.of(scene, shape.s)
+def _cells(s: Float[Array, "n+1"], of_joints: bool) -> Cells:
+    return JointCells(s) if of_joints else ElementCells(s)
 
 
 def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
-    return FrameForm.of(scene, _cells(scene, shape))
+    return FrameForm.of(scene, shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s))
 
 
 def framed_through(scene: Scene, points: Float[Array, "k 3"], of_joints: bool) -> FramedCurve:
     """Through points, as many as a mesh has nodes, or nodes and middles of elements; twisted as the rod at rest."""
+    shape = (Polyline if of_joints else Curve).through(points)
+    nodes, tangents = shape.nodes, shape.tangents
     if of_joints:
-        nodes = points
-        edges = jnp.diff(points, axis=0).T
-        slopes = jnp.concatenate([edges[:, :1], edges, edges[:, -1:]], axis=1)
-    else:
-        nodes = points[::2]
-        ends = (-3 * points[0] + 4 * points[1] - points[2], points[-3] - 4 * points[-2] + 3 * points[-1])
-        slopes = jnp.concatenate([ends[0][None], points[2:] - points[:-2], ends[1][None]]).T
-    tangents = slopes / jnp.sqrt(dot(slopes, slopes))[None]
+        tangents = jnp.concatenate([tangents[:, :1], tangents, tangents[:, -1:]], axis=1)
     s = jnp.linspace(0.0, 1.0, len(nodes), dtype=points.dtype)
     first = from_frame(scene.start.frame) if isinstance(scene.start, Clamp) else jnp.eye(1, 4, dtype=s.dtype)[0]
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-
-    def onward(q, tangent):
-        q = swung(q, tangent)
-        return q, q
-
-    _, quaternions = jax.lax.scan(onward, first, tangents.T)
-    places = _places(s, of_joints)
-    return FramedCurve(nodes, spun(quaternions.T, _twist_at_rest(scene, places)), s)
+    twist = _twist_at_rest(scene, _cells(s, of_joints).places)
+    return FramedCurve(nodes, spun(carried(first, tangents), twist), s)
 
 
 def rest_twist(scene: Scene) -> Float[Array, ""]:
@@ -162,7 +137,7 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     """The rod at rest in the place to which one of its ends is held; in any place between two pins."""
     start, end = scene.start, scene.end
     rest = scene.rod.rest_shape
-    poses = (RestStrain(None, None) if rest is None else rest).poses(interleaved(s, (s[:-1] + s[1:]) / 2))
+    poses = (RestStrain(None, None) if rest is None else rest).poses(ElementCells(s).places)
     q, positions = poses.quaternions, poses.positions[:, ::2]
     if of_joints:
         q = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1)

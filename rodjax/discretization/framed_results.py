@@ -12,7 +12,7 @@ from rodjax.discretization.results import Resultants
 from rodjax.energy import Sections
 from rodjax.guess import cubic
 from rodjax.linalg import factor_and_solve
-from rodjax.rotations import columns, inverse, product, rotated, tangent
+from rodjax.rotations import columns, inverse, product, rotated, tangent, unit
 from rodjax.supports import Directed, Free, Held
 from rodjax.vectors import cross, dot, root
 
@@ -30,7 +30,7 @@ def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
     scene = form.scene
     is_joints = isinstance(form.field, JointCells)
     at_nodes = _on_joints(form, point) if is_joints else _on_elements(form, point)
-    frames = columns(node_quaternions(form, point))
+    frames = columns(form.field.at_nodes(point.quaternions))
     forces = form.end_forces(point)
     moments = [
         _end_moment(end, frames[..., k], at_nodes.moments[:, k], sign)
@@ -47,15 +47,6 @@ def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
         end_force=forces[1],
         end_moment=moments[1],
     )
-
-
-def node_quaternions(form: FrameForm, point: FramePoint) -> Float[Array, "4 n+1"]:
-    q = point.quaternions
-    if isinstance(form.field, ElementCells):
-        return q[:, ::2]
-    inner = q[:, 1:-2] + q[:, 2:-1]
-    inner /= jnp.sqrt(dot(inner, inner))[None]
-    return jnp.concatenate([q[:, :1], inner, q[:, -1:]], axis=1)
 
 
 def _end_moment(end, frame: Float[Array, "3 3"], held: Float[Array, "3"], sign: int) -> Float[Array, "3"]:
@@ -83,7 +74,7 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
     field = form.field
     own = own_moments(form, point)
     moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
-    q = node_quaternions(form, point)
+    q = field.at_nodes(point.quaternions)
     forces = form.forces(point.quaternions, point.end_force)
     first, last = forces[:, 0], forces[:, 2]
     # On the side of the element beyond, at the end of the one before.
@@ -180,7 +171,7 @@ def positions_between_frames(
     here = form.strained(point)
     slopes = (1 + here.axial)[None] * here.tangents
     if not isinstance(field, ElementCells):
-        t = tangent(node_quaternions(form, point))
+        t = tangent(field.at_nodes(q))
         return cubic(field.s, nodes, t.T, s)
     a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
     ways = field.h[None] * (5 * a + 8 * b - c) / 24
@@ -215,7 +206,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point)
     moments = _on_elements(form, point).moments
-    nodes = q[:, ::2]
+    nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments[:, 1:]), nodes[:, :-1], moments[:, :-1])
     last = _integrated(form, field, point, first)
 
@@ -278,7 +269,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         )
 
     def slope(pose: Pose, x: Float[Array, ""]) -> Pose:
-        q = pose.quaternion / jnp.sqrt(dot(pose.quaternion, pose.quaternion))[None]
+        q = unit(pose.quaternion)
         t = tangent(q)
         force = parabola(x, forces)
         here = jax.tree.map(lambda leaf: parabola(x, leaf), _arrays(sections))
@@ -313,7 +304,7 @@ def _errors_of_joints(form: FrameForm, point: FramePoint) -> Errors:
     """The way to the elements between the same nodes by one step of Newton's method."""
     field, scene = form.field, form.scene
     elements = FrameForm.of(scene, ElementCells(field.s))
-    nodes = node_quaternions(form, point)
+    nodes = field.at_nodes(point.quaternions)
     q = jnp.stack([nodes[:, :-1], point.quaternions[:, 1:-1]], axis=2).reshape(4, -1)
     begin = FramePoint(jnp.concatenate([q, nodes[:, -1:]], axis=1), point.end_force, point.total_twist)
     here = elements.linearized(begin)

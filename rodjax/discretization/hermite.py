@@ -67,7 +67,7 @@ class HermiteElements(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        return _assembled(*(weight * self.h for weight in SIMPSON))
+        return assembled(*(weight * self.h for weight in SIMPSON))
 
     @property
     def places(self) -> Float[Array, "m"]:
@@ -147,7 +147,7 @@ class HermiteElements(eqx.Module):
 
     def swept(self, scene: Scene, old: Float[Array, "3 m"], new: Float[Array, "3 m"]) -> Float[Array, ""]:
         """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
-        return jnp.sum(_arcs(_of_elements(new), _of_elements(old)))
+        return jnp.sum(_arcs(of_elements(new), of_elements(old)))
 
     def by_end_tangents(
         self, scene: Scene, tangents: Float[Array, "3 m"], end_force: Float[Array, "3"], torque: Float[Array, ""]
@@ -174,7 +174,7 @@ class HermiteElements(eqx.Module):
         straight = nodes[:, :-1] + nodes[:, 1:]
         straight /= jnp.sqrt(dot(straight, straight))[None]
         # A polygon lags behind the curve by a third of the area between whole and half elements, summed.
-        a, b, c = _of_elements(tangents)
+        a, b, c = of_elements(tangents)
         swept = jax.vmap(swept_angle, in_axes=1)
         bulge = swept(a, b, a, straight) + swept(b, c, straight, c)
         angle = -jnp.concatenate([jnp.zeros_like(bulge[:1]), jnp.cumsum(bulge)]) / 3
@@ -191,14 +191,14 @@ class HermiteElements(eqx.Module):
 
     def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:
         """From node to node, of a curve with these derivatives by arclength at the points."""
-        parts = _of_elements(slopes)
+        parts = of_elements(slopes)
         return (self.h[None] * sum(weight * part for weight, part in zip(SIMPSON, parts, strict=True))).T
 
     def forces_beyond(self, scene: Scene) -> Float[Array, "3 m"]:
         """What the loads beyond each point exert on it; where the start is free, less all of them."""
         of_elements = self.forces_in_elements(scene)
         parts = (weight * self.h[None] * of_elements[:, k] for k, weight in enumerate(SIMPSON))
-        return _assembled(*parts) / self.weights[None]
+        return assembled(*parts) / self.weights[None]
 
     def force_spread(self, scene: Scene) -> Float[Array, "3 3 m"] | None:
         """The weighted products of what the forces on both sides of a point differ from `forces_beyond` by."""
@@ -206,41 +206,35 @@ class HermiteElements(eqx.Module):
             return None
         differences = self._side_differences(scene)
         products = differences[:, None] * differences[None]
-        return _assembled(*(weight * self.h[None, None] * products[:, :, k] for k, weight in enumerate(SIMPSON)))
+        return assembled(*(weight * self.h[None, None] * products[:, :, k] for k, weight in enumerate(SIMPSON)))
 
     def ways_of_spread(
         self, scene: Scene, tangents: Float[Array, "3 m"], softness: Float[Array, "m"]
     ) -> Float[Array, "n 3"]:
         """By how much the ways between nodes differ where the tension on their side of a point does."""
-        along = jnp.stack(_of_elements(tangents), axis=1)
-        strain = jnp.stack(_of_elements(softness)) * dot(self._side_differences(scene), along)
+        along = jnp.stack(of_elements(tangents), axis=1)
+        strain = jnp.stack(of_elements(softness)) * dot(self._side_differences(scene), along)
         weights = jnp.array(SIMPSON, strain.dtype)[:, None] * self.h[None]
         return short_sum((weights * strain)[None] * along, axis=1).T
 
     def _side_differences(self, scene: Scene) -> Float[Array, "3 3 n"]:
-        return self.forces_in_elements(scene) - jnp.stack(_of_elements(self.forces_beyond(scene)), axis=1)
+        return self.forces_in_elements(scene) - jnp.stack(of_elements(self.forces_beyond(scene)), axis=1)
 
     def forces_in_elements(self, scene: Scene) -> Float[Array, "3 3 n"]:
         """The same at start, middle and end of each element, on its side of a point force at a node."""
         starts_held = isinstance(scene.start, Held)
         forces = jnp.zeros((3, 3, len(self.h)), self.s.dtype)
         if scene.gravity is not None:
-            places = jnp.stack(_of_elements(self.places))
+            places = jnp.stack(of_elements(self.places))
             forces += scene.gravity[:, None, None] * (1.0 - places if starts_held else -places)[None]
         for load in scene.point_forces:
-            before = self._part_before(load.at)
+            before = parts_before(self.s, load.at)
             forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
         if isinstance(scene.start, Free) and scene.start.force is not None:
             forces -= scene.start.force[:, None, None]
         if isinstance(scene.end, Free) and scene.end.force is not None:
             forces += scene.end.force[:, None, None]
         return forces
-
-    def _part_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
-        """How much of the weight of each point of an element lies before an arclength: parabolas, integrated so far."""
-        x = jnp.clip((at - self.s[:-1]) / self.h, 0.0, 1.0)
-        parts = (x - 3 * x**2 / 2 + 2 * x**3 / 3, 2 * x**2 - 4 * x**3 / 3, 2 * x**3 / 3 - x**2 / 2)
-        return jnp.stack([part / weight for part, weight in zip(parts, SIMPSON, strict=True)])
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 m"], lengths: Float[Array, "m"]) -> Float[Array, ""]:
         """Largest component of the moment left at a point, per length of rod."""
@@ -288,7 +282,7 @@ class Curve(Shape):
         places = interleaved(s, (s[:-1] + s[1:]) / 2)
         cell = jnp.clip(jnp.searchsorted(self.s, places, side="right") - 1, 0, len(self.s) - 2)
         x = ((places - self.s[cell]) / (self.s[cell + 1] - self.s[cell]))[None]
-        a, b, c = (part[:, cell] for part in _of_elements(self.tangents))
+        a, b, c = (part[:, cell] for part in of_elements(self.tangents))
         tangents = (1 - x) * (1 - 2 * x) * a + 4 * x * (1 - x) * b + x * (2 * x - 1) * c
         nodes = jax.vmap(lambda coordinate: jnp.interp(s, self.s, coordinate), 1, 1)(self.nodes)
         return Curve(nodes, tangents / jnp.sqrt(dot(tangents, tangents))[None], s)
@@ -351,7 +345,7 @@ def with_nodes_at(
     return s
 
 
-def _of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:
+def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:
     """What belongs to start, middle and end of the elements."""
     return by_point[..., 0:-1:2], by_point[..., 1::2], by_point[..., 2::2]
 
@@ -368,16 +362,25 @@ def interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) 
     return jnp.concatenate([pairs.reshape(*nodes.shape[:-1], -1), nodes[..., -1:]], axis=-1)
 
 
-def _assembled(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
+def assembled(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
     """Sums over the elements at each point."""
     none = jnp.zeros_like(start[..., :1])
     nodes = jnp.concatenate([start, none], axis=-1) + jnp.concatenate([none, end], axis=-1)
     return interleaved(nodes, middle)
 
 
+def parts_before(s: Float[Array, "n+1"], at: Float[Array, ""]) -> Float[Array, "3 n"]:
+    """How much of the weight of each point of the elements between nodes at `s` lies before an arclength: parabolas,
+    integrated so far.
+    """
+    x = jnp.clip((at - s[:-1]) / jnp.diff(s), 0.0, 1.0)
+    parts = (x - 3 * x**2 / 2 + 2 * x**3 / 3, 2 * x**2 - 4 * x**3 / 3, 2 * x**3 / 3 - x**2 / 2)
+    return jnp.stack([part / weight for part, weight in zip(parts, SIMPSON, strict=True)])
+
+
 def _of_pairs(by_point: Float[Array, "... m"]) -> tuple[Float[Array, "... 3 n"], Float[Array, "... 3 n"]]:
     """What belongs to the first and to the last point of each pair."""
-    parts = _of_elements(by_point)
+    parts = of_elements(by_point)
     first, last = zip(*PAIRS, strict=True)
     return jnp.stack([parts[i] for i in first], axis=-2), jnp.stack([parts[j] for j in last], axis=-2)
 
@@ -405,8 +408,8 @@ def _added(terms: Iterable[Array]) -> Array:
 def _blocks(gradient: tuple[Array, Array, Array], diagonal: tuple[Array, Array, Array], below: Array) -> Blocks:
     """Element by element -> point by point. `below`: by the last point of each pair, then by its first."""
     return Blocks(
-        gradient=_assembled(*gradient),
-        diagonal=_assembled(*diagonal),
+        gradient=assembled(*gradient),
+        diagonal=assembled(*diagonal),
         lower=jnp.stack([below[..., 0, :], below[..., 1, :]], axis=-1).reshape(*below.shape[:2], -1),
         across=below[..., 2, :],
     )

@@ -6,9 +6,10 @@ A cable of 1 m between two clamps under its own weight, the end rolled by a quar
 and twisted. Measured are 21 points (1 mm), force and moment of the end (10 mN, 1 mN m). Unknown are EI, GJ and weight;
 and of each rig the pitch of the start clamp and a shift of the arclength.
 
-`recovery`: `count` such experiments, each with a truth of its own, fitted each by itself: bias in standard errors of the
-mean, and how often the 95 % intervals hold the truth. `joint`: all have the same cable, in one fit with two nuisance
-parameters each. `peer`: the first fits again by scipy's `least_squares` with differences of the same compiled residuals.
+`recovery`: `count` such experiments, each with a truth of its own, fitted each by itself: bias in standard errors of
+the mean, and how often the 95 % intervals hold the truth. `joint`: all have the same cable, in one fit with two nuisance
+parameters each. `peer`: the first fits again by scipy's `least_squares` with differences, of `rodjax.solve` as a user
+would call it, and of the same residuals compiled and warm-started.
 """
 
 import argparse
@@ -43,14 +44,15 @@ class Row(NamedTuple):
     meaning: str
 
 
-def scenes(material: np.ndarray, pitch: np.ndarray, ends: np.ndarray) -> rj.Scene:
+def stacked(material: np.ndarray, pitch: np.ndarray, ends: np.ndarray) -> rj.Scene:
     """A stack: `material` (e, 3), `pitch` (e,), positions of the end (e, 3)."""
 
     def one(material: jax.Array, pitch: jax.Array, end: jax.Array) -> rj.Scene:
         rod = rj.Rod(1.0, material[0], material[1], 1e3, material[2])
         level = rj.frame((1, 0, 0), d2=(0, 1, 0))
-        start = rj.Clamp((0, 0, 0), rj.rotate(level, jnp.stack([0 * pitch, pitch, 0 * pitch])))
-        return rj.Scene(rod, start, rj.Clamp(end, rj.frame((1, 0, 0), d2=(0, 0, 1))), GRAVITY)
+        pitched = rj.rotate(level, jnp.stack([0 * pitch, pitch, 0 * pitch]))
+        rolled = rj.frame((1, 0, 0), d2=(0, 0, 1))
+        return rj.Scene(rod, rj.Clamp((0, 0, 0), pitched), rj.Clamp(end, rolled), GRAVITY)
 
     return jax.vmap(one)(*(jnp.asarray(x) for x in (material, pitch, ends)))
 
@@ -61,9 +63,9 @@ def made_up(count: int, seed: int, spread: float) -> tuple[list[rj.Experiment], 
     material = np.array([EI, GJ, MASS]) * np.exp(spread * draw.standard_normal((count, 3)))
     pitch, shift = PITCH * draw.standard_normal(count), SHIFT * draw.standard_normal(count)
     ends = np.array([0.7, 0.1, 0.0]) + draw.uniform(-0.05, 0.05, (count, 3))
-    results = rj.solve_batch(scenes(material, pitch, ends), segments=2 * SEGMENTS)
+    results = rj.solve_batch(stacked(material, pitch, ends), segments=2 * SEGMENTS)
     points = np.asarray(jax.vmap(lambda result, shift: result.position_at(S + shift))(results, jnp.asarray(shift)))
-    nominal = scenes(np.tile([EI, GJ, MASS], (count, 1)), np.zeros(count), ends)
+    nominal = stacked(np.tile([EI, GJ, MASS], (count, 1)), np.zeros(count), ends)
     experiments = []
     for k in range(count):
         measured = (
@@ -71,8 +73,8 @@ def made_up(count: int, seed: int, spread: float) -> tuple[list[rj.Experiment], 
             rj.EndForce(np.asarray(results.end_force[k]) + SD_FORCE * draw.standard_normal(3), SD_FORCE),
             rj.EndMoment(np.asarray(results.end_moment[k]) + SD_MOMENT * draw.standard_normal(3), SD_MOMENT),
         )
-        scene = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], nominal)
-        experiments.append(rj.Experiment(jax.tree.map(jax.device_put, scene), measured))
+        scene = jax.tree.map(lambda leaf, k=k: jax.device_put(np.asarray(leaf)[k]), nominal)
+        experiments.append(rj.Experiment(scene, measured))
     return experiments, np.concatenate([material, pitch[:, None], shift[:, None]], axis=1)
 
 
@@ -104,30 +106,35 @@ def recovery(count: int, peers: int) -> list[Row]:
         rows.append(Row(f"recovery: scatter of {name}", str(count), f"{np.std(errors):.2e}", "relative, m or rad"))
         rows.append(Row(f"recovery: coverage of {name}", str(count), f"{covered:.4f}", "by 95 % intervals"))
     if peers:
-        rows += peer(experiments[:peers], fits, seconds / count)
+        for how in ("rodjax.solve", "compiled"):
+            rows += peer(experiments[:peers], fits, seconds / count, how)
     return rows
 
 
-def peer(experiments: Sequence[rj.Experiment], fits: rj.Fits, seconds: float) -> list[Row]:
-    """The same residuals, compiled and warm-started, in scipy's method with its differences."""
+def scene_of(x: Any, nominal: rj.Scene) -> rj.Scene:
+    start = nominal.start
+    assert isinstance(start, rj.Clamp)
+    xp = np if isinstance(x, np.ndarray) else jnp
+    rod = rj.Rod(1.0, xp.exp(x[0]), xp.exp(x[1]), 1e3, xp.exp(x[2]))
+    pitched = rj.Clamp(start.position, rj.rotate(start.frame, xp.stack([0 * x[3], x[3], 0 * x[3]])))
+    return rj.Scene(rod, pitched, nominal.end, nominal.gravity)
 
-    def scene(x: jax.Array, nominal: rj.Scene) -> rj.Scene:
-        start, end = nominal.start, nominal.end
-        assert isinstance(start, rj.Clamp)
-        rod = rj.Rod(1.0, *jnp.exp(x[:2]), 1e3, jnp.exp(x[2]))
-        zero = jnp.zeros_like(x[3])
-        pitched = rj.Clamp(start.position, rj.rotate(start.frame, jnp.stack([zero, x[3], zero])))
-        return rj.Scene(rod, pitched, end, nominal.gravity)
+
+def residuals(x: Any, result: rj.Equilibrium, points: Any, force: Any, moment: Any) -> jax.Array:
+    parts = (
+        (points - result.position_at(jnp.asarray(S) + x[4])) / SD_POINT,
+        (force - result.end_force) / SD_FORCE,
+        (moment - result.end_moment) / SD_MOMENT,
+    )
+    return jnp.concatenate([part.reshape(-1) for part in parts])
+
+
+def peer(experiments: Sequence[rj.Experiment], fits: rj.Fits, seconds: float, how: str) -> list[Row]:
+    """scipy's method with its differences."""
 
     @jax.jit
-    def residuals(x: jax.Array, nominal: rj.Scene, guess: rj.Equilibrium, points: Any, force: Any, moment: Any):
-        result = rj.solve(scene(x, nominal), segments=SEGMENTS, guess=guess)
-        parts = (
-            (points - result.position_at(jnp.asarray(S) + x[4])) / SD_POINT,
-            (force - result.end_force) / SD_FORCE,
-            (moment - result.end_moment) / SD_MOMENT,
-        )
-        return jnp.concatenate([part.reshape(-1) for part in parts])
+    def compiled(x: jax.Array, nominal: rj.Scene, guess: rj.Equilibrium, data: Any) -> jax.Array:
+        return residuals(x, rj.solve(scene_of(x, nominal), segments=SEGMENTS, guess=guess), *data)
 
     start = np.array([np.log(EI), np.log(GJ), np.log(MASS), 0.0, 0.0])
     times, evaluations, differences = [], [], []
@@ -138,13 +145,15 @@ def peer(experiments: Sequence[rj.Experiment], fits: rj.Fits, seconds: float) ->
         def of(x: np.ndarray, nominal: rj.Scene = experiment.scene, guess: Any = guess, data: Any = data):
             nonlocal calls
             calls += 1
-            return np.asarray(residuals(jnp.asarray(x), nominal, guess, *data))
+            if how == "compiled":
+                return np.asarray(compiled(jnp.asarray(x), nominal, guess, data))
+            return np.asarray(residuals(x, rj.solve(scene_of(x, nominal), segments=SEGMENTS), *data))
 
         calls = 0
         of(start)
         calls = 0
         begin = time.perf_counter()
-        found = least_squares(of, start, x_scale=np.array([1, 1, 1, 1, 1.0]), method="lm")
+        found = least_squares(of, start, method="lm")
         times.append(time.perf_counter() - begin)
         evaluations.append(calls)
         value = np.exp(found.x[:3])
@@ -152,10 +161,15 @@ def peer(experiments: Sequence[rj.Experiment], fits: rj.Fits, seconds: float) ->
     median = float(np.median(times))
     count = str(len(experiments))
     return [
-        Row("peer: scipy least_squares, time a fit", count, f"{1e3 * median:.1f}", "ms, median"),
-        Row("peer: evaluations a fit", count, f"{np.median(evaluations):.0f}", "solves, median"),
-        Row("peer: its estimates beside ours", count, f"{np.max(differences):.1e}", "largest relative difference"),
-        Row("peer: its time by ours", count, f"{median / seconds:.1f}", "times"),
+        Row(f"peer, {how}: scipy least_squares, a fit", count, f"{1e3 * median:.1f}", "ms, median"),
+        Row(f"peer, {how}: evaluations a fit", count, f"{np.median(evaluations):.0f}", "solves, median"),
+        Row(
+            f"peer, {how}: its estimates beside ours",
+            count,
+            f"{np.max(differences):.1e}",
+            "largest relative difference",
+        ),
+        Row(f"peer, {how}: its time by ours", count, f"{median / seconds:.1f}", "times"),
     ]
 
 

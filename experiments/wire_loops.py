@@ -8,6 +8,7 @@ level after a whole turn. Writes `fits.csv`, one row a model and loop:
 
 - `EI`: the stiffness alone, clamps level, the end where the last node was measured.
 - `EI+angles`: the turns of both clamps in the plane too, positive downwards.
+- `EI+angles+tilt`: and the tilt of the camera, as a level part of gravity.
 - `EI+angles, pooled`: one stiffness and one pair of angles for all repeats of a wire.
 
 and `prediction.csv` (each repeat from a pooled fit to the others), `report_*.txt` and pictures.
@@ -36,6 +37,7 @@ GJ_BY_EI = 2 / 3
 FIRST = 1000.0
 VIEW = rj.orthographic((1, 0, 0), (0, 1, 0))
 ANGLES = ("start.frame.2", "end.frame.2")
+TILT = "gravity.0"
 SEGMENTS = 32
 
 
@@ -89,26 +91,27 @@ def experiment(loop: Loop) -> rj.Experiment:
 
 
 def fit_singly(loops: Sequence[Loop]) -> tuple[list[Row], float]:
-    """Both models of every loop, in one call; and the seconds of a second such call."""
+    """The models of every loop, in one call; and the seconds of a second such call."""
     experiments = [experiment(loop) for loop in loops]
-    unknowns = [rj.Unknown("rod.EI"), *(rj.Unknown(name) for name in ANGLES)]
-    free = np.array([[True, False, False]] * len(loops) + [[True, True, True]] * len(loops))
+    unknowns = [rj.Unknown(name) for name in ("rod.EI", *ANGLES, TILT)]
+    models = {"EI": (True, False, False, False), "EI+angles": (True, True, True, False), "EI+angles+tilt": (True,) * 4}
+    free = np.repeat(np.array(list(models.values())), len(loops), axis=0)
 
     def fits() -> rj.Fits:
-        return rj.fit_each([*experiments, *experiments], unknowns, free=free, segments=SEGMENTS, planar=True)
+        return rj.fit_each(experiments * len(models), unknowns, free=free, segments=SEGMENTS, planar=True)
 
     fits()
     begin = time.perf_counter()
     found = fits()
     seconds = time.perf_counter() - begin
     rows = []
-    for k, loop in enumerate([*loops, *loops]):
-        EI, *angles = found.estimates[k]
+    for k, (model, loop) in enumerate((model, loop) for model in models for loop in loops):
+        EI, *angles, _ = found.estimates[k]
         rows.append(
             Row(
                 loop.wire,
                 loop.repeat,
-                "EI" if k < len(loops) else "EI+angles",
+                model,
                 f"{EI:.6e}",
                 f"{found.standard_errors[k, 0]:.2e}",
                 f"{found.rms[k, 0]:.6e}",

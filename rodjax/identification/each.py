@@ -68,9 +68,9 @@ class Fits:
     def intervals(self, level: float = 0.95) -> tuple[Float[np.ndarray, "e p"], Float[np.ndarray, "e p"]]:
         """The ends of the confidence intervals, by Student's distribution; symmetric on the scale of each unknown."""
         reach = stats.t.ppf((1 + level) / 2, self.degrees_of_freedom)[:, None] * self.standard_errors
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):  # of those on a linear scale
             factor = np.exp(reach / self.estimates)
-        low = np.where(self.is_log, self.estimates / factor, self.estimates - reach)
+            low = np.where(self.is_log, self.estimates / factor, self.estimates - reach)
         return low, np.where(self.is_log, self.estimates * factor, self.estimates + reach)
 
 

@@ -20,7 +20,7 @@ FIRST_STEP = 1e3
 # Inverse of the damping at which nothing is found any more.
 LEAST_STEP = 1e-12
 # A step that moves no estimate by more than this part of its standard error, or of its size, is the last.
-LAST_STEP = 1e-5
+LAST_STEP = 1e-3
 LEAST_CHANGE = 1e-10
 # A reduction of the sum of squares by this part of it is lost in rounding.
 ROUNDING = 1e-11

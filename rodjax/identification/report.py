@@ -77,7 +77,8 @@ def _scatter(fit: "Fit") -> str:
     else:
         unit = fit.setup.experiments[0].measured[0].unit
         told = f"scatter {fit.sigma:.3g} {unit} in each number"
-    return f"{told}, {fit.degrees_of_freedom} degrees of freedom; meshes within {fit.error_estimate:.0e} of the length"
+    mesh = "" if math.isnan(fit.error_estimate) else f"; meshes within {fit.error_estimate:.0e} of the length"
+    return f"{told}, {fit.degrees_of_freedom} degrees of freedom{mesh}"
 
 
 def _remarks(fit: "Fit") -> list[str]:
@@ -85,13 +86,14 @@ def _remarks(fit: "Fit") -> list[str]:
     told += [f"{label} is at its bound, where its standard error means nothing" for label in fit.at_bounds]
     if fit.setup.has_sd and fit.degrees_of_freedom > 0 and not 0.5 < fit.sigma < 2:
         told.append("the scatter is far from the given standard deviations: these are wrong, or the model is")
-    for label in fit.labels:
-        ratio = fit.clustered_error[label] / fit.standard_error[label] if fit.standard_error[label] else math.nan
-        if ratio > UNDERSTATED:
-            told.append(
-                f"formal errors understate the scatter between repeats: by clusters {label} is {ratio:.1f} times less "
-                "certain, as deviations of one experiment go together; believe the interval by clusters"
-            )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = {label: np.divide(fit.clustered_error[label], fit.standard_error[label]) for label in fit.labels}
+    understated = [f"{label} {ratio:.1f} times" for label, ratio in ratios.items() if ratio > UNDERSTATED]
+    if understated:
+        told.append(
+            "formal errors understate the scatter between repeats, as deviations of one experiment go together: by "
+            f"clusters the error is larger, of {', of '.join(understated)}; believe the intervals by clusters"
+        )
     if fit.clusters < 2:
         told.append("one cluster only: how repeats scatter is not known, and the formal errors may be too small")
     correlation = fit.correlation if fit.labels else np.zeros((0, 0))

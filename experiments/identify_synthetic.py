@@ -7,9 +7,9 @@ and twisted. Measured are 21 points (1 mm), force and moment of the end (10 mN, 
 and of each rig the pitch of the start clamp and a shift of the arclength.
 
 `recovery`: `count` such experiments, each with a truth of its own, fitted each by itself: bias in standard errors of
-the mean, and how often the 95 % intervals hold the truth. `joint`: all have the same cable, in one fit with two nuisance
-parameters each. `peer`: the first fits again by scipy's `least_squares` with differences, of `rodjax.solve` as a user
-would call it, and of the same residuals compiled and warm-started.
+the mean, and how often the 95 % intervals hold the truth. `joint`: all have the same cable, in one fit with two
+nuisance parameters each. `peer`: the first fits again by scipy's `least_squares` with differences, of `rodjax.solve` as
+a user would call it, and of the same residuals compiled and warm-started.
 """
 
 import argparse

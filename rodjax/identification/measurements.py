@@ -205,7 +205,8 @@ def _feet(
     _, slope = jax.jvp(curve, (foot,), (jnp.ones_like(foot),))
     # Beyond an end the distance from the end counts, in all directions.
     is_inside = (foot > 0) & (foot < length)
-    return foot, slope / jnp.sqrt(jnp.sum(slope**2, axis=1, keepdims=True)) * is_inside[:, None]
+    along = slope / jnp.sqrt(jnp.sum(slope**2, axis=1, keepdims=True))
+    return foot, jnp.where(is_inside[:, None], along, 0.0)
 
 
 class _EndLoad(Measurement):
@@ -215,7 +216,7 @@ class _EndLoad(Measurement):
     end: str = eqx.field(static=True)
     has_sd: bool = eqx.field(static=True)
 
-    def __init__(self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None):
+    def __init__(self, value: Any, sd: Any, end: str, direction: Any):
         self.value = leaf(vector(value, "value") if direction is None else number_array(value, "value").reshape(1))
         self.direction = None if direction is None else leaf(vector(direction, "direction"))
         one_of(end, "end", ("start", "end"))
@@ -253,6 +254,9 @@ class EndForce(_EndLoad):
     component [N], `None` as in `Centerline`.
     """
 
+    def __init__(self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None):
+        super().__init__(value, sd, end, direction)
+
     def computed(self, equilibrium: Equilibrium) -> Float[Array, "3"]:
         return equilibrium.end_force if self.end == "end" else equilibrium.start_force
 
@@ -263,6 +267,9 @@ class EndForce(_EndLoad):
 
 class EndMoment(_EndLoad):
     """The moment (3,) [N m] about the centerline that a support applies to the rod; otherwise as `EndForce`."""
+
+    def __init__(self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None):
+        super().__init__(value, sd, end, direction)
 
     def computed(self, equilibrium: Equilibrium) -> Float[Array, "3"]:
         return equilibrium.end_moment if self.end == "end" else equilibrium.start_moment

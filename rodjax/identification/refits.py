@@ -2,22 +2,23 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
-from rodjax.checks import leaf, number_list, whole_number
+from rodjax.checks import number_list, whole_number
 from rodjax.compilation import compiled
-from rodjax.identification.lanes import in_lanes
+from rodjax.identification.lanes import LANES
 from rodjax.identification.least_squares import Coordinates
-from rodjax.identification.measurements import Experiment
-from rodjax.identification.problem import Found, Problem, Rows, Structure, looked_at, search, values
-from rodjax.identification.setup import Setup, beginnings, begun, name_of, prepared, stacked, structure_of
+from rodjax.identification.measurements import Experiment, Measurement
+from rodjax.identification.problem import Found, Problem, Structure, looked_at, search, values
+from rodjax.identification.setup import Setup, beginnings, begun, clusters_of, prepared, stacked, structure_of
 from rodjax.identification.statistics import Blocks
 from rodjax.identification.unknowns import outside
 from rodjax.result import Equilibrium
@@ -25,46 +26,62 @@ from rodjax.result import Equilibrium
 Equilibria = tuple[Equilibrium, ...]
 
 
-class _Refit(eqx.Module):
-    shared: Float[Array, "... p"]
-    squares: Float[Array, "..."]
-    converged: Bool[Array, "..."]
+class _Refits(NamedTuple):
+    """Of k fits: the unknowns in common, not numbers where the fit did not converge, and the sums of squares."""
+
+    shared: Float[np.ndarray, "k p"]
+    squares: Float[np.ndarray, "k"]
 
 
-def _refit(structure: Structure, problem: Problem, start: Coordinates, guesses: Equilibria) -> _Refit:
-    found = search(structure, problem, start, guesses)
-    return _Refit(values(structure, problem, found.at)[0], found.squares, found.converged)
+def _refits(
+    structure: Structure, problems: Iterable[Problem], starts: Iterable[Coordinates], guesses: Equilibria
+) -> _Refits:
+    """Fits of problems of one structure, some side by side in one program, which is compiled once for all kinds."""
+    shared, squares = [], []
+    pairs = list(zip(problems, starts, strict=True))
+    lanes = max(1, LANES // pairs[0][1].own.shape[0])
+    for first in range(0, len(pairs), lanes):
+        chosen = [pairs[min(k, len(pairs) - 1)] for k in range(first, first + lanes)]
+        stack = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *chosen)
+        at, sums, converged = _side_by_side(structure, *stack, guesses)
+        shared.append(np.where(np.asarray(converged)[:, None], np.asarray(at), np.nan))
+        squares.append(np.asarray(sums))
+    return _Refits(np.concatenate(shared)[: len(pairs)], np.concatenate(squares)[: len(pairs)])
+
+
+@functools.partial(compiled, static_argnames=("structure",))
+def _side_by_side(
+    structure: Structure, problems: Problem, starts: Coordinates, guesses: Equilibria
+) -> tuple[Float[Array, "k p"], Float[Array, "k"], Bool[Array, "k"]]:
+    def one(problem: Problem, start: Coordinates) -> tuple[Float[Array, "p"], Float[Array, ""], Bool[Array, ""]]:
+        found = search(structure, problem, start, guesses)
+        return values(structure, problem, found.at)[0][: len(structure.shared)], found.squares, found.converged
+
+    return jax.vmap(one)(problems, starts)
 
 
 # --- without a cluster -----------------------------------------------------------------------------------------------
 
 
 def leave_one_out(setup: Setup, structure: Structure, problem: Problem, found: Found) -> dict[str, dict[str, float]]:
-    labels = np.array([setup.experiments[k].cluster or name_of(setup, k) for k in setup.order])
-    clusters = sorted(set(labels.tolist()))
+    labels = clusters_of(setup)
+    clusters = sorted(set(labels))
     if len(clusters) < 2:
         raise ValueError(f"experiments must be of at least two clusters to leave one out, got {len(clusters)}")
-    given = np.concatenate([np.asarray(group.weights) for group in problem.groups])
-    weights = leaf(np.stack([given * (labels != name) for name in clusters]))
-    fits = _without(structure, problem, found.at, found.evaluation.results, weights)
+
+    def without(cluster: tuple[str, ...]) -> Problem:
+        is_left = np.array([label != cluster for label in labels], problem.scale.dtype)
+        weights = [
+            np.asarray(group.weights) * is_left[here]
+            for group, here in zip(problem.groups, problem.places, strict=True)
+        ]
+        return eqx.tree_at(lambda problem: [group.weights for group in problem.groups], problem, weights)
+
+    fits = _refits(structure, map(without, clusters), [found.at] * len(clusters), found.evaluation.results)
     names = [unknown.label for unknown in setup.shared]
-    estimates = np.where(np.asarray(fits.converged)[:, None], np.asarray(fits.shared), np.nan)[:, : len(names)]
-    return {name: dict(zip(names, row, strict=True)) for name, row in zip(clusters, estimates.tolist(), strict=True)}
-
-
-@functools.partial(compiled, static_argnames=("structure",))
-def _without(
-    structure: Structure, problem: Problem, at: Coordinates, guesses: Equilibria, weights: Float[Array, "c e"]
-) -> _Refit:
-    sizes = [group.weights.shape[0] for group in problem.groups]
-    ends = np.cumsum(sizes)[:-1].tolist()
-
-    def one(weights: Float[Array, "e"]) -> _Refit:
-        parts = jnp.split(weights, ends)
-        less = eqx.tree_at(lambda problem: [group.weights for group in problem.groups], problem, parts)
-        return _refit(structure, less, at, guesses)
-
-    return in_lanes(one, (weights,), weights.shape[1])
+    return {
+        name[0]: dict(zip(names, row, strict=True)) for name, row in zip(clusters, fits.shared.tolist(), strict=True)
+    }
 
 
 # --- with an unknown held --------------------------------------------------------------------------------------------
@@ -113,27 +130,14 @@ def profile(
     x = outside(z, np.full_like(z, low), np.full_like(z, high))
     is_free = np.asarray(problem.is_free.shared).copy()
     is_free[k] = False
-    held = eqx.tree_at(lambda problem: problem.is_free.shared, problem, leaf(is_free))
-    starts = np.tile(np.asarray(found.at.shared), (len(x), 1))
-    starts[:, k] = x
-    fits = _held(structure, held, leaf(starts), found.at.own, found.evaluation.results)
-    converged = np.asarray(fits.converged)
-    deviance = (np.asarray(fits.squares) - float(found.squares)) / dispersion
+    held = eqx.tree_at(lambda problem: problem.is_free.shared, problem, is_free)
+    starts = [eqx.tree_at(lambda at: at.shared, found.at, np.array(found.at.shared)) for _ in x]
+    for start, place in zip(starts, x, strict=True):
+        start.shared[k] = place
+    fits = _refits(structure, [held] * len(x), starts, found.evaluation.results)
+    deviance = (fits.squares - float(found.squares)) / dispersion
     return Profile(
-        unknown.label,
-        unknown.unit,
-        chosen,
-        np.where(converged, deviance, np.nan),
-        np.where(converged[:, None], np.asarray(fits.shared), np.nan)[:, : len(setup.shared)],
-    )
-
-
-@functools.partial(compiled, static_argnames=("structure",))
-def _held(
-    structure: Structure, problem: Problem, starts: Float[Array, "k p"], own: Float[Array, "e q"], guesses: Equilibria
-) -> _Refit:
-    return in_lanes(
-        lambda shared: _refit(structure, problem, Coordinates(shared, own), guesses), (starts,), own.shape[0]
+        unknown.label, unknown.unit, chosen, np.where(np.isnan(fits.shared[:, 0]), np.nan, deviance), fits.shared
     )
 
 
@@ -147,40 +151,28 @@ def bootstrap(
         raise ValueError("bootstrap is not made for critical values, which are not part of a compiled program")
     whole_number(count, "count", 1, 10**6)
     whole_number(seed, "seed", 0, 2**31)
-    keys = jax.random.split(jax.random.key(seed), count)
-    scatter = leaf(np.asarray(np.sqrt(dispersion), problem.scale.dtype))
-    rows = found.evaluation.rows
-    fits = _made_up(structure, problem, found.at, found.evaluation.results, rows, keys, scatter)
-    estimates = np.where(np.asarray(fits.converged)[:, None], np.asarray(fits.shared), np.nan)
-    return dict(zip([unknown.label for unknown in setup.shared], estimates.T, strict=False))
+    draw = np.random.default_rng(seed)
+    scatter = math.sqrt(dispersion) * float(problem.scale)
 
-
-@functools.partial(compiled, static_argnames=("structure",))
-def _made_up(
-    structure: Structure,
-    problem: Problem,
-    at: Coordinates,
-    guesses: Equilibria,
-    found: tuple[Rows, ...],
-    keys: PRNGKeyArray,
-    scatter: Float[Array, ""],
-) -> _Refit:
-    """`found`: the deviations, whose opposite leads from what was measured to what is computed."""
-
-    def one(key: PRNGKeyArray) -> _Refit:
+    def made_up(_: int) -> Problem:
+        """With measurements that are the computed ones with noise."""
         groups = []
-        for group, rows in zip(problem.groups, found, strict=True):
+        for group, rows in zip(problem.groups, found.evaluation.rows, strict=True):
             measured = []
-            for measurement, x in zip(group.experiments.measured, rows, strict=True):
-                key, own_key = jax.random.split(key)
-                noise = scatter * jax.random.normal(own_key, x.shape, x.dtype)
-                weights = measurement.weights[..., None]
-                change = (problem.scale * noise - x) / jnp.where(weights > 0, weights, 1.0)
-                measured.append(jax.vmap(lambda m, change: m.moved(change))(measurement, change))
+            for measurement, deviations in zip(group.experiments.measured, rows, strict=True):
+                weights = np.asarray(measurement.weights)[..., None]
+                noise = scatter * draw.standard_normal(deviations.shape)
+                change = (noise - np.asarray(deviations)) / np.where(weights > 0, weights, 1.0)
+                measured.append(jax.vmap(_moved)(measurement, jnp.asarray(change, problem.scale.dtype)))
             groups.append(eqx.tree_at(lambda group: group.experiments.measured, group, tuple(measured)))
-        return _refit(structure, eqx.tree_at(lambda problem: problem.groups, problem, tuple(groups)), at, guesses)
+        return eqx.tree_at(lambda problem: problem.groups, problem, tuple(groups))
 
-    return in_lanes(one, (keys,), at.own.shape[0])
+    fits = _refits(structure, map(made_up, range(count)), [found.at] * count, found.evaluation.results)
+    return dict(zip([unknown.label for unknown in setup.shared], fits.shared.T, strict=True))
+
+
+def _moved(measurement: Measurement, change: Float[Array, "k d"]) -> Measurement:
+    return measurement.moved(change)
 
 
 # --- which to do next ------------------------------------------------------------------------------------------------

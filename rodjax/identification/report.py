@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.identification.setup import name_of
-from rodjax.status import Status
+from rodjax.status import is_converged
 
 if TYPE_CHECKING:
     from rodjax.identification.result import Fit
@@ -104,7 +104,7 @@ def _remarks(fit: "Fit") -> list[str]:
                     f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
                 )
     told += fit.held
-    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status is not Status.CONVERGED]
+    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if not is_converged(status)]
     if lost:
         told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
     return [f"- {remark}" for remark in told]

@@ -15,7 +15,7 @@ from rodjax.identification import refits
 from rodjax.identification.least_squares import Coordinates, NormalEquations
 from rodjax.identification.measurements import Experiment
 from rodjax.identification.problem import Found, Problem, Structure, values
-from rodjax.identification.setup import Setup, name_of
+from rodjax.identification.setup import Setup, clusters_of
 from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, undetermined
 from rodjax.identification.unknowns import Unknown
 from rodjax.result import Equilibrium
@@ -99,9 +99,8 @@ class Fit:
         shared, own = (np.asarray(x, float) for x in values(structure, problem, found.at))
         shared = shared[:p]
         covariance, own_covariance = blocks.covariance()
-        labels = [setup.experiments[k].cluster or name_of(setup, k) for k in setup.order]
         scores = np.asarray(found.information.scores, float)[:, :p]
-        robust, clusters = clustered(blocks, scores, labels, slope, numbers, count, is_used)
+        robust, clusters = clustered(blocks, scores, clusters_of(setup), slope, numbers, count, is_used)
         rates = _rates(setup.shared, shared, length)
         own_rates = np.stack([_rates(setup.own, row, length) for row in own]) if q else np.zeros_like(own)
         order = np.argsort(np.array(setup.order))
@@ -206,6 +205,11 @@ class Fit:
             low, high = self.estimate[label], self.standard_error[label]
             offsets = np.linspace(-3, 3, 13) * high
             at = low * np.exp(offsets / low) if self.setup.shared[k].scale == "log" else low + offsets
+            if not np.all(np.isfinite(at)):
+                raise ValueError(f"at must be given for {label}, whose standard error is not known")
+            least, largest = self.setup.shared[k].bounds
+            inside = (at > (-math.inf if least is None else least)) & (at < (math.inf if largest is None else largest))
+            at = at[inside]
         return refits.profile(self.setup, self.structure, self.problem, self.found, k, at, self.dispersion)
 
     def bootstrap(self, count: int = 200, seed: int = 0) -> dict[str, Float[np.ndarray, "count"]]:

@@ -49,10 +49,10 @@ def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setu
     `needs_all`: whether there must be a number for each unknown.
     """
     given = sequence(experiments, "experiments", "Experiment")
-    if not any(isinstance(one, Experiment) for one in given):
-        raise ValueError(f"experiments must hold at least one Experiment, got {len(given)} others")
     for k, one in enumerate(given):
         instance(one, f"experiments[{k}]", (Experiment, CriticalValue))
+    if not any(isinstance(one, Experiment) for one in given):
+        raise ValueError(f"experiments must hold at least one Experiment, got {len(given)} others")
     unknowns = sequence(unknowns, "unknowns", "Unknown")
     if not unknowns:
         raise ValueError("unknowns must hold at least one Unknown, got none")
@@ -62,6 +62,10 @@ def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setu
     labels = [unknown.label for unknown in unknowns]
     if len(set(labels)) < len(labels):
         raise ValueError(f"unknowns must have different labels, got {', '.join(labels)}")
+    names = [name for unknown in unknowns for name in unknown.names]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"unknowns must each have names of their own, got {twice[0]} twice")
     measured = tuple(one for one in given if isinstance(one, Experiment))
     critical = tuple(one for one in given if isinstance(one, CriticalValue))
     subjects: list[Subject] = [*measured, *(_one_scene(value) for value in critical)]
@@ -246,7 +250,11 @@ def _varied(x: Float[np.ndarray, "*e n"], ranges: Ranges, unknowns: Sequence[Unk
     low, high = (np.broadcast_to(np.asarray(bound), z.shape) for bound in (ranges.low, ranges.high))
     for k, unknown in enumerate(unknowns):
         if not (np.all(z[..., k] > low[..., k]) and np.all(z[..., k] < high[..., k])):
-            raise ValueError(f"bounds of {unknown.label} must hold the start between them, got {unknown.bounds}")
+            start = (z[..., k] * float(ranges.size[k])).flat[0]
+            start = np.exp(start) if unknown.scale == "log" else start
+            raise ValueError(
+                f"bounds of {unknown.label} must hold the start, {start:g}, between them, got {unknown.bounds}"
+            )
     return leaf(outside(z, low, high).astype(z.dtype))
 
 
@@ -317,6 +325,14 @@ def warn_of_lost(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> None:
         NotConvergedWarning,
         stacklevel=3,
     )
+
+
+def clusters_of(setup: Setup) -> list[tuple[str, ...]]:
+    """Of each row of the problem what tells its cluster from others; an experiment without one is its own."""
+    return [
+        (name_of(setup, k), str(k)) if setup.experiments[k].cluster is None else (str(setup.experiments[k].cluster),)
+        for k in setup.order
+    ]
 
 
 def name_of(setup: Setup, k: int) -> str:

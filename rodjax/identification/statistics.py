@@ -1,7 +1,7 @@
 """What a fit is worth: covariances, classical and by clusters, and what the data do not determine."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -166,7 +166,7 @@ def _size(unknown: Unknown, deviation: float, length: float) -> str:
 def clustered(
     blocks: Blocks,
     scores: Float[np.ndarray, "e p"],
-    labels: Sequence[str],
+    labels: Sequence[Hashable],
     slope: float,
     numbers: int,
     unknowns: int,
@@ -177,7 +177,7 @@ def clustered(
     Liang & Zeger (1986), with the small-sample factor G/(G-1) (n-1)/(n-k).
     """
     used = [label for label, is_in in zip(labels, is_used, strict=True) if is_in]
-    names = sorted(set(used))
+    names = list(dict.fromkeys(used))
     count = len(names)
     if count < 2 or numbers <= unknowns:
         return np.full_like(blocks.ss, np.nan), count

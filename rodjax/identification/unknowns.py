@@ -20,6 +20,7 @@ Per = Literal["all", "experiment"]
 # Numbers that are positive by their nature, and so sought by their logarithm where nothing else is said.
 POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
 UNITS = {
+    "jumps": "m",
     "rod.EI": "N m^2",
     "rod.GJ": "N m^2",
     "rod.EA": "N",
@@ -84,7 +85,7 @@ class Unknown:
             raise ValueError("names must hold at least one name, got none")
         first = self.names[0]
         if scale is None:
-            scale = "log" if _matches(first, POSITIVE) else "linear"
+            scale = "log" if _matches(first, POSITIVE) and not _matches(first, ("jumps",)) else "linear"
         one_of(scale, "scale", get_args(Scale))
         one_of(per, "per", get_args(Per))
         self.scale: Scale = scale
@@ -95,7 +96,8 @@ class Unknown:
         self.bounds = (None, None) if bounds is None else _bounds(bounds, check)
         self.size = None if size is None else float(positive(size, "size"))
         self.label = first if label is None else str(label)
-        self.unit = next((unit for name, unit in UNITS.items() if _matches(first, (name,))), "")
+        is_distributed = first.startswith("distributed.") and _matches(first, ("force",))
+        self.unit = "N/m" if is_distributed else next((u for name, u in UNITS.items() if _matches(first, (name,))), "")
 
     def natural_size(self, length: float) -> float:
         """The change that counts as large, for a rod of that length [m]."""

@@ -5,13 +5,14 @@ Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did no
 
 import argparse
 import io
+import json
 import os
 import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import jax
 import numpy as np
@@ -26,6 +27,11 @@ from rodjax.status import Status
 from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
 from rodjax.sweep import Summary, merge, sweep
 from rodjax.sweep_cases import SweepError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rodjax.identification.refits import Profile
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -74,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
     solve.set_defaults(run=_solve)
     _add_sweep(commands)
+    _add_fit(commands)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
     demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
@@ -97,6 +104,15 @@ def _add_sweep(commands: Any) -> None:
     join.add_argument("shards", metavar=f"SHARD{SWEEP_SUFFIX}", type=Path, nargs="+")
     join.add_argument("-o", "--output", **output)
     join.set_defaults(run=_merge)
+
+
+def _add_fit(commands: Any) -> None:
+    fit = commands.add_parser("fit", help="find numbers of a scene from measured centerlines and end forces")
+    fit.add_argument("fit", metavar="FIT.toml", type=Path, help="what is sought: pydoc rodjax.identification.files")
+    fit.add_argument("data", metavar="DATA.csv", type=Path, help="what was measured: the same")
+    fit.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-fit"), help="folder for the results")
+    fit.add_argument("--profiles", action="store_true", help="draw likelihoods too, which takes as long again")
+    fit.set_defaults(run=_fit)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -190,6 +206,60 @@ def _swept(path: Path, summary: Summary) -> int:
     return 3
 
 
+def _fit(arguments: argparse.Namespace) -> int:
+    # With what it imports it takes a second, which the other commands need not wait for.
+    from rodjax.identification.files import read_fit_files
+
+    _check_folder(arguments.out, "--out")
+    files = read_fit_files(arguments.fit, arguments.data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NotConvergedWarning)
+        try:
+            fit = rodjax.fit(files.experiments, files.unknowns, **files.options)
+        except ValueError as error:
+            raise CommandError(f"{arguments.fit}: {error}") from None
+    report = fit.report()
+    print(report, flush=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    written = [arguments.out / "report.txt", arguments.out / "report.json"]
+    replace_file(written[0], f"{report}\n".encode())
+    replace_file(written[1], f"{json.dumps(fit.as_dict(), indent=1, allow_nan=False)}\n".encode())
+    written += _draw_fit(fit, arguments.out, arguments.profiles)
+    print(f"written: {', '.join(map(str, written))}")
+    told = "; ".join(str(w.message) for w in caught if issubclass(w.category, NotConvergedWarning))
+    if fit.converged and not told:
+        return 0
+    print(f"rodjax: {arguments.fit}: {' '.join(told.split())}", file=sys.stderr)
+    return 3
+
+
+def _draw_fit(fit: "rodjax.Fit", folder: Path, profiles: bool) -> list[Path]:
+    """Draws what there is to draw; returns the names of the files."""
+    from rodjax.identification import plots
+
+    figures = {}
+    if plots.has_centerlines(fit):
+        figures |= {"shapes": plots.plot_shapes(fit), "residuals": plots.plot_residuals(fit)}
+    if len(fit.labels) > 1:
+        figures["correlation"] = plots.plot_correlation(fit)
+    found = _profiles(fit) if profiles else []
+    if found:
+        figures["profiles"] = plots.plot_profiles(found)
+    for name, figure in figures.items():
+        _save_figure(figure, folder / f"{name}.png", dpi=150)
+    return [folder / f"{name}.png" for name in figures]
+
+
+def _profiles(fit: "rodjax.Fit") -> "list[Profile]":
+    found = []
+    for label in fit.labels:
+        try:
+            found.append(fit.profile(label))
+        except ValueError as error:  # three standard errors reach beyond the bounds
+            print(f"rodjax: the profile of {label} is not drawn: {error}", file=sys.stderr)
+    return found
+
+
 def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
     """Finds out before a long solve that its result could not be written."""
     if path is None:
@@ -202,15 +272,26 @@ def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> 
         raise CommandError(f"{option} must be a file that can be written, got {str(path)!r}")
 
 
+def _check_folder(path: Path, option: str) -> None:
+    """The same of a folder, which is made where it is not there."""
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise CommandError(f"{option} must be a folder that can be written, got {str(path)!r}")
+
+
 def _plot(equilibrium: Equilibrium, path: Path) -> None:
     if not np.all(np.isfinite(equilibrium.nodes)):
         print(f"rodjax: {path} is not drawn: the shape is not finite", file=sys.stderr)
         return
     from rodjax.plot import plot_rod
 
+    _save_figure(plot_rod(equilibrium), path)
+
+
+def _save_figure(figure: "Figure", path: Path, **options: Any) -> None:
     # Put together in memory, so that a full disk leaves the picture that was there.
     image = io.BytesIO()
-    plot_rod(equilibrium).savefig(image, format=path.suffix[1:])
+    figure.savefig(image, format=path.suffix[1:], **options)
     replace_file(path, image.getvalue())
 
 

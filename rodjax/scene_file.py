@@ -255,7 +255,7 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise SceneFileError(f"cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise SceneFileError(f"is not valid TOML: {error}") from None
+        raise SceneFileError(f"is not text in UTF-8: {error}") from None
 
 
 def toml_tables(text: str) -> dict[str, Any]:

@@ -54,7 +54,8 @@ from rodjax.files import FIELDS
 from rodjax.result import NotConvergedWarning
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
-from rodjax.sweep_cases import MAX_CASES, CaseReader, SweepError, unit_of
+from rodjax.scene_keys import unit_of
+from rodjax.sweep_cases import MAX_CASES, CaseReader, SweepError
 
 SUFFIX = ".h5"
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.

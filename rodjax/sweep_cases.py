@@ -7,29 +7,24 @@ import csv
 import dataclasses
 import io
 import itertools
-import json
 import math
-import re
-import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from rodjax.checks import line, shown
-from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, quantity, si_values
+from rodjax.checks import shown
+from rodjax.quantities import SceneFileError
 from rodjax.scene import Scene
-from rodjax.scene_file import SceneFile, SceneReader, read_text, toml_tables
+from rodjax.scene_file import SceneFile, read_text, toml_tables
+from rodjax.scene_keys import SceneVariations, cell, check_keys, si_number
 
 # More than a grid of ten keys has; to read them takes a second.
 MAX_CORNERS = 1024
 # More cases than this are taken for a mistake: their results would fill 100 GB.
 MAX_CASES = 100_000_000
-
-Place = tuple[str | int, ...]
 
 
 class SweepError(ValueError):
@@ -40,11 +35,9 @@ class SweepError(ValueError):
 
 
 class Parameter(NamedTuple):
-    """A key that varies: `values` (rows, ...) in SI units, put into the tables at `place`, there at `component`."""
+    """A key that varies, and its `values` (rows, ...) in SI units."""
 
     key: str
-    place: Place
-    component: tuple[int, ...]
     values: Float[np.ndarray, "rows ..."]
 
 
@@ -100,7 +93,7 @@ def read_cases(path: Path) -> tuple[Cases, str]:
 
 def _grid(content: dict[str, Any]) -> list[Parameter]:
     values = _flat(content, "")
-    _check_keys(list(values))
+    check_keys(list(values))
     return [_parameter(key, _grid_values(value, key)) for key, value in values.items()]
 
 
@@ -132,7 +125,7 @@ def _range(table: dict[str, Any], key: str) -> Float[np.ndarray, "rows ..."]:
     count, spacing = table["count"], table.get("spacing", "linear")
     if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= MAX_CASES:
         raise SceneFileError(f"{key}.count must be a whole number from 2 to {MAX_CASES}, got {shown(count)}")
-    first, last = (_si_number(table[name], *_target(key)) for name in ("from", "to"))
+    first, last = (si_number(table[name], key) for name in ("from", "to"))
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(last - first)):
             raise SceneFileError(f"{key}.from and {key}.to must not be further apart than numbers reach")
@@ -153,92 +146,23 @@ def _table(text: str) -> list[Parameter]:
     if len(rows) < 2:
         raise SceneFileError("must have a header of keys and a row for each case")
     header = [key.strip() for key in rows.pop(0)]
-    _check_keys(header)
+    check_keys(header)
     for case, row in enumerate(rows):
         if len(row) != len(header):
             raise SceneFileError(f"case {case} has {len(row)} cells, the header has {len(header)}")
-    return [_parameter(key, [_cell(row[column]) for row in rows]) for column, key in enumerate(header)]
-
-
-def _cell(text: str) -> Any:
-    """A plain number or list as such, anything else as text with a unit."""
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return json.loads(text, parse_int=float) if text.startswith("[") else text
-    except (ValueError, RecursionError):
-        return text
-
-
-def _check_keys(keys: list[str]) -> None:
-    if not keys:
-        raise SceneFileError('holds no keys; give values to vary, such as "rod.EI" = [0.004, 0.005]')
-    components: dict[Place, list[tuple[int, ...]]] = {}
-    for key in keys:
-        place, component = _target(key)
-        before = components.setdefault(place, [])
-        # A component beside the whole is as contradictory as the same twice.
-        if before and (component in before or not component or () in before):
-            raise SceneFileError(f"{key} is given twice, or beside a component of it")
-        before.append(component)
-
-
-def _target(key: str) -> tuple[Place, tuple[int, ...]]:
-    """Where a key is in the tables, and which component of its numbers is meant."""
-    names = key.split(".")
-    numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
-    end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
-    if names[0] not in ("rod", "start", "end", "loads") or names[end - 1] not in QUANTITIES:
-        raise SceneFileError(
-            f"{line(key)} cannot be swept; allowed are the keys of rod, start, end and loads that hold numbers, "
-            "such as rod.EI, end.position.2, loads.point_force.0.at"
-        )
-    place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
-    component = tuple(number for number in numbers[end:] if number is not None)
-    shape = QUANTITIES[names[end - 1]][1]
-    is_within = len(component) == len(shape) and all(k < size for k, size in zip(component, shape, strict=True))
-    if component and not is_within:
-        kind = f"{' x '.join(map(str, shape))} numbers, which count from 0" if shape else "a single number"
-        raise SceneFileError(f"{key} is no component: {'.'.join(names[:end])} is {kind}")
-    return place, component
+    return [_parameter(key, [cell(row[column]) for row in rows]) for column, key in enumerate(header)]
 
 
 def _parameter(key: str, values: list[Any] | np.ndarray) -> Parameter:
-    place, component = _target(key)
     if isinstance(values, np.ndarray):
-        return Parameter(key, place, component, values)
+        return Parameter(key, values)
     numbers = []
     for k, value in enumerate(values):
         try:
-            numbers.append(_si_number(value, place, component))
+            numbers.append(si_number(value, key))
         except SceneFileError as mistake:
             raise SceneFileError(f"value {k}: {mistake}") from None
-    return Parameter(key, place, component, np.stack(numbers))
-
-
-def _si_number(value: Any, place: Place, component: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """A value as the scene file has it, or a plain number in SI units."""
-    where, name = _dotted(place[:-1]), str(place[-1])
-    unit, shape = quantity(name, where)[0], QUANTITIES[name][1]
-    is_scalar = not shape or bool(component)
-    # The bulk of a large table, which must not wait for the parsing of text.
-    if is_scalar and type(value) in (int, float) and abs(value) <= sys.float_info.max:
-        return np.asarray(value, float)
-    if unit and not isinstance(value, str):
-        value = f"{value} {unit}"
-    if not component:
-        number = si_values({name: value}, where, (), (name,))[name]
-        # A direction is kept as it was given; scenes make its length 1.
-        return number if unit else np.asarray(value, float)
-    match = NUMBER_AND_UNIT.fullmatch(value) if unit else None
-    if match is None or match[1].startswith("["):
-        raise SceneFileError(
-            f"a component of {_dotted(place)} must be a number{' and a unit' if unit else ''}, got {shown(value)}"
-        )
-    same = np.full(shape, float(match[1])).tolist()
-    return si_values({name: f"{same} {match[2]}"}, where, (), (name,))[name][component]
+    return Parameter(key, np.stack(numbers))
 
 
 # --- the scenes ------------------------------------------------------------------------------------------------------
@@ -249,99 +173,24 @@ class CaseReader:
 
     def __init__(self, scene: Path, over: Path):
         self.cases, self.over_text = read_cases(over)
-        self._scene, self._over, self._reader = scene, over, SceneReader()
+        self._scene, self._over = scene, over
         try:
             self.scene_text = read_text(scene)
-            self._content = toml_tables(self.scene_text)
-            if "path" in self._content:
+            content = toml_tables(self.scene_text)
+            if "path" in content:
                 raise SceneFileError("path is not allowed in a sweep, which is over single scenes; leave [[path]] out")
-            self._templates = {p.place: _template(self._content, p) for p in self.cases.parameters}
+            self._variations = SceneVariations(content, [parameter.key for parameter in self.cases.parameters])
         except SceneFileError as mistake:
             raise SweepError(f"{scene}: {mistake}") from None
         self.first = self._read(0, self.cases.of(np.array([0])), 0)
-        # Numbers in SI units are read much faster than others.
-        self._content = {name: _in_si(table) for name, table in self._content.items()}
+        self._variations.in_si()
 
     def scenes(self, cases: Int[np.ndarray, "k"]) -> list[Scene]:
         values = self.cases.of(cases)
         return [self._read(int(case), values, row).scenes[0] for row, case in enumerate(cases)]
 
     def _read(self, case: int, values: Mapping[str, np.ndarray], row: int) -> SceneFile:
-        numbers = {place: template.copy() for place, template in self._templates.items()}
-        for parameter in self.cases.parameters:
-            numbers[parameter.place][parameter.component] = values[parameter.key][row]
-        content = dict(self._content)
-        for place, number in numbers.items():
-            _put(content, place, _as_text(number, str(place[-1]), _dotted(place[:-1])))
         try:
-            return self._reader.read(content)
+            return self._variations.read({key: numbers[row] for key, numbers in values.items()})
         except SceneFileError as mistake:
             raise SweepError(f"{self._over}: case {case}: {mistake} (in {self._scene} with these values)") from None
-
-
-def _template(content: dict[str, Any], parameter: Parameter) -> Float[np.ndarray, "..."]:
-    """The numbers in SI units into which the values of a parameter are put."""
-    place, key = parameter.place, parameter.key
-    if place[0] == "loads":
-        content.setdefault("loads", {})
-    table: Any = content
-    for depth in range(1, len(place)):
-        table = _entry(table, place[:depth], key)
-    if not isinstance(table, dict):
-        raise SceneFileError(f"{_dotted(place[:-1])} must be a table, got {shown(table)}")
-    name = str(place[-1])
-    if not parameter.component:
-        return np.zeros(QUANTITIES[name][1])
-    value = _entry(table, place, key)
-    numbers = si_values({name: value}, _dotted(place[:-1]), (), (name,))[name]
-    # A direction is kept as it was given; scenes make its length 1.
-    return numbers if QUANTITIES[name][0] else np.asarray(value, float)
-
-
-def _entry(table: Any, place: Place, key: str) -> Any:
-    """What a table, or list of tables, has at the end of a place."""
-    last: Any = place[-1]
-    is_there = last in table if isinstance(table, dict) else isinstance(table, list) and last in range(len(table))
-    if not is_there:
-        raise SceneFileError(f"{_dotted(place)} is not there, so that {key} cannot be swept")
-    return table[last]
-
-
-def _dotted(place: Place) -> str:
-    return ".".join(map(str, place))
-
-
-def _put(content: dict[str, Any], place: Place, value: Any) -> None:
-    """Puts a value where it belongs; the tables on the way are copied, so that those of the file stay as they are."""
-    table: Any = content
-    for part in place[:-1]:
-        table[part] = table[part].copy()
-        table = table[part]
-    table[place[-1]] = value
-
-
-def _as_text(number: Float[np.ndarray, "..."], name: str, where: str) -> Any:
-    unit = quantity(name, where)[0]
-    return f"{number.tolist()} {unit}" if unit else number.tolist()
-
-
-def _in_si(table: Any, where: str = "") -> Any:
-    """A table with all quantities in SI units."""
-    if isinstance(table, list):
-        return [_in_si(entry, where) for entry in table]
-    if not isinstance(table, dict):
-        return table
-
-    def value(key: str, value: Any) -> Any:
-        if isinstance(value, str) and key in QUANTITIES:
-            with suppress(SceneFileError):  # each case has another value in its place
-                return _as_text(si_values({key: value}, where, (), (key,))[key], key, where)
-        return _in_si(value, f"{where}.{key}")
-
-    return {key: value(key, entry) for key, entry in table.items()}
-
-
-def unit_of(key: str) -> str:
-    """SI unit of the numbers of a key; 1 where they have no dimension."""
-    place, _ = _target(key)
-    return quantity(str(place[-1]), _dotted(place[:-1]))[0] or "1"

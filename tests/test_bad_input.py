@@ -146,6 +146,7 @@ def world(tmp_path, samples, capsys, monkeypatch) -> World:
         for name in names:
             monkeypatch.setattr(f"rodjax.{module}.{name}", solved)
     monkeypatch.setattr("rodjax.sweep.solve_batch", solved)
+    monkeypatch.setattr(rj, "fit", solved)
     monkeypatch.setattr("rodjax.cli._set_up_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
     return World(tmp_path, samples, capsys)
@@ -758,6 +759,8 @@ COMMANDS = st.one_of(
             "shard",
         )
     ),
+    WORDS.map(lambda word: (["fit", word, "data.csv"], word)),
+    WORDS.map(lambda word: (["fit", "fit.toml", "data.csv", "--out", f"scene.toml/{word}"], "--out must be a folder")),
     WORDS.map(lambda word: (["merge", f"{word}.h5", "-o", "a.h5"], word)),
     WORDS.map(lambda word: (["merge", "scene.toml", word, "-o", "a.h5"], "scene.toml")),
 )
@@ -843,6 +846,53 @@ def cases_of_a_sweep(example, world):
     assert not Path("out.h5.parts").exists()
 
 
+# --- fits ------------------------------------------------------------------------------------------------------------
+
+FITS = Path(__file__).parents[1] / "experiments" / "fits"
+BAD_VALUES = st.one_of(NONSENSE, OF_NO_KIND, arrays_for_toml((2,)), WRONG_UNITS.map(lambda wrong: f"1 {wrong}"))
+
+
+@st.composite
+def bad_fits(draw):
+    """The name of one of the files of the example, what becomes of its text, and what the message must name."""
+    kind = draw(st.sampled_from(["cell", "title", "value"]))
+    if kind == "value":
+        text = (FITS / "fit.toml").read_text()
+        found = draw(st.sampled_from(list(re.finditer(r"^(\w+) = (.*?)(?=  #|$)", text, re.M))))
+        value = document({"a": draw(BAD_VALUES)}).partition("=")[2].strip()
+        return "fit.toml", text[: found.start(2)] + value + text[found.end(2) :], None
+    rows = [row.split(",") for row in (FITS / "data.csv").read_text().splitlines()]
+    column = draw(st.integers(2, len(rows[0]) - 1))
+    bad = draw(st.sampled_from(["stiff", "nan", "-inf", "1 m", "1e999", "[1]", "[", "true", "1,1", "1e-3 mm mm"]))
+    if kind == "cell":
+        row = draw(st.sampled_from([k for k, row in enumerate(rows) if k and row[column]]))
+        rows[row][column] = bad
+        return "data.csv", "\n".join(map(",".join, rows)), f"line {row + 1}"
+    title = f"{draw(WORDS)}x"
+    rows[0][column] = title
+    return "data.csv", "\n".join(map(",".join, rows)), "column"
+
+
+def copy_fit():
+    for source in FITS.iterdir():
+        shutil.copy(source, source.name)
+
+
+@bad_input(bad_fits())
+def measurements(example, world):
+    name, text, named = example
+    copy_fit()
+    Path(name).write_text(text, encoding="utf-8", errors="replace")
+    try:
+        line = world.refused("fit", "fit.toml", "data.csv")
+    except Accepted:
+        assert named is None
+        reject()
+    assert re.match(rf"rodjax: ({name}|[^:]*: cannot be read)", line)
+    assert (named or "") in line
+    assert not Path("rodjax-fit").exists()
+
+
 # --- damaged files ---------------------------------------------------------------------------------------------------
 
 
@@ -896,6 +946,18 @@ def damaged_results(example, world):
     save(expected, "a.vtkhdf")
     Path("a.vtkhdf").write_bytes(damaged(Path("a.vtkhdf").read_bytes()))
     assert_refused_or_same("a.vtkhdf", expected)
+
+
+@bad_input(st.tuples(st.sampled_from(["fit.toml", "scene.toml", "data.csv"]), damage()))
+def damaged_fits(example, world):
+    name, damaged = example
+    copy_fit()
+    Path(name).write_bytes(damaged(Path(name).read_bytes()))
+    try:
+        world.refused("fit", "fit.toml", "data.csv")
+    except Accepted:
+        reject()
+    assert not Path("rodjax-fit").exists()
 
 
 MAY_BE_MISSING = {"scene/gravity", "scene/turns", "scene/rod/radius", "scene/point_forces"}

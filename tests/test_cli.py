@@ -72,7 +72,7 @@ def test_a_solve_that_does_not_converge_exits_with_3_and_still_writes(tmp_path, 
     ("arguments", "said"),
     [
         ([], "COMMAND"),
-        (["bend"], "'solve', 'sweep', 'merge', 'demo'"),
+        (["bend"], "'solve', 'sweep', 'merge', 'fit', 'demo'"),
         (["solve"], "SCENE.toml"),
         (["solve", HANGING, "--fast"], "--fast"),
         (["solve", "missing.toml"], "missing.toml: cannot be read"),
@@ -127,7 +127,7 @@ def test_works_without_a_cache_folder(tmp_path, monkeypatch):
 
 
 def test_help_and_version_exit_with_0(capsys):
-    for arguments in (["--help"], ["solve", "--help"], ["demo", "--help"], ["--version"]):
+    for arguments in (["--help"], ["solve", "--help"], ["fit", "--help"], ["demo", "--help"], ["--version"]):
         with pytest.raises(SystemExit, match=r"^0$"):
             main(arguments)
     assert rodjax.__version__ in capsys.readouterr().out

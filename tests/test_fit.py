@@ -229,7 +229,7 @@ def test_many_fits_by_themselves_are_the_single_ones():
         assert fits.standard_errors[2, k] == pytest.approx(alone.standard_error[label], rel=1e-3)
     assert fits.sigma[2] == pytest.approx(alone.sigma, rel=1e-5)
     np.testing.assert_allclose(fits.rms[2], alone.rms[0], rtol=1e-4)
-    np.testing.assert_array_equal(fits.estimates[6:, 1], 0.8 * MASS)
+    np.testing.assert_allclose(fits.estimates[6:, 1], 0.8 * MASS, rtol=1e-15)  # by its logarithm
     assert np.all(np.isnan(fits.standard_errors[6:, 1:]))
     np.testing.assert_array_equal(fits.degrees_of_freedom, [27] * 6 + [29] * 6)
     low, high = fits.intervals()

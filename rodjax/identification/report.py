@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.identification.setup import name_of
-from rodjax.status import is_converged
+from rodjax.status import Status
 
 if TYPE_CHECKING:
     from rodjax.identification.result import Fit
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 UNDERSTATED = 1.5
 # Correlations beyond this are told in words.
 CORRELATED = 0.95
+# What a solve ends with where there is an equilibrium.
+FOUND = (Status.CONVERGED, Status.ROUNDING_FLOOR)
 # Rows of the table of experiments; of more the worst.
 MOST_ROWS = 30
 LEVEL = 0.95
@@ -104,7 +106,7 @@ def _remarks(fit: "Fit") -> list[str]:
                     f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
                 )
     told += fit.held
-    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if not is_converged(status)]
+    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in FOUND]
     if lost:
         told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
     return [f"- {remark}" for remark in told]

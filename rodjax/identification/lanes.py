@@ -20,6 +20,8 @@ def in_lanes(function: Callable[..., T], each: tuple[Any, ...], rods: int = 1) -
     count = jax.tree.leaves(each)[0].shape[0]
     lanes = min(max(1, LANES // rods), count)
     turns = -(-count // lanes)
+    if turns == 1:
+        return jax.vmap(function)(*each)
     which = np.minimum(np.arange(turns * lanes), count - 1).reshape(turns, lanes)
     found = jax.lax.map(lambda x: jax.vmap(function)(*x), jax.tree.map(lambda x: x[which], each))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)

@@ -3,7 +3,7 @@
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.compilation import compiled
 from rodjax.equilibrium import Discretization, solve
+from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates, NormalEquations, Residuals, least_squares
 from rodjax.identification.loss import Loss, influence, robust
 from rodjax.identification.measurements import Experiment
@@ -189,27 +190,25 @@ def evaluation(
     structure: Structure, problem: Problem, z: Coordinates, guesses: tuple[Equilibrium, ...], is_used: Bool[Array, "e"]
 ) -> Evaluation:
     """At unknowns by their sizes, on the scale on which they are sought."""
+    ways = jnp.eye(z.shared.shape[0] + z.own.shape[1], dtype=z.shared.dtype)
+    of_shared, of_own = ways[:, : z.shared.shape[0]], ways[:, z.shared.shape[0] :]
 
-    def rows(z: Coordinates) -> tuple[tuple[Rows, ...], tuple[Equilibrium, ...]]:
-        shared, own = values(structure, problem.unbounded, z)
+    def one(experiment: Experiment, own: Float[Array, "q"], guess: Equilibrium) -> Any:
+        def rows(shared: Float[Array, "p"], own: Float[Array, "q"]) -> tuple[list[Float[Array, "k d"]], Equilibrium]:
+            shared, own = values(structure, problem.unbounded, Coordinates(shared, own))
+            placed = with_unknowns(structure, experiment, shared, own)
+            result = solved(structure, placed.scene, guess)
+            return [measured.weights[:, None] * measured.deviations(result) for measured in placed.measured], result
 
-        def one(experiment: Experiment, own: Float[Array, "q"], guess: Equilibrium):
-            experiment = with_unknowns(structure, experiment, shared, own)
-            result = solved(structure, experiment.scene, guess)
-            found = [measured.weights[:, None] * measured.deviations(result) for measured in experiment.measured]
-            return found, result
+        found, tangent, result = jax.linearize(rows, z.shared, own, has_aux=True)
+        return found, jax.vmap(tangent)(of_shared, of_own), result
 
-        pairs = [
-            jax.vmap(one)(group.experiments, own[here], guess)
-            for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
-        ]
-        return tuple([found for found, _ in pairs]), tuple([result for _, result in pairs])
-
-    found, tangent, results = jax.linearize(rows, z, has_aux=True)
-    (p,), (e, q) = z.shared.shape, z.own.shape
-    ways = jnp.eye(p + q, dtype=z.shared.dtype)
-    of_own = jnp.broadcast_to(ways[:, None, p:], (p + q, e, q))
-    changes = jax.vmap(tangent)(Coordinates(ways[:, :p], of_own))
+    parts = [
+        in_lanes(one, (group.experiments, z.own[here], guess))
+        for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
+    ]
+    found, changes, results = zip(*parts, strict=True)
+    changes = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), changes)
     return Evaluation(found, changes, results, is_used)
 
 

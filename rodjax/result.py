@@ -22,7 +22,7 @@ from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
-from rodjax.discretization.results import Resultants, positions_between, resultants
+from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
 from rodjax.discretization.shape import Shape
 from rodjax.guess import cubic
 from rodjax.linalg import factor
@@ -40,11 +40,12 @@ class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
-    are unknown; `end_force`: the force at s = L between held ends, else zero.
+    are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
+    with the forces of the clips beyond it.
     """
 
     shape: Shape
-    end_force: Float[Array, "... 3"]
+    end_force: Float[Array, "..."]
     units: Units
 
 
@@ -63,6 +64,8 @@ class Equilibrium(eqx.Module):
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
+    - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
+      position, zero where it holds no direction; the moments are computed when they are asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
       (dead moments, couples along the rod, follower loads) this is not examined and False, and
@@ -110,6 +113,19 @@ class Equilibrium(eqx.Module):
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
         return self.frames[..., 2]
+
+    @property
+    def clip_forces(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        seen = self.state.end_force * self.state.units.force[..., None, None]
+        return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
+
+    @property
+    def clip_moments(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        return _clip_moments(self)
 
     @property
     def error_estimate(self) -> Float[Array, "..."]:
@@ -245,6 +261,13 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
     return _Examination(critical, factor(form.regular(here.system)).negative, jnp.any(turn.rotation != 0))
+
+
+@over_leading_axes
+def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, MixedForm)
+    return clip_moments(form, point) * equilibrium.state.units.energy
 
 
 @over_leading_axes

@@ -55,8 +55,8 @@ def errors_of_differences(
     form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], at_nodes: Float[Array, "3 n+1"]
 ) -> Errors:
     """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
-    scene, field = form.scene, HermiteElements(form.field.s)
-    elements = MixedForm.of(scene, field)
+    scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
+    elements = type(form).of(scene, field)
     tangents = interleaved(at_nodes, point.tangents)
     begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
     here = elements.linearized(begin)
@@ -71,9 +71,12 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     rod, h = scene.rod, field.h
     torque = rod.GJ * point.total_twist
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
-    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
-    first = Section(jnp.zeros_like(middles), nodes[:, :-1], moments[:, :-1])
+    # In a clip that holds the tangent the moment jumps.
+    before = -cross(nodes[:, :-1], by_start) if scene.clips else moments[:, :-1]
+    first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
     last, passed = _integrated(form, field, point, torque, first)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
@@ -81,7 +84,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     turn = cross(nodes[:, 1:], last.tangent)
     back = -cross(turn, middles)
     passed = [tangent + k / STEPS * -cross(turn, tangent) for k, tangent in enumerate(passed)]
-    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 1]
+    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 1])
     couple = last.moment - moments[:, 1:]
     gap = last.way + h[None] / 2 * back - form.edges(point).T
 
@@ -94,7 +97,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
     gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
-    closure = -form.of_force(jnp.sum(gap, axis=1))
+    closure = -form.of_force(form.along_spans(gap))
     if form.has_torsion:
         missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
         closure = jnp.concatenate([missing[None], closure])
@@ -120,7 +123,7 @@ def _integrated(
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
     scene, rod = form.scene, form.scene.rod
-    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 0]
+    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 0])
     weight = jnp.zeros(3, force.dtype) if scene.gravity is None else scene.gravity
     step = field.h / STEPS
 

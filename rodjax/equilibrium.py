@@ -1,5 +1,6 @@
 """solve(): the equilibrium of a scene."""
 
+import dataclasses
 import functools
 import typing
 import warnings
@@ -36,10 +37,21 @@ from rodjax.result import (
     estimated_errors,
     warn_if_not_converged,
 )
-from rodjax.scene import Scene, dead_end_moment, force_shape, held_at_both_ends, needs_frames, nondimensional
+from rodjax.scene import (
+    Scene,
+    dead_end_moment,
+    force_shape,
+    held_at_both_ends,
+    needs_frames,
+    nondimensional,
+    slid,
+    slides,
+    sliding_places,
+)
+from rodjax.sliding_search import INNER_TOLERANCE, slid_free
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
-from rodjax.status import Status
+from rodjax.status import Outcome, Status
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -203,7 +215,7 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
     else:
         shape = Polyline.through(shape.points(options.segments))
-    return SolverState(shape, state.end_force, state.units)
+    return SolverState(shape, state.end_force, state.units, state.places)
 
 
 def checked_options(
@@ -305,6 +317,10 @@ def first_state(
     return _first_state(scene, guess, options)
 
 
+def _sliding(scene: Scene) -> tuple[bool, ...]:
+    return tuple(clip.sliding for clip in scene.clips)
+
+
 def _kind(options: Options) -> type[Polyline] | type[Curve]:
     return Polyline if options.discretization == "finite_difference" else Curve
 
@@ -312,7 +328,7 @@ def _kind(options: Options) -> type[Polyline] | type[Curve]:
 def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
     """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
     shape = guess.state.shape
-    if guess.state.end_force.shape != force_shape(scene):
+    if guess.state.end_force.shape != force_shape(scene) or _sliding(guess.scene) != _sliding(scene):
         return False
     if needs_frames(scene):
         return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
@@ -331,9 +347,11 @@ def _first_state(
         return _first_frames(scaled, units, guess, options)
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype) if scene.clips else jnp.zeros_like(no_force[0])
-        return SolverState(kind.through(first_shape(scaled, pieces)), no_force, units), no_twist
+        shape = kind.through(first_shape(scaled, pieces))
+        return SolverState(shape, no_force, units, sliding_places(scaled)), no_twist
     if isinstance(guess, Guess):
-        return SolverState(kind.through(guess.nodes(units, pieces)), no_force, units), guess.total_twist
+        shape = kind.through(guess.nodes(units, pieces))
+        return SolverState(shape, no_force, units, sliding_places(scaled)), guess.total_twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -346,7 +364,10 @@ def _first_state(
         # Of a scene with other clips: the force at the end in all spans.
         last = end_force if end_force.ndim == 1 else end_force[:, -1]
         end_force = last if no_force.ndim == 1 else jnp.broadcast_to(last[:, None], no_force.shape)
-    return SolverState(shape, end_force, state.units), guess.total_twist
+    places = sliding_places(scaled)
+    if _sliding(guess.scene) == _sliding(scene):
+        places = state.places
+    return SolverState(shape, end_force, state.units, places), guess.total_twist
 
 
 def _first_frames(
@@ -373,7 +394,8 @@ def _first_frames(
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     # To the same bits, whatever is made of it in the same program.
-    return jax.lax.optimization_barrier(_found(*in_units_of(scene, state), twist, options))
+    find = _slid if slides(scene) else _found
+    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), twist, options))
 
 
 def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
@@ -420,7 +442,8 @@ class Search(eqx.Module):
             # Inside a user's own jit the scene could not be checked before.
             status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
-        return Found(SolverState(shape, point.end_force, self.units), point, outcome, stable)
+        places = sliding_places(self.form.scene)
+        return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
 
 
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
@@ -434,6 +457,26 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     point = minimum.problem.mixed_point(minimum.point)
     stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
+
+
+def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+    """The same where the rod slides through clips."""
+    assert guess.places is not None
+    assert isinstance(options.solver, Newton)
+    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, twist)
+    if scene.turns is not None:
+        # They are those of the first shape.
+        scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
+
+    tolerance = options.solver.tolerance
+    inner = options._replace(solver=dataclasses.replace(options.solver, tolerance=INNER_TOLERANCE * tolerance))
+
+    def find_at(scene: Scene, last: Found) -> Found:
+        return _found(scene, last.state, last.point.total_twist, inner)
+
+    count = jnp.zeros((), int)
+    begin = Found(guess, point, Outcome(jnp.zeros_like(twist), count, count, count), jnp.array(False))
+    return slid_free(scene, find_at, begin, tolerance, options.find)
 
 
 def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, Point]:
@@ -474,4 +517,4 @@ def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: O
 def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
-    return SolverState(shape, state.end_force * (state.units.force / units.force), units)
+    return SolverState(shape, state.end_force * (state.units.force / units.force), units, state.places)

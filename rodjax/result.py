@@ -16,7 +16,7 @@ from rodjax.compilation import compiled
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
-from rodjax.discretization.form import Form
+from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
@@ -26,7 +26,8 @@ from rodjax.discretization.results import Resultants, clip_moments, positions_be
 from rodjax.discretization.shape import Shape
 from rodjax.guess import cubic
 from rodjax.linalg import factor
-from rodjax.scene import Scene, has_potential, nondimensional
+from rodjax.scene import Scene, has_potential, nondimensional, slid, slides
+from rodjax.sliding import slide
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
@@ -41,12 +42,14 @@ class SolverState(eqx.Module):
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
     are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
-    with the forces of the clips beyond it.
+    with the forces of the clips beyond it; `places`: arclengths at which the rod passes its sliding clips, as parts of
+    its length, where there are some.
     """
 
     shape: Shape
-    end_force: Float[Array, "..."]
+    end_force: Float[Array, "... 3"] | Float[Array, "... 3 spans"]
     units: Units
+    places: Float[Array, "... slides"] | None = None
 
 
 class Equilibrium(eqx.Module):
@@ -81,7 +84,8 @@ class Equilibrium(eqx.Module):
       examined, under loads without a potential and in the continuum. Computed when asked for
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
-    - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
+    - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
+    - `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
     - `state`: what a solve that begins from here takes over
     """
 
@@ -171,6 +175,8 @@ class Found(eqx.Module):
 
 def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
     """What a solver found, in SI units."""
+    if found.state.places is not None:
+        scene = slid(scene, found.state.places * scene.rod.length)
     scaled, units = nondimensional(scene)
     point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
@@ -204,7 +210,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         substeps=substeps,
         residual=outcome.residual,
         scene=scene,
-        state=SolverState(found.state.shape, found.state.end_force, units),
+        state=SolverState(found.state.shape, found.state.end_force, units, found.state.places),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
     )
 
@@ -240,8 +246,15 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
         return errors_of_frames(form, point)
     assert isinstance(form, MixedForm)
     if isinstance(state.shape, Curve):
-        return errors_of_elements(form, point)
-    return errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+        errors = errors_of_elements(form, point)
+    else:
+        errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+    if errors.axial is None:
+        return errors
+    # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
+    now = slide(form.scene, state.shape, point)
+    further = -jnp.linalg.solve(now.rates, errors.axial)
+    return errors._replace(nodes=errors.nodes + jnp.tensordot(further, now.nodes, 1))
 
 
 class _Examination(eqx.Module):
@@ -260,7 +273,11 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     _, critical, turn = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
-    return _Examination(critical, factor(form.regular(here.system)).negative, jnp.any(turn.rotation != 0))
+    negative = factor(form.regular(here.system)).negative
+    if slides(equilibrium.scene):
+        stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
+        negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
+    return _Examination(critical, negative, jnp.any(turn.rotation != 0))
 
 
 @over_leading_axes

@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
@@ -177,7 +178,7 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
     if not scene.clips:
         return mixed
-    clips = tuple(Clip(clip.at, clip.position, clip.tangent) for clip in mixed.clips)
+    clips = tuple(Clip(clip.at, clip.position, clip.tangent, clip.sliding) for clip in mixed.clips)
     return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
 
 
@@ -189,6 +190,21 @@ def held_at_both_ends(scene: Scene) -> bool:
 def force_shape(scene: Scene) -> tuple[int, ...]:
     """The shape of what a solver knows of the force at s = L: with clips one vector for each span between supports."""
     return (3, len(scene.clips) + 1) if scene.clips else (3,)
+
+
+def slides(scene: Scene) -> bool:
+    """Whether the rod slides through a clip."""
+    return any(clip.sliding for clip in scene.clips)
+
+
+def sliding_places(scene: Scene) -> Float[Array, "slides"] | None:
+    """The arclengths of the sliding clips; `None` where there are none."""
+    return jnp.stack([clip.at for clip in scene.clips if clip.sliding]) if slides(scene) else None
+
+
+def slid(scene: Scene, places: Float[Array, "slides"]) -> Scene:
+    """The scene with its sliding clips at other arclengths."""
+    return eqx.tree_at(lambda scene: [clip.at for clip in scene.clips if clip.sliding], scene, list(places))
 
 
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:

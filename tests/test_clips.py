@@ -14,11 +14,11 @@ GRAVITY = (0.0, 3.0, -9.81)
 LEVEL = frame((1, 0, 0))
 
 
-def in_space(tangent=None, start=None, end=None) -> Scene:
+def in_space(tangent=None, start=None, end=None, sliding=(False, False), slenderness=20.0) -> Scene:
     """A thick rod under its weight through two clips, the first of which may hold the tangent."""
-    clips = [Clip(0.25, (0.18, 0.05, -0.04), tangent), Clip(0.625, (0.4, 0.12, 0.05))]
-    start = start or Clamp(ORIGIN, frame((1, 0, -1)))
-    return Scene(problems.cable(20.0), start, end or Clamp((0.6, 0.2, 0.0), frame((1, 1, 0))), GRAVITY, clips=clips)
+    clips = [Clip(0.25, (0.18, 0.05, -0.04), tangent, sliding[0]), Clip(0.625, (0.4, 0.12, 0.05), None, sliding[1])]
+    start, end = start or Clamp(ORIGIN, frame((1, 0, -1))), end or Clamp((0.6, 0.2, 0.0), frame((1, 1, 0)))
+    return Scene(problems.cable(slenderness), start, end, GRAVITY, clips=clips)
 
 
 def weight(scene: Scene) -> np.ndarray:
@@ -174,14 +174,85 @@ def test_order_of_the_mesh(discretization, order, sizes):
     np.testing.assert_allclose(estimates, errors, rtol=0.1)
 
 
+# --- sliding ---------------------------------------------------------------------------------------------------------
+
+
+def axial_forces(result: rj.Equilibrium) -> list[float]:
+    """What the sliding clips apply along the rod [N]."""
+    nodes = [int(np.argmin(np.abs(result.s - clip.at))) for clip in result.scene.clips]
+    along = [float(jnp.sum(f * result.tangents[node])) for f, node in zip(result.clip_forces, nodes, strict=True)]
+    return [force for force, clip in zip(along, result.scene.clips, strict=True) if clip.sliding]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("discretization", ["hermite", "finite_difference"])
+@pytest.mark.parametrize("tangent", [None, (1.0, 0.3, 0.4)])
+@pytest.mark.parametrize("sliding", [(False, True), (True, True)])
+def test_no_axial_force_acts_where_the_rod_slides(sliding, tangent, discretization):
+    scene = in_space(tangent, sliding=sliding, slenderness=100.0)
+    result = rj.solve(scene, segments=16, discretization=discretization)
+    assert result.converged
+    assert result.stable
+    assert result.index == 0
+    size = float(np.linalg.norm(weight(scene)))
+    np.testing.assert_allclose(axial_forces(result), 0.0, atol=1e-9 * size)
+    np.testing.assert_allclose(supported(result), -weight(scene), rtol=0, atol=1e-9 * size)
+    again = rj.solve(scene, segments=16, discretization=discretization, guess=result)
+    assert again.iterations == 0
+    np.testing.assert_array_equal(again.nodes, result.nodes)
+
+
+@pytest.mark.slow
+def test_a_sliding_clip_is_where_the_energy_is_least():
+    """Clips that hold the rod beside that place cost more; half way, by symmetry, most: the rod slides away."""
+    rod = problems.cable(100.0)
+    ends = Clamp(ORIGIN, LEVEL), Clamp((0.8, 0, 0), LEVEL)
+
+    def scene(at: float, *, sliding: bool) -> Scene:
+        return Scene(rod, *ends, (0, 0, -9.81), clips=[Clip(at, (0.4, 0, 0.1), None, sliding)])
+
+    options = {"segments": 32, "solver": TIGHT}
+    result = rj.solve(scene(0.44, sliding=True), **options)
+    at = float(result.scene.clips[0].at)
+    assert 0.4 < at < 0.499
+    assert result.stable
+    held = [rj.solve(scene(at + shift, sliding=False), guess=result, **options) for shift in (-0.005, 0.0, 0.005)]
+    energies = [float(each.energy) for each in held]
+    assert energies[1] < min(energies[0], energies[2])
+    assert float(result.energy) == pytest.approx(energies[1], rel=1e-12)
+    half = rj.solve(scene(0.5, sliding=True), find="equilibrium", **options)
+    np.testing.assert_allclose(half.scene.clips[0].at, 0.5, rtol=0, atol=1e-11)
+    assert half.index == 1
+    assert not half.stable
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("discretization", "sizes", "order"), [("hermite", (16, 32), 4), ("finite_difference", (64, 128), 2)]
+)
+def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
+    """The clip slides to a place of its own on each mesh, which the estimate knows."""
+    scene = in_space((1.0, 0.3, 0.4), sliding=(False, True))
+    truth = rj.solve(scene, segments=96, solver=TIGHT)
+    results = [rj.solve(scene, segments=n, discretization=discretization, solver=TIGHT) for n in sizes]
+    errors = [float(np.max(np.linalg.norm(r.nodes - truth.position_at(r.s), axis=1))) for r in results]
+    places = [abs(float(r.scene.clips[1].at - truth.scene.clips[1].at)) for r in results]
+    # 16 elements are few for a rod that is thick and bent in three spans.
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.7)
+    assert np.log2(places[0] / places[1]) == pytest.approx(order, abs=0.7)
+    np.testing.assert_allclose([float(r.error_estimate) for r in results], errors, rtol=0.15)
+
+
 # --- derivatives -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("discretization", ["hermite", "finite_difference"])
-@pytest.mark.parametrize("end", [None, Free()])
-def test_derivatives_by_place_position_and_direction(discretization, end):
-    scene = in_space((1.0, 0.3, 0.4), end=end)
+@pytest.mark.parametrize(
+    ("end", "sliding"), [(None, (False, False)), (Free(), (False, False)), (None, (False, True)), (None, (True, True))]
+)
+def test_derivatives_by_place_position_and_direction(discretization, end, sliding):
+    scene = in_space((1.0, 0.3, 0.4), end=end, sliding=sliding)
     options = {"segments": 8, "discretization": discretization, "solver": rj.Newton(tolerance=1e-13)}
     base = rj.solve(scene, **options)
     direction = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (2, 7)))
@@ -191,10 +262,12 @@ def test_derivatives_by_place_position_and_direction(discretization, end):
         clips = []
         for clip, at_rest, change in zip(scene.clips, frames, by, strict=True):
             tangent = None if at_rest is None else rotate(at_rest, change[4:])[:, 2]
-            clips.append(Clip(clip.at + change[0] / 10, clip.position + change[1:4] / 10, tangent))
+            at = clip.at if clip.sliding else clip.at + change[0] / 10
+            clips.append(Clip(at, clip.position + change[1:4] / 10, tangent, clip.sliding))
         moved = Scene(scene.rod, scene.start, scene.end, scene.gravity, clips=clips)
         result = rj.solve(moved, guess=base, **options)
-        moments = (result.start_moment, result.end_moment, result.clip_moments.reshape(-1))
+        places = jnp.stack([clip.at for clip in result.scene.clips])
+        moments = (result.start_moment, result.end_moment, result.clip_moments.reshape(-1), places)
         return jnp.concatenate([result.start_force, result.end_force, result.clip_forces.reshape(-1), *moments])
 
     @jax.jit
@@ -206,7 +279,7 @@ def test_derivatives_by_place_position_and_direction(discretization, end):
     at = jax.jit(lambda h: found(h * direction))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=found(0 * direction).shape))
     values, change, by_weights = both(weights)
-    h = 1e-3 if end is None else 1e-4
+    h = 1e-3 if end is None and not any(sliding) else 1e-4
     expected = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
     # Differences of fourth order: h^4 of the fifth derivative (large where a free end hangs from the soft part of the
     # rod), and roundings by h.
@@ -283,6 +356,68 @@ def test_a_tolerance_is_met():
     assert result.converged
 
 
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sliding", [(False, False), (True, False)])
+def test_results_and_scenes_are_read_back(sliding, tmp_path):
+    scene = in_space((1.0, 0.3, 0.4), sliding=sliding)
+    result = rj.solve(scene, segments=8)
+    several = rj.solve_path([scene] * 2, segments=8)
+    for found, path in ((result, tmp_path / "one.vtkhdf"), (several, tmp_path / "path.vtkhdf")):
+        rj.save(found, path)
+        again = rj.load(path)
+        assert jax.tree.structure(again) == jax.tree.structure(found)
+        jax.tree.map(np.testing.assert_array_equal, again, found)
+        np.testing.assert_array_equal(again.clip_forces, found.clip_forces)
+    rj.write_scene(result.scene, tmp_path / "scene.toml")
+    read = rj.read_scene(tmp_path / "scene.toml")
+    assert jax.tree.structure(read) == jax.tree.structure(result.scene)
+    jax.tree.map(np.testing.assert_array_equal, read, result.scene)
+
+
+def test_clips_in_a_scene_file(tmp_path):
+    text = """
+    [rod]
+    length = "1 m"
+    EI = "1 N m^2"
+    GJ = "1 N m^2"
+    EA = "1e4 N"
+    [start]
+    support = "pin"
+    position = "[0, 0, 0] m"
+    [end]
+    support = "pin"
+    position = "[60, 0, 0] cm"
+    [[clips]]
+    at = "30 cm"
+    position = "[20, 0, 1] cm"
+    tangent = [2, 0, 0]
+    sliding = true
+    [[clips]]
+    at = "0.7 m"
+    position = "[0.4, 0, 0] m"
+    """
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    first, second = rj.read_scene(path).clips
+    assert (first.sliding, second.sliding, second.tangent) == (True, False, None)
+    np.testing.assert_allclose(first.position, (0.2, 0, 0.01), rtol=1e-15)
+    np.testing.assert_array_equal(first.tangent, (1, 0, 0))
+    for old, new, message in (
+        ('"0.7 m"', '"0.2 m"', r"clips\[1\].at must be larger than clips\[0\].at = 0.3 m"),
+        ('"0.7 m"', '"7 kg"', r"clips\[1\].at must be"),
+        ('"30 cm"', '"3 cm"', r"clips: the start and clips\[0\] are 0.2"),
+        ("sliding = true", 'sliding = "yes"', r"clips\[0\].sliding must be true or false"),
+        ("tangent = [2, 0, 0]", "direction = [2, 0, 0]", r"clips\[0\].direction"),
+        ("tangent = [2, 0, 0]", "tangent = [0, 0, 0]", r"clips\[0\].tangent must be a direction"),
+    ):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(rj.SceneFileError, match=message):
+            rj.read_scene(path)
+
+
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
@@ -333,6 +468,10 @@ def test_what_clips_do_not_go_with_is_said():
         rj.solve_continuum(scene)
     with pytest.raises(ValueError, match=r"clips must be \(\) where a moment acts on a free end"):
         Scene(scene.rod, scene.start, Free(moment=(0, 0, 1)), clips=scene.clips)
+    slides = in_space(sliding=(True, False))
+    for refused in (lambda: rj.follow([slides, slides]), lambda: rj.solve_path([slides] * 2, at_critical="stop")):
+        with pytest.raises(ValueError, match="sliding clips"):
+            refused()
     curved = Rod(1.0, (1.0, 2.0), 1.0, 1e6)
     with pytest.raises(ValueError, match=r"clips must be \(\) for a rod or loads that need frames"):
         rj.solve(Scene(curved, scene.start, scene.end, clips=scene.clips))

@@ -12,6 +12,7 @@ of each point. A clip that holds the tangent takes the rotations of its node, as
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
@@ -114,6 +115,12 @@ class ClippedForm(MixedForm):
         if isinstance(start, Free):
             return jnp.zeros_like(total) if start.force is None else -start.force, last - total
         return first + total, last
+
+    def axial_forces(self, point: MixedPoint) -> Float[Array, "slides"]:
+        """What the sliding clips apply to the rod along its tangent."""
+        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
+        along = dot(forces, self.field.tangents_in_clips(self.scene, point.tangents))
+        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     # --- stretch, by cells -------------------------------------------------------------------------------------------
 

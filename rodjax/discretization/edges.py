@@ -21,6 +21,7 @@ from rodjax.discretization.twist import angle_about, swept_twist, transport_alon
 from rodjax.energy import density
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Directed, Free, Held
+from rodjax.vectors import dot
 
 
 class EdgeTangents(eqx.Module):
@@ -148,6 +149,21 @@ class EdgeTangents(eqx.Module):
     @property
     def side_weights(self) -> Float[Array, "1 n"]:
         return self.weights[None]
+
+    def tangents_at_nodes(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n-1"]:
+        """At the nodes between the ends: on the arc between those of the edges beside, or as a clip holds it."""
+        if self.places is None:
+            inner = tangents[:, :-1] + tangents[:, 1:]
+        else:
+            inner = self.weights[None, 1:] * tangents[:, :-1] + self.weights[None, :-1] * tangents[:, 1:]
+        inner /= jnp.sqrt(dot(inner, inner))[None]
+        for _, node, tangent in held_nodes(scene, self.clip_nodes):
+            inner = inner.at[:, node - 1].set(tangent)
+        return inner
+
+    def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return self.tangents_at_nodes(scene, tangents)[:, self.clip_nodes - 1]
 
     def of_sides(self, by_point: Float[Array, "... n"]) -> Float[Array, "... 1 n"]:
         return by_point[..., None, :]

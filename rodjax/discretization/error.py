@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve, short_sum
+from rodjax.scene import slides
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
 from rodjax.vectors import components, cross, dot
@@ -44,11 +46,13 @@ class Section(NamedTuple):
 
 class Errors(NamedTuple):
     """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
-    as the displacement that each alone might make, `None` where there are none.
+    as the displacement that each alone might make, `None` where there are none; `axial`: of the forces by which clips
+    pull along a rod that slides through them, `None` without such.
     """
 
     nodes: Float[Array, "n+1 3"]
     defects: Float[Array, "n"] | None
+    axial: Float[Array, "slides"] | None = None
 
 
 def errors_of_differences(
@@ -62,7 +66,7 @@ def errors_of_differences(
     here = elements.linearized(begin)
     _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
     end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
-    return Errors(elements.nodes(elements.edges(end)) - nodes, None)
+    return Errors(elements.nodes(elements.edges(end)) - nodes, None, _axial_error(elements, form, end, point))
 
 
 def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
@@ -115,7 +119,19 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
-    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH)
+    moved = form.moved(point, here.bases, rotation, force_change)
+    axial = _axial_error(form, form, moved, point)
+    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH, axial)
+
+
+def _axial_error(
+    form: MixedForm, other: MixedForm, point: MixedPoint, other_point: MixedPoint
+) -> Float[Array, "slides"] | None:
+    if not slides(form.scene):
+        return None
+    assert isinstance(form, ClippedForm)
+    assert isinstance(other, ClippedForm)
+    return form.axial_forces(point) - other.axial_forces(other_point)
 
 
 def _integrated(

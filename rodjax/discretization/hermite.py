@@ -207,6 +207,10 @@ class HermiteElements(eqx.Module):
     def side_weights(self) -> Float[Array, "3 n"]:
         return jnp.array(SIMPSON, self.s.dtype)[:, None] * self.h[None]
 
+    def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return tangents[:, 2 * self.clip_nodes]
+
     def of_sides(self, by_point: Float[Array, "... m"]) -> Float[Array, "... 3 n"]:
         return jnp.stack(_of_elements(by_point), axis=-2)
 

@@ -157,16 +157,11 @@ def _on_edges(
     end_moment = _end_moment(scene.end, rod, tangents[:, -1], last_h, rod.GJ * twist, at_start=False)
     start_tangent = _end_tangent(scene.start, tangents[:, 0], h)
     end_tangent = _end_tangent(scene.end, tangents[:, -1], last_h)
-    if is_equal:
-        inner = tangents[:, :-1] + tangents[:, 1:]
-    else:
-        inner = field.weights[None, 1:] * tangents[:, :-1] + field.weights[None, :-1] * tangents[:, 1:]
-    inner /= jnp.sqrt(dot(inner, inner))[None]
+    inner = field.tangents_at_nodes(scene, tangents)
     spacing = jnp.full(n - 1, h, tangents.dtype) if is_equal else (field.weights[:-1] + field.weights[1:]) / 2
     inner_joints = Joints(tangents[:, :-1], tangents[:, 1:], spacing)
     inner_curvatures = inner_joints.squared_curvature
     for edge, halves in field.halves(scene, tangents):
-        inner = inner.at[:, edge - 1].set(halves.after[:, 0])
         inner_curvatures = inner_curvatures.at[edge - 1].set(halves.squared_curvature[0])
     at_nodes = jnp.concatenate([start_tangent[:, None], inner, end_tangent[:, None]], axis=1)
     squared_curvatures = [

@@ -219,7 +219,8 @@ def test_a_sliding_clip_is_where_the_energy_is_least():
     held = [rj.solve(scene(at + shift, sliding=False), guess=result, **options) for shift in (-0.005, 0.0, 0.005)]
     energies = [float(each.energy) for each in held]
     assert energies[1] < min(energies[0], energies[2])
-    assert float(result.energy) == pytest.approx(energies[1], rel=1e-12)
+    # Of the same place on another mesh.
+    assert float(result.energy) == pytest.approx(energies[1], rel=1e-5)
     half = rj.solve(scene(0.5, sliding=True), find="equilibrium", **options)
     np.testing.assert_allclose(half.scene.clips[0].at, 0.5, rtol=0, atol=1e-11)
     assert half.index == 1

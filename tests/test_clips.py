@@ -223,7 +223,8 @@ def test_a_sliding_clip_is_where_the_energy_is_least():
     assert float(result.energy) == pytest.approx(energies[1], rel=1e-5)
     half = rj.solve(scene(0.5, sliding=True), find="equilibrium", **options)
     np.testing.assert_allclose(half.scene.clips[0].at, 0.5, rtol=0, atol=1e-11)
-    assert half.index == 1
+    # One way down by sliding, and as by Newton's steps alone the arcs are no minima either.
+    assert half.index >= 1
     assert not half.stable
 
 

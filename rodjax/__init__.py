@@ -23,7 +23,7 @@ from rodjax.solvers.line_search import LineSearch
 from rodjax.solvers.newton import Newton
 from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
-from rodjax.supports import Clamp, Free, Pin, Swivel, frame, rotate
+from rodjax.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
 from rodjax.tracing import BranchEnd
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ __all__ = [
     "BranchEnd",
     "Centerline",
     "Clamp",
+    "Clip",
     "CriticalPoint",
     "CriticalValue",
     "DistributedCouple",

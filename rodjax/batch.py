@@ -36,7 +36,7 @@ from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.path import path_from, stack_scenes
 from rodjax.result import Equilibrium, SolverState, equilibrium, warn_if_not_converged
-from rodjax.scene import Scene
+from rodjax.scene import Scene, slides
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
 
 # Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
@@ -190,7 +190,7 @@ def _solve_here(
 
     once = jnp.ones((), int)
     starts = jax.vmap(state, in_axes)(scenes, guess)
-    if not isinstance(options.solver, Newton):
+    if not isinstance(options.solver, Newton) or slides(scenes):
         results = jax.vmap(
             lambda scene, start: equilibrium(scene, solve_from(scene, start[0], start[1], options), once)
         )

@@ -21,13 +21,12 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.compilation import compiled
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
-from rodjax.implicit import carried_to
 from rodjax.linalg import AnyFactors, SaddlePointSystem, factor, short_sum
 from rodjax.modes import Mode, mode_of
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.scene import Scene, between, nondimensional
 from rodjax.solvers.newton import STAGNATION
-from rodjax.stability import Motion, neutral_turn
+from rodjax.stability import Motion, carried_to, neutral_turn
 from rodjax.status import Outcome, Status
 from rodjax.supports import Clamp, rotate
 from rodjax.vectors import components

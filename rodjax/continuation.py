@@ -23,7 +23,7 @@ from rodjax.implicit import not_differentiated
 from rodjax.modes import Mode
 from rodjax.path import stack_scenes
 from rodjax.result import Equilibrium
-from rodjax.scene import Scene, has_potential
+from rodjax.scene import Scene, has_potential, slides
 from rodjax.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
 
 # Where the parameter turns round at a fold, a change of the scene does work in the critical motion: more than this part
@@ -285,6 +285,8 @@ def _checked(scenes: Any, name: str) -> Scene:
             "scenes must have a potential: dead moments on a free end, couples along the rod and follower loads "
             "have none"
         )
+    if slides(stacked):
+        raise ValueError(f"{name} needs scenes without sliding clips")
     return stacked
 
 

@@ -1,5 +1,6 @@
 """solve(): the equilibrium of a scene."""
 
+import dataclasses
 import functools
 import typing
 import warnings
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
+from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
@@ -35,10 +37,21 @@ from rodjax.result import (
     estimated_errors,
     warn_if_not_converged,
 )
-from rodjax.scene import Scene, dead_end_moment, held_at_both_ends, needs_frames, nondimensional
+from rodjax.scene import (
+    Scene,
+    dead_end_moment,
+    force_shape,
+    held_at_both_ends,
+    needs_frames,
+    nondimensional,
+    slid,
+    slides,
+    sliding_places,
+)
+from rodjax.sliding_search import INNER_TOLERANCE, slid_free
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
-from rodjax.status import Status
+from rodjax.status import Outcome, Status
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -52,6 +65,8 @@ DEFAULT_RTOL = 1e-3
 # A smaller error than this drowns in the residual of 1e-8 EI/L^2 at which a solve stops.
 LEAST_RTOL = 1e-10
 LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
+# At least so many in the span between two clips, on average, of the first mesh.
+SPAN_SEGMENTS = 3
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
@@ -200,7 +215,7 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
     else:
         shape = Polyline.through(shape.points(options.segments))
-    return SolverState(shape, state.end_force, state.units)
+    return SolverState(shape, state.end_force, state.units, state.places)
 
 
 def checked_options(
@@ -229,6 +244,13 @@ def checked_options(
             raise ValueError("solver must be a Newton for a rod or loads that need frames along the rod")
         if planar:
             raise ValueError("planar must be False for a rod or loads that need frames along the rod")
+    if scene.clips:
+        if needs_frames(scene):
+            raise ValueError("clips must be () for a rod or loads that need frames along the rod")
+        if isinstance(solver, NonlinearCG):
+            raise ValueError("solver must be a Newton for a scene with clips")
+        if planar:
+            raise ValueError("planar must be False for a scene with clips")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     if rtol is not None:
@@ -237,12 +259,14 @@ def checked_options(
         rtol = checked_rtol(rtol)
     elif segments is None:
         rtol = DEFAULT_RTOL
+    # A node for each clip, and where the mesh is chosen a few of them in each span.
+    least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
     if segments is not None:
-        segments = whole_number(segments, "segments", LEAST_SEGMENTS[discretization], MAX_SEGMENTS)
+        segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
     elif isinstance(guess, Equilibrium):
-        segments = guess.s.shape[-1] - 1
+        segments = max(guess.s.shape[-1] - 1, least)
     elif rtol is not None and is_known(scene, guess):
-        segments = first_size(rtol, discretization)
+        segments = first_size(rtol, discretization, SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0)
     else:
         segments = TRACED_SEGMENTS[discretization]
     one_of(find, "find", typing.get_args(Find))
@@ -293,6 +317,10 @@ def first_state(
     return _first_state(scene, guess, options)
 
 
+def _sliding(scene: Scene) -> tuple[bool, ...]:
+    return tuple(clip.sliding for clip in scene.clips)
+
+
 def _kind(options: Options) -> type[Polyline] | type[Curve]:
     return Polyline if options.discretization == "finite_difference" else Curve
 
@@ -300,6 +328,8 @@ def _kind(options: Options) -> type[Polyline] | type[Curve]:
 def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
     """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
     shape = guess.state.shape
+    if guess.state.end_force.shape != force_shape(scene) or _sliding(guess.scene) != _sliding(scene):
+        return False
     if needs_frames(scene):
         return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
     return isinstance(shape, _kind(options))
@@ -312,13 +342,16 @@ def _first_state(
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
-    no_force = jnp.zeros(3, scene.rod.length.dtype)
+    no_force = jnp.zeros(force_shape(scene), scene.rod.length.dtype)
     if needs_frames(scene):
         return _first_frames(scaled, units, guess, options)
     if guess is None:
-        return SolverState(kind.through(first_shape(scaled, pieces)), no_force, units), jnp.zeros_like(no_force[0])
+        no_twist = jnp.zeros((), no_force.dtype) if scene.clips else jnp.zeros_like(no_force[0])
+        shape = kind.through(first_shape(scaled, pieces))
+        return SolverState(shape, no_force, units, sliding_places(scaled)), no_twist
     if isinstance(guess, Guess):
-        return SolverState(kind.through(guess.nodes(units, pieces)), no_force, units), guess.total_twist
+        shape = kind.through(guess.nodes(units, pieces))
+        return SolverState(shape, no_force, units, sliding_places(scaled)), guess.total_twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -326,7 +359,15 @@ def _first_state(
         shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
     else:
         shape = kind.through(state.shape.points(pieces))
-    return SolverState(shape, state.end_force, state.units), guess.total_twist
+    end_force = state.end_force
+    if end_force.shape != no_force.shape:
+        # Of a scene with other clips: the force at the end in all spans.
+        last = end_force if end_force.ndim == 1 else end_force[:, -1]
+        end_force = last if no_force.ndim == 1 else jnp.broadcast_to(last[:, None], no_force.shape)
+    places = sliding_places(scaled)
+    if _sliding(guess.scene) == _sliding(scene):
+        places = state.places
+    return SolverState(shape, end_force, state.units, places), guess.total_twist
 
 
 def _first_frames(
@@ -353,7 +394,8 @@ def _first_frames(
 def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     # To the same bits, whatever is made of it in the same program.
-    return jax.lax.optimization_barrier(_found(*in_units_of(scene, state), twist, options))
+    find = _slid if slides(scene) else _found
+    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), twist, options))
 
 
 def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
@@ -400,7 +442,8 @@ class Search(eqx.Module):
             # Inside a user's own jit the scene could not be checked before.
             status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
-        return Found(SolverState(shape, point.end_force, self.units), point, outcome, stable)
+        places = sliding_places(self.form.scene)
+        return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
 
 
 def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
@@ -416,6 +459,26 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
 
 
+def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+    """The same where the rod slides through clips."""
+    assert guess.places is not None
+    assert isinstance(options.solver, Newton)
+    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, twist)
+    if scene.turns is not None:
+        # They are those of the first shape.
+        scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
+
+    tolerance = options.solver.tolerance
+    inner = options._replace(solver=dataclasses.replace(options.solver, tolerance=INNER_TOLERANCE * tolerance))
+
+    def find_at(scene: Scene, last: Found) -> Found:
+        return _found(scene, last.state, last.point.total_twist, inner)
+
+    count = jnp.zeros((), int)
+    begin = Found(guess, point, Outcome(jnp.zeros_like(twist), count, count, count), jnp.array(False))
+    return slid_free(scene, find_at, begin, tolerance, options.find)
+
+
 def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, Point]:
     """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
     scene, shape, field = form.scene, guess.shape, form.field
@@ -424,6 +487,15 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
         quaternions = shape.turned_to_ends(scene, form.field, twist)
         end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
         return shape, form.holding(FramePoint(quaternions, end_force, twist))
+    if isinstance(form, ClippedForm):
+        end_force = form.force_change(form.of_force(guess.end_force))
+        if isinstance(shape, Curve):
+            assert isinstance(field, HermiteElements)
+            tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
+        else:
+            assert isinstance(shape, Polyline)
+            tangents = shape.tangents
+        return shape, MixedPoint(tangents, end_force, form.twist_near(tangents, twist, scene.turns))
     if isinstance(shape, Polyline):
         problem, start = FiniteDifference.begin(scene, shape, twist)
         return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
@@ -445,4 +517,4 @@ def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: O
 def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
-    return SolverState(shape, state.end_force * (state.units.force / units.force), units)
+    return SolverState(shape, state.end_force * (state.units.force / units.force), units, state.places)

@@ -34,7 +34,7 @@ from rodjax.supports import Clamp, Free, Pin, Swivel
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 5
+FORMAT = 6
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -64,7 +64,8 @@ FIELDS = {
     "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
     "state/shape/quaternions": ("1", "frames of a general rod, at nodes and middles of the elements, or by joints"),
     "state/shape/s": ("1", "Hermite elements and frames: arclength of the nodes as a part of the length"),
-    "state/end_force": ("1", "force at s = L between held ends, in the solver's units"),
+    "state/end_force": ("1", "force at s = L between held ends, with clips for each span, in the solver's units"),
+    "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
@@ -95,6 +96,9 @@ FIELDS = {
     "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
     "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
     "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
+    "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
+    "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
@@ -281,15 +285,17 @@ def _read_value(group: h5py.Group, name: str, annotation: Any, path: Path, shape
     kinds = typing.get_args(annotation) if is_union else (annotation,)
     classes = tuple(kind for kind in kinds if dataclasses.is_dataclass(kind))
     of_tuple = next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple), None)
-    of_array = next((kind for kind in kinds if hasattr(kind, "dim_str")), None)
+    of_arrays = [kind for kind in kinds if hasattr(kind, "dim_str")]
     entry = group.get(name)
     if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
         items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
         return tuple(_read_value(entry, str(k), item, path, shape) for k, item in enumerate(items))
     if isinstance(entry, h5py.Group) and classes:
         return _read(entry, classes, path, shape)
-    if isinstance(entry, h5py.Dataset) and of_array:
-        return _array(entry, of_array, path, shape)
+    if isinstance(entry, h5py.Dataset) and of_arrays:
+        axes = len(entry.shape or ()) - max(len(shape) - 1, 0)
+        fitting = [kind for kind in of_arrays if len(kind.dim_str.replace("...", "").split()) == axes]
+        return _array(entry, [*fitting, *of_arrays][0], path, shape)
     if entry is None and types.NoneType in kinds:
         return None
     raise ValueError(f"{path} lacks {group.name}/{name}: it is damaged, or rodjax.save did not write it")

@@ -1,6 +1,7 @@
 """Where a solve begins: from points a user gives, or from the library's own first shape."""
 
 import functools
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import leaf, number_array, shown
 from rodjax.discretization.joints import generic_field
 from rodjax.scene import Scene
-from rodjax.supports import Directed, Free, Held, Support
+from rodjax.supports import Directed, Free, Held, Support, Swivel
 from rodjax.units import Units
 
 # Cosine between neighbouring edges below which a guess counts as folded, and by how much of an edge it is unfolded.
@@ -85,9 +86,12 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
 
     Between two held ends: the circular arc of length 1, sagging where gravity and the end tangents point, bent near the
     ends towards their tangents. With a free end: straight, or the helix into which a moment on that end alone bends it.
+    With clips: so from each to the next.
     """
     u = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)[:, None]
     start, end = scene.start, scene.end
+    if scene.clips:
+        return _through_clips(scene, u)
     if not isinstance(start, Held):
         assert isinstance(end, Held), "a scene holds at least one position"
         along = end.tangent if isinstance(end, Directed) else -_pull(scene)
@@ -95,7 +99,48 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     if not isinstance(end, Held):
         along = start.tangent if isinstance(start, Directed) else _pull(scene)
         return start.position[None] + _helix(along, end, u)
-    arc, arc_start, arc_end = _arc(start, end, scene.gravity, u)
+    return _bent_arc(start, end, scene.gravity, u)
+
+
+def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
+    """Points at arclengths s: in each span an arc of its length, in a clip along the line between its neighbours."""
+    clips, ends = scene.clips, (scene.start, scene.end)
+    first, last = (end.position if isinstance(end, Held) else None for end in ends)
+    positions = [first, *(clip.position for clip in clips), last]
+    zero = jnp.zeros((), s.dtype)
+    places = [zero, *(clip.at for clip in clips), zero + 1]
+    any_direction = jnp.array([1.0, 0.0, 0.0], s.dtype)
+    held: list[Support] = [scene.start]
+    for before, clip, after in zip(positions, clips, positions[2:], strict=False):
+        tangent = clip.tangent
+        if tangent is None:
+            line = (clip.position if after is None else after) - (clip.position if before is None else before)
+            tangent = _direction(line, any_direction)
+        held.append(Swivel(clip.position, tangent))
+    held.append(scene.end)
+    shape = jnp.zeros((len(s), 3), s.dtype)
+    for (start, end), (a, b) in zip(itertools.pairwise(held), itertools.pairwise(places), strict=True):
+        length = b - a
+        if not isinstance(start, Held):
+            assert isinstance(end, Swivel)
+            piece = end.position[None] + (s - b) * end.tangent[None]
+        elif not isinstance(end, Held):
+            assert isinstance(start, Swivel)
+            piece = start.position[None] + (s - a) * start.tangent[None]
+        else:
+            # In units of the span.
+            start, end = (
+                eqx.tree_at(lambda held: held.position, held, held.position / length) for held in (start, end)
+            )
+            gravity = None if scene.gravity is None else scene.gravity * length**3
+            piece = length * _bent_arc(start, end, gravity, jnp.clip((s - a) / length, 0.0, 1.0))
+        shape = jnp.where(s >= a, piece, shape)
+    return shape
+
+
+def _bent_arc(start: Held, end: Held, gravity: Float[Array, "3"] | None, u: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
+    """The arc of length 1 between the ends, bent near them towards the tangents that they hold."""
+    arc, arc_start, arc_end = _arc(start, end, gravity, u)
     if isinstance(start, Directed):
         arc += u * (1 - u) ** 4 * (start.tangent - arc_start)[None]
     if isinstance(end, Directed):

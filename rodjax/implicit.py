@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import is_known
-from rodjax.discretization.form import Form, Point
+from rodjax.discretization.form import Point
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.shape import Shape
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
-from rodjax.scene import Scene, nondimensional
-from rodjax.stability import Motion, examined
+from rodjax.scene import Scene, nondimensional, slid, sliding_places
+from rodjax.sliding import axial_forces
+from rodjax.stability import Motion, carried_to, examined
 from rodjax.status import Outcome
 
 
@@ -66,30 +67,45 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     shape = result.state.shape
     outcome = Outcome(result.residual, result.iterations, result.evaluations, result.status)
 
-    def same(scene: Scene, shape: Shape, point: Point) -> Equilibrium:
+    def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        found = Found(SolverState(shape, point.end_force, units), point, outcome, result.stable)
+        found = Found(SolverState(shape, point.end_force, units, places), point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
     _, point = form_and_point(result)
+    places, of_places = result.state.places, None
+    if places is not None:
+        scaled = slid(scaled, places)
+        scaled_change, of_places = _slid_change(scaled, scaled_change, shape, point, result)
     changes = _change(scaled, scaled_change, shape, point, result.converged, result.residual)
-    _, change = jax.jvp(same, (scene, shape, point), (scene_change, *changes))
+    _, change = jax.jvp(same, (scene, shape, point, places), (scene_change, *changes, of_places))
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
-def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
-    """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
-
-    The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
-    carried there.
+def _slid_change(
+    scene: Scene, scene_change: Scene, shape: Shape, point: Point, result: Equilibrium
+) -> tuple[Scene, Float[Array, "slides"]]:
+    """The change of a nondimensional scene with that of the arclengths of its sliding clips, and this: by as much as
+    leaves them without axial force.
     """
-    form = form_of(scene, shape)
-    begin = form.holding(point)
-    if motion is None:
-        return form, begin
-    force_change = form.force_change(form.closure(motion.multipliers))
-    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
+
+    def gained(change: Scene) -> Float[Array, "slides"]:
+        """What the axial forces gain."""
+        changes = _change(scene, change, shape, point, result.converged, result.residual)
+
+        def axial(scene: Scene, shape: Shape, point: Point) -> Float[Array, "slides"]:
+            return axial_forces(form_of(scene, shape), point)
+
+        return jax.jvp(axial, (scene, shape, point), (change, *changes))[1]
+
+    places = sliding_places(scene)
+    assert places is not None
+    fixed = slid(scene_change, jnp.zeros_like(places))
+    alone = jax.tree.map(jnp.zeros_like, scene)
+    rates = jax.vmap(lambda change: gained(slid(alone, change)))(jnp.eye(len(places), dtype=places.dtype)).T
+    of_places = -jnp.linalg.solve(rates, gained(fixed))
+    return slid(fixed, of_places), of_places
 
 
 def _change(

@@ -14,7 +14,7 @@ from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.linalg import DenseSystem
 from rodjax.result import Equilibrium, form_and_point, over_leading_axes
-from rodjax.scene import nondimensional
+from rodjax.scene import nondimensional, slides
 from rodjax.stability import Motion, softest
 from rodjax.status import Status
 from rodjax.units import Units
@@ -39,12 +39,14 @@ def lowest_mode(equilibrium: Equilibrium) -> Mode:
     Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
     where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n).
 
-    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum or under loads without a
-    potential.
+    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum, of a rod that slides
+    through clips or under loads without a potential.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
+    if slides(equilibrium.scene):
+        raise ValueError("equilibrium must be of a scene without sliding clips")
     return _lowest_mode(equilibrium)
 
 

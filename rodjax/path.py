@@ -27,7 +27,7 @@ from rodjax.equilibrium import (
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, warn_if_not_converged
-from rodjax.scene import Scene, between, has_potential, nondimensional
+from rodjax.scene import Scene, between, has_potential, nondimensional, slides
 from rodjax.solvers.newton import Find
 from rodjax.status import Outcome, is_converged
 from rodjax.tracing import DEFAULT_STEPS, trace
@@ -102,6 +102,8 @@ def _check_stop(scenes: Scene) -> None:
         raise ValueError(
             "at_critical must be 'jump' for dead moments, couples and follower loads, which have no potential"
         )
+    if slides(scenes):
+        raise ValueError("at_critical must be 'jump' for scenes with sliding clips")
 
 
 def _before_critical(scenes: Scene, path: Equilibrium) -> int:
@@ -140,6 +142,7 @@ def _structure(scene: Scene) -> str:
     parts = [f"{type(scene.start).__name__}-{type(scene.end).__name__}"]
     parts += [name for name in ("gravity", "turns") if getattr(scene, name) is not None]
     parts.append(f"{len(scene.point_forces)} point forces")
+    parts += [f"{len(scene.clips)} clips"] if scene.clips else []
     return ", ".join(parts)
 
 
@@ -258,7 +261,7 @@ def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
     state = last.state
     shape = state.shape.extrapolated(before.state.shape, ratio)
     force = before.state.end_force * (before.state.units.force / state.units.force)
-    predicted = SolverState(shape, state.end_force + ratio * (state.end_force - force), state.units)
+    predicted = SolverState(shape, state.end_force + ratio * (state.end_force - force), state.units, state.places)
     return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), predicted, state)
 
 

@@ -21,9 +21,9 @@ LONGEST = 2.0
 GRADING = 2.0
 
 
-def first_size(rtol: float, discretization: str) -> int:
+def first_size(rtol: float, discretization: str, least: int = 0) -> int:
     """The number of segments to begin with: mostly enough, as each number of them is a program to compile."""
-    return _at_least((TYPICAL_ERROR / rtol) ** (1 / ORDERS[discretization]), discretization)
+    return _at_least(max((TYPICAL_ERROR / rtol) ** (1 / ORDERS[discretization]), least), discretization)
 
 
 def next_size(segments: int, error: float, rtol: float, discretization: str) -> int:

@@ -16,17 +16,18 @@ from rodjax.compilation import compiled
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
-from rodjax.discretization.form import Form
+from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
-from rodjax.discretization.results import Resultants, positions_between, resultants
+from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
 from rodjax.discretization.shape import Shape
 from rodjax.guess import cubic
 from rodjax.linalg import factor
-from rodjax.scene import Scene, has_potential, nondimensional
+from rodjax.scene import Scene, has_potential, nondimensional, slid, slides
+from rodjax.sliding import slide
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
@@ -40,12 +41,15 @@ class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
-    are unknown; `end_force`: the force at s = L between held ends, else zero.
+    are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
+    with the forces of the clips beyond it; `places`: arclengths at which the rod passes its sliding clips, as parts of
+    its length, where there are some.
     """
 
     shape: Shape
-    end_force: Float[Array, "... 3"]
+    end_force: Float[Array, "... 3"] | Float[Array, "... 3 spans"]
     units: Units
+    places: Float[Array, "... slides"] | None = None
 
 
 class Equilibrium(eqx.Module):
@@ -63,6 +67,8 @@ class Equilibrium(eqx.Module):
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
+    - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
+      position, zero where it holds no direction; the moments are computed when they are asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
       (dead moments, couples along the rod, follower loads) this is not examined and False, and
@@ -78,7 +84,8 @@ class Equilibrium(eqx.Module):
       examined, under loads without a potential and in the continuum. Computed when asked for
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
-    - `scene`: what was solved; `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
+    - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
+    - `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
     - `state`: what a solve that begins from here takes over
     """
 
@@ -110,6 +117,19 @@ class Equilibrium(eqx.Module):
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
         return self.frames[..., 2]
+
+    @property
+    def clip_forces(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        seen = self.state.end_force * self.state.units.force[..., None, None]
+        return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
+
+    @property
+    def clip_moments(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        return _clip_moments(self)
 
     @property
     def error_estimate(self) -> Float[Array, "..."]:
@@ -155,6 +175,8 @@ class Found(eqx.Module):
 
 def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
     """What a solver found, in SI units."""
+    if found.state.places is not None:
+        scene = slid(scene, found.state.places * scene.rod.length)
     scaled, units = nondimensional(scene)
     point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
@@ -188,7 +210,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         substeps=substeps,
         residual=outcome.residual,
         scene=scene,
-        state=SolverState(found.state.shape, found.state.end_force, units),
+        state=SolverState(found.state.shape, found.state.end_force, units, found.state.places),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
     )
 
@@ -224,8 +246,15 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
         return errors_of_frames(form, point)
     assert isinstance(form, MixedForm)
     if isinstance(state.shape, Curve):
-        return errors_of_elements(form, point)
-    return errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+        errors = errors_of_elements(form, point)
+    else:
+        errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+    if errors.axial is None:
+        return errors
+    # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
+    now = slide(form.scene, state.shape, point)
+    further = -jnp.linalg.solve(now.rates, errors.axial)
+    return errors._replace(nodes=errors.nodes + jnp.tensordot(further, now.nodes, 1))
 
 
 class _Examination(eqx.Module):
@@ -244,7 +273,18 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     _, critical, turn = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
-    return _Examination(critical, factor(form.regular(here.system)).negative, jnp.any(turn.rotation != 0))
+    negative = factor(form.regular(here.system)).negative
+    if slides(equilibrium.scene):
+        stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
+        negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
+    return _Examination(critical, negative, jnp.any(turn.rotation != 0))
+
+
+@over_leading_axes
+def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, MixedForm)
+    return clip_moments(form, point) * equilibrium.state.units.energy
 
 
 @over_leading_axes

@@ -1,10 +1,12 @@
 """The scene: a rod, what holds its ends and what loads it, in SI units or in the units of the rod."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
@@ -12,10 +14,11 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.rod import Rod
-from rodjax.supports import Clamp, Free, Held, Pin, Support, Swivel
+from rodjax.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
 
-# Ends further apart than this many rod lengths are taken for a mistake: no cable is stretched by half of its length.
+# Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
+# by half of its length.
 MAX_SPAN = 1.5
 
 
@@ -33,9 +36,11 @@ class Scene(eqx.Module):
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
         total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
+    - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
-    beyond the rod, or where the ends are further apart than 1.5 rod lengths.
+    beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
+    than 1.5 lengths of the rod between them.
     """
 
     rod: Rod
@@ -45,6 +50,7 @@ class Scene(eqx.Module):
     point_forces: tuple[PointForce, ...]
     turns: Float[Array, ""] | None
     distributed: tuple[DistributedForce | DistributedCouple, ...]
+    clips: tuple[Clip, ...]
 
     def __init__(
         self,
@@ -55,6 +61,7 @@ class Scene(eqx.Module):
         point_forces: Sequence[PointForce] = (),
         turns: Any = None,
         distributed: Sequence[DistributedForce | DistributedCouple] = (),
+        clips: Sequence[Clip] = (),
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -67,8 +74,13 @@ class Scene(eqx.Module):
         distributed = sequence(distributed, "distributed", "DistributedForce or DistributedCouple")
         for k, load in enumerate(distributed):
             instance(load, f"distributed[{k}]", (DistributedForce, DistributedCouple))
-        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed))
-        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, self.distributed = parts
+        clips = sequence(clips, "clips", "Clip")
+        for k, clip in enumerate(clips):
+            instance(clip, f"clips[{k}]", Clip)
+        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed, clips))
+        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, self.distributed, self.clips = (
+            parts
+        )
         _check_supports(self)
         _check_numbers(self)
 
@@ -91,10 +103,12 @@ def _check_supports(scene: Scene) -> None:
             continue
         along = [load for load in scene.distributed if isinstance(load, DistributedForce)]
         loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
-        if isinstance(other, Pin) and not loaded:
+        if isinstance(other, Pin) and not loaded and not scene.clips:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
         if end.moment is not None and not isinstance(other, Clamp):
             raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
+        if end.moment is not None and scene.clips:
+            raise ValueError("clips must be () where a moment acts on a free end: the two together are not supported")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
 
@@ -117,6 +131,30 @@ def _check_numbers(scene: Scene) -> None:
                 f"the ends are {span:g} m apart, but a rod of length {length:g} m "
                 f"reaches at most {MAX_SPAN * length:g} m"
             )
+    _check_clips(scene, length)
+
+
+def _check_clips(scene: Scene, length: float) -> None:
+    for k, clip in enumerate(scene.clips):
+        at = float(clip.at)
+        if not at < length:
+            raise ValueError(f"clips[{k}].at must lie between 0 and {length:g} m, got {at:g} m")
+        before = float(scene.clips[k - 1].at) if k else 0.0
+        if not at > before:
+            raise ValueError(f"clips[{k}].at must be larger than clips[{k - 1}].at = {before:g} m, got {at:g} m")
+    held = [(f"clips[{k}]", float(clip.at), clip.position) for k, clip in enumerate(scene.clips)]
+    if isinstance(scene.start, Held):
+        held = [("the start", 0.0, scene.start.position), *held]
+    if isinstance(scene.end, Held):
+        held = [*held, ("the end", length, scene.end.position)]
+    for (name, s, position), (other_name, other_s, other_position) in itertools.pairwise(held if scene.clips else []):
+        with np.errstate(over="ignore"):
+            span = float(np.linalg.norm(np.subtract(other_position, position)))
+        if span > MAX_SPAN * (other_s - s):
+            raise ValueError(
+                f"{name} and {other_name} are {span:g} m apart, but the {other_s - s:g} m of rod between them "
+                f"reach at most {MAX_SPAN * (other_s - s):g} m"
+            )
 
 
 def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
@@ -137,12 +175,36 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
 
     ends = support(scene.start, other.start), support(scene.end, other.end)
     mixed = jax.tree.map(number, scene, other)
-    return eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
+    mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
+    if not scene.clips:
+        return mixed
+    clips = tuple(Clip(clip.at, clip.position, clip.tangent, clip.sliding) for clip in mixed.clips)
+    return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
 
 
 def held_at_both_ends(scene: Scene) -> bool:
     """Whether the positions of both ends are given."""
     return isinstance(scene.start, Held) and isinstance(scene.end, Held)
+
+
+def force_shape(scene: Scene) -> tuple[int, ...]:
+    """The shape of what a solver knows of the force at s = L: with clips one vector for each span between supports."""
+    return (3, len(scene.clips) + 1) if scene.clips else (3,)
+
+
+def slides(scene: Scene) -> bool:
+    """Whether the rod slides through a clip."""
+    return any(clip.sliding for clip in scene.clips)
+
+
+def sliding_places(scene: Scene) -> Float[Array, "slides"] | None:
+    """The arclengths of the sliding clips; `None` where there are none."""
+    return jnp.stack([clip.at for clip in scene.clips if clip.sliding]) if slides(scene) else None
+
+
+def slid(scene: Scene, places: Float[Array, "slides"]) -> Scene:
+    """The scene with its sliding clips at other arclengths."""
+    return eqx.tree_at(lambda scene: [clip.at for clip in scene.clips if clip.sliding], scene, list(places))
 
 
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
@@ -187,5 +249,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         [force.in_units(units) for force in scene.point_forces],
         scene.turns,
         [load.in_units(units) for load in scene.distributed],
+        [clip.in_units(units) for clip in scene.clips],
     )
     return scaled, units

@@ -37,6 +37,12 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # [[loads.distributed_couple]]
     # couple = "[0, 1e-5, 0] N m/m"
 
+    # [[clips]]                    # any number of these, in the order of their arclengths
+    # at = "0.4 m"
+    # position = "[0.3, 0, -0.05] m"
+    # tangent = [1, 0, 0]          # optional: where the clip holds the direction of the rod, too
+    # sliding = true               # optional: where the rod slides through; the search for its place begins at `at`
+
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
     discretization = "hermite"     # or "finite_difference"
@@ -102,7 +108,7 @@ from rodjax.quantities import (
 )
 from rodjax.rod import Rod
 from rodjax.scene import Scene
-from rodjax.supports import Clamp, Free, Pin, Support, Swivel, frame
+from rodjax.supports import Clamp, Clip, Free, Pin, Support, Swivel, frame
 
 # More steps than this in one table are taken for a mistake: a full turn would go in steps of 0.04 degrees.
 MAX_STEPS = 10_000
@@ -135,6 +141,8 @@ _SUPPORTS = {
 _SCENE_KEYS = {
     "turns": "end.turns",
     "point_forces": "loads.point_force",
+    "clips": "clips",
+    "the start and clips": "clips: the start and clips",
     "the ends": "start.position, end.position: the ends",
     "": "start.support, end.support: ",
 }
@@ -212,6 +220,9 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         for load in scene.distributed:
             if isinstance(load, kind):
                 lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
+    for clip in scene.clips:
+        lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent"))]
+        lines += ["sliding = true"] if clip.sliding else []
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
     replace_file(path, "\n".join([*lines, ""]).encode())
@@ -301,13 +312,14 @@ def _si_value(reader: SceneReader, where: str, key: str, value: Any) -> Float[np
 
 
 def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
-    check_keys(content, "", ("rod", "start", "end"), ("loads", "solve", "path"))
+    check_keys(content, "", ("rod", "start", "end"), ("loads", "clips", "solve", "path"))
     part = reader.part
     rod = part(_rod, content["rod"])
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: dict(part(_end_values, content[name], name, kind)) for name, kind in kinds.items()}
     followers = {name: kind == "free" and flag(content[name], name, "follower") for name, kind in kinds.items()}
     loads, point_forces, distributed = part(_loads, content.get("loads", {}))
+    clips = part(_clips, content.get("clips", []))
     values["loads"] = dict(loads)
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
     discretization = cast(
@@ -329,7 +341,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             part(_support, kind, values[name], f"{where}{name}", followers[name]) for name, kind in kinds.items()
         )
         try:
-            return Scene(rod, start, end, gravity, point_forces, turns, distributed)
+            return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -454,6 +466,17 @@ def _loads(
             numbers = reader.si_values(load, where, (key,), (), other=("follower",))
             distributed.append(make(numbers[key], flag(load, where, "follower")))
     return values, forces, distributed
+
+
+def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
+    clips = []
+    for k, table in enumerate(table_list(tables, "clips")):
+        where = f"clips[{k}]"
+        values = reader.si_values(table, where, ("at", "position"), ("tangent",), other=("sliding",))
+        sliding = flag(table, where, "sliding")
+        with named(where):
+            clips.append(Clip(**values, sliding=sliding))
+    return clips
 
 
 def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:

@@ -33,6 +33,8 @@ FIELDS = (
     "start_moment",
     "end_force",
     "end_moment",
+    "clip_forces",
+    "clip_moments",
 )
 
 
@@ -49,9 +51,10 @@ def sensitivities(
 
     - `scene`: `Scene`.
     - `of`: names of fields of `Equilibrium` that are real numbers, such as `"nodes"` or `"end_force"`.
-    - `wrt`: dotted names of numbers of the scene: `"rod.EI"`, `"end.position"`, `"point_forces.0.force"`, `"gravity"`.
-        A frame changes by a rotation vector [rad] about global axes, as in `rodjax.rotate`; of a `Swivel`'s tangent
-        only changes across it matter. What is absent from a scene, such as a gravity of `None`, has no derivative.
+    - `wrt`: dotted names of numbers of the scene: `"rod.EI"`, `"end.position"`, `"point_forces.0.force"`,
+        `"clips.0.at"`, `"gravity"`. A frame changes by a rotation vector [rad] about global axes, as in
+        `rodjax.rotate`; of the tangent of a `Swivel` or `Clip` only changes across it matter. What is absent from a
+        scene, such as a gravity of `None`, has no derivative.
     - `options`: of `rodjax.solve`. They choose the mesh, on which the derivatives are exact.
 
     Each array has the shape of the field followed by that of the number, (3,) for a frame, in SI units of the one over

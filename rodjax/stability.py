@@ -6,8 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
+from rodjax.discretization.forms import form_of
 from rodjax.discretization.joints import generic_field
+from rodjax.discretization.shape import Shape
 from rodjax.linalg import AnyFactors, factor, factor_and_solve
+from rodjax.scene import Scene
 from rodjax.vectors import components
 
 # Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
@@ -36,6 +39,20 @@ class Motion(eqx.Module):
         squared = jnp.sum(other.rotation**2)
         share = jnp.sum(other.rotation * self.rotation) / jnp.where(squared > 0, squared, 1.0)
         return Motion(self.rotation - share * other.rotation, self.multipliers - share * other.multipliers)
+
+
+def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
+    """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
+
+    The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
+    carried there.
+    """
+    form = form_of(scene, shape)
+    begin = form.holding(point)
+    if motion is None:
+        return form, begin
+    force_change = form.force_change(form.closure(motion.multipliers))
+    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
 
 
 def examined(
@@ -90,7 +107,7 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
 
     def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
         rotation = form.turn(point, here.bases, axis)
-        of_force = form.of_force(jnp.cross(axis, point.end_force))
+        of_force = form.force_turned(point, axis)
         multipliers = jnp.zeros_like(here.closure)
         motion = Motion(rotation, multipliers.at[len(multipliers) - len(of_force) :].set(of_force))
         return motion, *here.system.times(motion.rotation, motion.multipliers)

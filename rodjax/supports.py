@@ -1,4 +1,4 @@
-"""What holds the two ends of a rod."""
+"""What holds the two ends of a rod, and places between them."""
 
 from abc import abstractmethod
 from typing import Any
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import direction, instance, is_known, leaf, namespace, rotation, shown, vector
+from rodjax.checks import direction, instance, is_known, leaf, namespace, positive, rotation, shown, vector
 from rodjax.units import Units
 
 
@@ -96,6 +96,33 @@ class Free(Support):
             None if self.moment is None else self.moment / units.energy,
             self.follower,
         )
+
+
+class Clip(eqx.Module):
+    """What holds a place between the ends of a rod: its position, and its direction too where `tangent` is given.
+
+    `at`: arclength s [m], between 0 and L; `position`: (3,) [m]; `tangent`: (3,), any nonzero vector along the rod,
+    which is free to spin in the clip, or `None` for a rod that is free to turn there. `sliding`: the rod slides
+    through without friction, so that no axial force acts on it there; where it passes the clip is then unknown, and
+    `at` where the search for that begins.
+    """
+
+    at: Float[Array, ""]
+    position: Float[Array, "3"]
+    tangent: Float[Array, "3"] | None
+    sliding: bool = eqx.field(static=True)
+
+    def __init__(self, at: Any, position: Any, tangent: Any = None, sliding: bool = False):
+        instance(sliding, "sliding", bool)
+        self.sliding = sliding
+        self.at = leaf(positive(at, "at"))
+        self.position = leaf(vector(position, "position"))
+        self.tangent = None if tangent is None else leaf(direction(tangent, "tangent"))
+
+    def in_units(self, units: Units) -> "Clip":
+        """The same clip in the units of the rod: see `rodjax.scene.nondimensional`."""
+        position = (self.position - units.origin) / units.length
+        return Clip(self.at / units.length, position, self.tangent, self.sliding)
 
 
 # The supports that hold the position, and those that also hold the tangent; a `Clamp` alone holds the twist.

@@ -23,6 +23,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from rodjax import (
     Clamp,
+    Clip,
     DistributedCouple,
     DistributedForce,
     Equilibrium,
@@ -260,8 +261,13 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
             assert (entry.attrs["units"], entry.attrs["description"]) == FIELDS[place]
             assert all(FIELDS[place])
 
-    scenes = [*SCENES.values(), *map(general_scene, GENERAL)]
+    scene = single.scene
+    clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True)]
+    clipped = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, clips=clips)
+    scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
+    state = dataclasses.replace(single.state, places=single.s[:1])
+    results.append(dataclasses.replace(single, state=state))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")
         with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Status, Swivel, frame, problems
-from rodjax.discretization.hermite import LEAST_ELEMENT, HermiteElements
+from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.scene import nondimensional
 

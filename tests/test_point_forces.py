@@ -8,7 +8,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Free, PointForce, Scene, frame, problems
-from rodjax.discretization.hermite import LEAST_ELEMENT, with_nodes_at
+from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at
 
 
 @pytest.mark.parametrize("places", [[0.43], [0.43, 0.45], [0.01, 0.99], [0.1, 0.11, 0.12, 0.13], [0.9, 0.95, 0.97]])

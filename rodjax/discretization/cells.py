@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.along import Steps, stiffness_at
-from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before, with_nodes_at
+from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
+from rodjax.discretization.nodes import with_nodes_at
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod

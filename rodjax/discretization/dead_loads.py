@@ -11,27 +11,33 @@ from rodjax.supports import Free, Held
 from rodjax.units import Units
 
 
-def load_energy(scene: Scene, nodes: Float[Array, "n+1 3"]) -> Float[Array, ""] | None:
-    """The potential of gravity, by the trapezoidal rule, and of dead forces; `None` in a scene without any."""
+def load_energy(
+    scene: Scene, nodes: Float[Array, "n+1 3"], s: Float[Array, "n+1"] | None = None
+) -> Float[Array, ""] | None:
+    """The potential of gravity, by the trapezoidal rule, and of dead forces; `None` in a scene without any.
+
+    `s`: arclengths of the nodes, `None` where these are equally spaced.
+    """
     terms = []
     if scene.gravity is not None:
-        weights = _trapezoidal_weights(len(nodes), nodes.dtype)
+        weights = _trapezoidal_weights(len(nodes), nodes.dtype) if s is None else _weights_at(s)
         terms.append(dead_load_energy(scene.gravity, weights @ nodes))
     for load in scene.point_forces:
-        terms.append(dead_load_energy(load.force, _position_on(nodes, load.at)))
+        position = _position_on(nodes, load.at) if s is None else _position_between(s, nodes, load.at)
+        terms.append(dead_load_energy(load.force, position))
     for end, node in ((scene.start, nodes[0]), (scene.end, nodes[-1])):
         if isinstance(end, Free) and end.force is not None:
             terms.append(dead_load_energy(end.force, node))
     return sum(terms[1:], terms[0]) if terms else None
 
 
-def forces_on_nodes(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
+def forces_on_nodes(scene: Scene, segments: int, s: Float[Array, "n+1"] | None = None) -> Float[Array, "n+1 3"]:
     """What the loads exert on each node."""
     nodes = jnp.zeros((segments + 1, 3), scene.rod.length.dtype)
-    energy = load_energy(scene, nodes)
+    energy = load_energy(scene, nodes, s)
     if energy is None:
         return nodes
-    return -jax.grad(lambda nodes: load_energy(scene, nodes))(nodes)
+    return -jax.grad(lambda nodes: load_energy(scene, nodes, s))(nodes)
 
 
 def total_force(scene: Scene) -> Float[Array, "3"]:
@@ -62,6 +68,18 @@ def _position_on(nodes: Float[Array, "n+1 3"], s: Float[Array, ""]) -> Float[Arr
     n = len(nodes) - 1
     cell = jnp.clip(jnp.floor(s * n).astype(int), 0, n - 1)
     t = s * n - cell.astype(s.dtype)
+    return (1 - t) * nodes[cell] + t * nodes[cell + 1]
+
+
+def _weights_at(s: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
+    halves = jnp.diff(s) / 2
+    none = jnp.zeros_like(halves[:1])
+    return jnp.concatenate([halves, none]) + jnp.concatenate([none, halves])
+
+
+def _position_between(s: Float[Array, "n+1"], nodes: Float[Array, "n+1 3"], at: Float[Array, ""]) -> Float[Array, "3"]:
+    cell = jnp.clip(jnp.searchsorted(s, at, side="right") - 1, 0, len(s) - 2)
+    t = (at - s[cell]) / (s[cell + 1] - s[cell])
     return (1 - t) * nodes[cell] + t * nodes[cell + 1]
 
 

@@ -1,11 +1,13 @@
 """Tangents of the edges of a polyline: the finite differences of the report, of second order."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes
 from rodjax.discretization.joints import (
+    Joints,
     assembled,
     bending_derivatives,
     joints,
@@ -13,21 +15,33 @@ from rodjax.discretization.joints import (
     twist_derivatives,
     with_held_tangents,
 )
+from rodjax.discretization.nodes import held_nodes, with_nodes_at_clips
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, swept_twist, transport_along
 from rodjax.energy import density
 from rodjax.scene import Scene
-from rodjax.supports import Clamp, Free, Held
+from rodjax.supports import Clamp, Directed, Free, Held
+from rodjax.vectors import dot
 
 
 class EdgeTangents(eqx.Module):
-    """n equal edges, of which each is a point; bending and torsion live in the joints between them."""
+    """n edges, of which each is a point; bending and torsion live in the joints between them.
+
+    The edges are equal but for clips, each of which has a node: then `places` are the arclengths of the nodes, and
+    `clip_nodes` the numbers of those at the clips. Where a clip holds the tangent it parts its joint into two halves.
+    """
 
     weights: Float[Array, "n"]
+    places: Float[Array, "n+1"] | None = None
+    clip_nodes: Int[Array, "clips"] | None = None
 
     @staticmethod
     def of(scene: Scene, segments: int) -> "EdgeTangents":
-        return EdgeTangents(jnp.full(segments, 1 / segments, scene.rod.length.dtype))
+        dtype = scene.rod.length.dtype
+        if not scene.clips:
+            return EdgeTangents(jnp.full(segments, 1 / segments, dtype))
+        s, clip_nodes = with_nodes_at_clips(scene, jnp.linspace(0.0, 1.0, segments + 1, dtype=dtype), [])
+        return EdgeTangents(jnp.diff(s), s, clip_nodes)
 
     @property
     def segments(self) -> int:
@@ -35,11 +49,13 @@ class EdgeTangents(eqx.Module):
 
     @property
     def s(self) -> Float[Array, "n+1"]:
+        if self.places is not None:
+            return self.places
         return jnp.linspace(0.0, 1.0, self.segments + 1, dtype=self.weights.dtype)
 
     @property
     def finest(self) -> Float[Array, ""]:
-        return self.weights[0]
+        return self.weights[0] if self.places is None else jnp.min(self.weights)
 
     def with_held(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 k"]:
         return with_held_tangents(scene, tangents)
@@ -54,22 +70,68 @@ class EdgeTangents(eqx.Module):
         return diagonal
 
     def bending_energy(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
-        energy = joints(scene, tangents).bending_energy(scene.rod)
+        energy = self._bending_energy(scene, tangents)
         for end, edge in ((scene.start, 0), (scene.end, -1)):
             if isinstance(end, Free) and end.moment is not None:  # bends the half edge there
                 curvature = jnp.cross(end.moment, tangents[:, edge]) / scene.rod.EI
                 energy += self.finest / 2 * density(scene.rod, squared_curvature=jnp.sum(curvature**2))
         return energy
 
+    def _bending_energy(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, ""]:
+        between = self.joints(scene, tangents)
+        if self.clip_nodes is None:
+            return between.bending_energy(scene.rod)
+        whole = between.spacing * density(scene.rod, squared_curvature=between.squared_curvature)
+        energy = jnp.sum(jnp.where(self._is_parted(scene), 0.0, whole))
+        for _, halves in self.halves(scene, tangents):
+            energy += halves.bending_energy(scene.rod)
+        return energy
+
+    def joints(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Joints:
+        return joints(scene, tangents, None if self.places is None else self.weights)
+
+    def _is_parted(self, scene: Scene) -> Bool[Array, "k"]:
+        """Which joints a clip parts that holds the tangent."""
+        first = int(not isinstance(scene.start, Directed))  # the number of the node of the first joint
+        count = self.segments - 1 + int(isinstance(scene.start, Directed)) + int(isinstance(scene.end, Directed))
+        nodes = jnp.arange(count) + first
+        parted = jnp.zeros(count, bool)
+        for held in held_nodes(scene, self.clip_nodes):
+            parted |= nodes == held.node
+        return parted
+
+    def halves(self, scene: Scene, tangents: Float[Array, "3 n"]) -> list[tuple[Int[Array, ""], Joints]]:
+        """Of each clip that holds the tangent the edge behind it, and the joints of the edges beside with the clip."""
+        found = []
+        for _, edge, tangent in held_nodes(scene, self.clip_nodes):
+            before = jnp.stack([tangents[:, edge - 1], tangent], axis=1)
+            after = jnp.stack([tangent, tangents[:, edge]], axis=1)
+            spacing = jnp.stack([self.weights[edge - 1], self.weights[edge]]) / 2
+            found.append((edge, Joints(before, after, spacing)))
+        return found
+
     def bending(
         self, scene: Scene, tangents: Float[Array, "3 n"], bases: Float[Array, "3 b k"]
     ) -> tuple[Float[Array, ""], Blocks]:
-        between = joints(scene, tangents)
+        between = self.joints(scene, tangents)
         derivatives = bending_derivatives(scene.rod, between, (bases[..., :-1], bases[..., 1:]))
-        return between.bending_energy(scene.rod), Blocks(*assembled(scene, derivatives, self.segments))
+        if self.clip_nodes is None:
+            return between.bending_energy(scene.rod), Blocks(*assembled(scene, derivatives, self.segments))
+        parted = self._is_parted(scene)
+        derivatives = jax.tree.map(lambda derivative: jnp.where(parted, 0.0, derivative), derivatives)
+        gradient, diagonal, lower = assembled(scene, derivatives, self.segments)
+        of_edges = self.basis(scene, bases)
+        for edge, halves in self.halves(scene, tangents):
+            # The tangent of the clip does not turn.
+            beside = jnp.stack([of_edges[..., edge - 1], of_edges[..., edge]], axis=-1)
+            half = bending_derivatives(scene.rod, halves, (beside, beside))
+            gradient = gradient.at[:, edge - 1].add(half.before[:, 0]).at[:, edge].add(half.after[:, 1])
+            diagonal = diagonal.at[..., edge - 1].add(half.before_before[..., 0])
+            diagonal = diagonal.at[..., edge].add(half.after_after[..., 1])
+        return self._bending_energy(scene, tangents), Blocks(gradient, diagonal, lower)
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 n"], bases: Float[Array, "3 b k"]) -> Blocks:
-        derivatives = twist_derivatives(joints(scene, tangents), (bases[..., :-1], bases[..., 1:]))
+        derivatives = twist_derivatives(self.joints(scene, tangents), (bases[..., :-1], bases[..., 1:]))
         return Blocks(*assembled(scene, derivatives, self.segments))
 
     def swept(self, scene: Scene, old: Float[Array, "3 n"], new: Float[Array, "3 n"]) -> Float[Array, ""]:
@@ -82,10 +144,38 @@ class EdgeTangents(eqx.Module):
         return angle_about(held[:, -1], transport_along(scene.start.frame[:, 0], held)[:, -1], scene.end.frame[:, 0])
 
     def ways(self, slopes: Float[Array, "3 n"]) -> Float[Array, "n 3"]:
-        return slopes.T / self.segments
+        return slopes.T / self.segments if self.places is None else slopes.T * self.weights[:, None]
+
+    @property
+    def side_weights(self) -> Float[Array, "1 n"]:
+        return self.weights[None]
+
+    def tangents_at_nodes(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n-1"]:
+        """At the nodes between the ends: on the arc between those of the edges beside, or as a clip holds it."""
+        if self.places is None:
+            inner = tangents[:, :-1] + tangents[:, 1:]
+        else:
+            inner = self.weights[None, 1:] * tangents[:, :-1] + self.weights[None, :-1] * tangents[:, 1:]
+        inner /= jnp.sqrt(dot(inner, inner))[None]
+        for _, node, tangent in held_nodes(scene, self.clip_nodes):
+            inner = inner.at[:, node - 1].set(tangent)
+        return inner
+
+    def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return self.tangents_at_nodes(scene, tangents)[:, self.clip_nodes - 1]
+
+    def of_sides(self, by_point: Float[Array, "... n"]) -> Float[Array, "... 1 n"]:
+        return by_point[..., None, :]
+
+    def of_points(self, by_side: Float[Array, "... 1 n"]) -> Float[Array, "... n"]:
+        return by_side[..., 0, :]
+
+    def side_forces(self, scene: Scene) -> Float[Array, "3 1 n"]:
+        return self.forces_beyond(scene)[:, None]
 
     def forces_beyond(self, scene: Scene) -> Float[Array, "3 n"]:
-        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments).T)
+        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.places).T)
 
     def force_spread(self, scene: Scene) -> None:
         return None

@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve, short_sum
+from rodjax.scene import slides
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
 from rodjax.vectors import components, cross, dot
@@ -44,25 +46,27 @@ class Section(NamedTuple):
 
 class Errors(NamedTuple):
     """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
-    as the displacement that each alone might make, `None` where there are none.
+    as the displacement that each alone might make, `None` where there are none; `axial`: of the forces by which clips
+    pull along a rod that slides through them, `None` without such.
     """
 
     nodes: Float[Array, "n+1 3"]
     defects: Float[Array, "n"] | None
+    axial: Float[Array, "slides"] | None = None
 
 
 def errors_of_differences(
     form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], at_nodes: Float[Array, "3 n+1"]
 ) -> Errors:
     """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
-    scene, field = form.scene, HermiteElements(form.field.s)
-    elements = MixedForm.of(scene, field)
+    scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
+    elements = type(form).of(scene, field)
     tangents = interleaved(at_nodes, point.tangents)
     begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
     here = elements.linearized(begin)
     _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
     end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
-    return Errors(elements.nodes(elements.edges(end)) - nodes, None)
+    return Errors(elements.nodes(elements.edges(end)) - nodes, None, _axial_error(elements, form, end, point))
 
 
 def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
@@ -71,9 +75,12 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     rod, h = scene.rod, field.h
     torque = rod.GJ * point.total_twist
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
-    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
-    first = Section(jnp.zeros_like(middles), nodes[:, :-1], moments[:, :-1])
+    # In a clip that holds the tangent the moment jumps.
+    before = -cross(nodes[:, :-1], by_start) if scene.clips else moments[:, :-1]
+    first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
     last, passed = _integrated(form, field, point, torque, first)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
@@ -81,7 +88,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     turn = cross(nodes[:, 1:], last.tangent)
     back = -cross(turn, middles)
     passed = [tangent + k / STEPS * -cross(turn, tangent) for k, tangent in enumerate(passed)]
-    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 1]
+    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 1])
     couple = last.moment - moments[:, 1:]
     gap = last.way + h[None] / 2 * back - form.edges(point).T
 
@@ -94,7 +101,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
     gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
-    closure = -form.of_force(jnp.sum(gap, axis=1))
+    closure = -form.of_force(form.along_spans(gap))
     if form.has_torsion:
         missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
         closure = jnp.concatenate([missing[None], closure])
@@ -112,7 +119,19 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
-    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH)
+    moved = form.moved(point, here.bases, rotation, force_change)
+    axial = _axial_error(form, form, moved, point)
+    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH, axial)
+
+
+def _axial_error(
+    form: MixedForm, other: MixedForm, point: MixedPoint, other_point: MixedPoint
+) -> Float[Array, "slides"] | None:
+    if not slides(form.scene):
+        return None
+    assert isinstance(form, ClippedForm)
+    assert isinstance(other, ClippedForm)
+    return form.axial_forces(point) - other.axial_forces(other_point)
 
 
 def _integrated(
@@ -120,7 +139,7 @@ def _integrated(
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
     scene, rod = form.scene, form.scene.rod
-    force = point.end_force[:, None] + field.forces_in_elements(scene)[:, 0]
+    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 0])
     weight = jnp.zeros(3, force.dtype) if scene.gravity is None else scene.gravity
     step = field.h / STEPS
 

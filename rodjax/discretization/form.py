@@ -46,8 +46,10 @@ class Point(Protocol):
     def tangents(self) -> Float[Array, "3 m"]: ...
 
     @property
-    def end_force(self) -> Float[Array, "3"]:
-        """The force at s = L between held ends, else zero."""
+    def end_force(self) -> Float[Array, "3 *spans"]:
+        """The force at s = L between held ends, else zero; with clips, for each span in turn, with the forces of the
+        clips beyond it.
+        """
         ...
 
     @property
@@ -165,13 +167,17 @@ class Form(eqx.Module):
         """The part for the end force, of what is given for all multipliers."""
         return multipliers[len(multipliers) - self._closures :]
 
-    def of_force(self, vector: Float[Array, "3"]) -> Float[Array, "c"]:
-        """The components of a vector that belong to the end force."""
+    def of_force(self, vector: Float[Array, "3 *spans"]) -> Float[Array, "c"]:
+        """The components of a vector, with clips one for each span, that belong to the end force."""
         if not self._closures:
             return jnp.zeros(0, vector.dtype)
         return vector if self.axes is None else vector @ self.axes
 
-    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3"]:
+    def force_turned(self, point: Any, axis: Float[Array, "3"]) -> Float[Array, "c"]:
+        """The components of what the end force changes by as the whole rod turns about an axis."""
+        return self.of_force(jnp.cross(axis, point.end_force))
+
+    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3 *spans"]:
         """A change of the end force from its components."""
         if not self._closures:
             return jnp.zeros(3, closure.dtype)

@@ -17,11 +17,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.discretization.form import Form
 from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.nodes import held_nodes, with_nodes_at, with_nodes_at_clips
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
@@ -42,19 +43,21 @@ PAIRS = ((0, 1), (1, 2), (0, 2))
 ARC_WEIGHTS = (4 / 3, 4 / 3, -1 / 3)
 
 
-# Point forces nearer to one another or to an end, in parts of an element, share it: shorter ones would cost digits.
-LEAST_ELEMENT = 0.05
-
-
 class HermiteElements(eqx.Module):
-    """n elements between nodes at the arclengths `s` in units of L: 0, ..., 1. Points are nodes and middles in turn."""
+    """n elements between nodes at the arclengths `s` in units of L: 0, ..., 1. Points are nodes and middles in turn.
+
+    `clip_nodes`: the numbers of the nodes at which clips hold the rod, where there are clips.
+    """
 
     s: Float[Array, "n+1"]
+    clip_nodes: Int[Array, "clips"] | None = None
 
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "HermiteElements":
-        """On these nodes, moved so that one lies at each point force: the moment has a kink there."""
+        """On these nodes, moved so that one lies at each clip and point force: the moment has a kink there."""
         places = [load.at for load in scene.point_forces]
+        if scene.clips:
+            return HermiteElements(*with_nodes_at_clips(scene, s, places))
         return HermiteElements(with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
 
     @property
@@ -87,7 +90,13 @@ class HermiteElements(eqx.Module):
             tangents = tangents.at[:, 0].set(scene.start.tangent)
         if isinstance(scene.end, Directed):
             tangents = tangents.at[:, -1].set(scene.end.tangent)
+        for point, tangent in self._directed(scene):
+            tangents = tangents.at[:, point].set(tangent)
         return tangents
+
+    def _directed(self, scene: Scene) -> list[tuple[Int[Array, ""], Float[Array, "3"]]]:
+        """The points at which clips hold the tangent, and what it is there."""
+        return [(2 * held.node, held.tangent) for held in held_nodes(scene, self.clip_nodes)]
 
     def basis(self, scene: Scene, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
         """The directions in which each tangent may turn: none where a support holds it."""
@@ -95,6 +104,8 @@ class HermiteElements(eqx.Module):
             bases = bases.at[..., 0].set(0.0)
         if isinstance(scene.end, Directed):
             bases = bases.at[..., -1].set(0.0)
+        for point, _ in self._directed(scene):
+            bases = bases.at[..., point].set(0.0)
         return bases
 
     def held(self, scene: Scene, diagonal: Float[Array, "b b m"]) -> Float[Array, "b b m"]:
@@ -104,6 +115,8 @@ class HermiteElements(eqx.Module):
             diagonal = diagonal.at[..., 0].set(identity)
         if isinstance(scene.end, Directed):
             diagonal = diagonal.at[..., -1].set(identity)
+        for point, _ in self._directed(scene):
+            diagonal = diagonal.at[..., point].set(identity)
         return diagonal
 
     # --- strains -----------------------------------------------------------------------------------------------------
@@ -150,11 +163,12 @@ class HermiteElements(eqx.Module):
         return jnp.sum(_arcs(of_elements(new), of_elements(old)))
 
     def by_end_tangents(
-        self, scene: Scene, tangents: Float[Array, "3 m"], end_force: Float[Array, "3"], torque: Float[Array, ""]
+        self, scene: Scene, tangents: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]
     ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
-        """The derivatives of what each element adds to the Lagrangian by the tangents of its start and end."""
+        """The derivatives of what each element adds to the Lagrangian by the tangents of its start and end, where
+        `forces` run through the rod.
+        """
         rod = scene.rod
-        forces = end_force[:, None, None] + self.forces_in_elements(scene)[:, ::2]
         chords = _half_squared_chords(tangents)
         first, last = _of_pairs(tangents)
         by_chord = jax.grad(lambda chords: jnp.sum(_bending_energies(rod, chords, self.h)))(chords)
@@ -186,6 +200,25 @@ class HermiteElements(eqx.Module):
         assert isinstance(scene.end, Clamp)
         carried = self.carried(scene.start.frame[:, 0], tangents)[:, -1]
         return angle_about(tangents[:, -1], carried, scene.end.frame[:, 0])
+
+    # --- points by elements, as clips part them ----------------------------------------------------------------------
+
+    @property
+    def side_weights(self) -> Float[Array, "3 n"]:
+        return jnp.array(SIMPSON, self.s.dtype)[:, None] * self.h[None]
+
+    def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return tangents[:, 2 * self.clip_nodes]
+
+    def of_sides(self, by_point: Float[Array, "... m"]) -> Float[Array, "... 3 n"]:
+        return jnp.stack(of_elements(by_point), axis=-2)
+
+    def of_points(self, by_side: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
+        return assembled(by_side[..., 0, :], by_side[..., 1, :], by_side[..., 2, :])
+
+    def side_forces(self, scene: Scene) -> Float[Array, "3 3 n"]:
+        return self.forces_in_elements(scene)
 
     # --- places and loads --------------------------------------------------------------------------------------------
 
@@ -294,7 +327,19 @@ class Curve(Shape):
             tangents = _turned(tangents, tangents[:, 0], scene.start.tangent, 1.0 - places)
         if isinstance(scene.end, Directed):
             tangents = _turned(tangents, tangents[:, -1], scene.end.tangent, places)
-        return tangents
+        return _turned_in_clips(scene, tangents, places) if scene.clips else tangents
+
+
+def _turned_in_clips(scene: Scene, tangents: Float[Array, "3 m"], places: Float[Array, "m"]) -> Float[Array, "3 m"]:
+    """The tangents turned to those that clips hold, by less and less towards the supports on both sides of each."""
+    arclengths = [jnp.zeros_like(places[0]), *(clip.at for clip in scene.clips), jnp.ones_like(places[0])]
+    for k, clip in enumerate(scene.clips):
+        if clip.tangent is not None:
+            before, at, after = arclengths[k : k + 3]
+            near = jnp.minimum((places - before) / (at - before), (after - places) / (after - at))
+            held = tangents[:, jnp.argmin(jnp.abs(places - at))]
+            tangents = _turned(tangents, held, clip.tangent, jnp.maximum(near, 0.0))
+    return tangents
 
 
 def _turned(
@@ -310,39 +355,6 @@ def _turned(
     across = cross(jnp.broadcast_to(axis[:, None], tangents.shape), tangents)
     turned = along + jnp.cos(angle)[None] * (tangents - along) + jnp.sin(angle)[None] * across
     return jnp.where(turns, turned, tangents)
-
-
-def with_nodes_at(
-    s: Float[Array, "n+1"], places: Float[Array, "k"], *, may_repeat: bool = False
-) -> Float[Array, "n+1"]:
-    """The nodes moved, with all between them and the next one fixed, so that one lies at each of the sorted places.
-
-    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none. `may_repeat`: several of
-    them may be the same, so that there may be more of them than nodes.
-    """
-    n, k = len(s) - 1, min(len(places), len(s) - 2)
-    remaining: Iterable[Any] = range(k, 0, -1)
-    if may_repeat:
-        k = len(places)
-        differ = jnp.concatenate([jnp.diff(places) * n >= LEAST_ELEMENT, jnp.array([True])])
-        remaining = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
-    index = jnp.arange(n + 1)
-    fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
-    for nodes_left, place in zip(remaining, places[:k], strict=True):
-        nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - nodes_left)
-        here = s[nearest]
-        # Written so that the same bits come out where the node is there already.
-        before = s + (s - fixed_place) * ((place - fixed_place) / (here - fixed_place) - 1)
-        beyond = s + (1 - s) * (1 - (1 - place) / (1 - here))
-        moved = jnp.where(index <= fixed, s, jnp.where(index < nearest, before, beyond))
-        moved = jnp.where(index == nearest, place, moved)
-        is_apart = (place - fixed_place) * n >= LEAST_ELEMENT
-        is_apart &= (1 - place) * n >= LEAST_ELEMENT
-        if may_repeat:
-            is_apart &= nearest > fixed
-        s = jnp.where(is_apart, moved, s)
-        fixed, fixed_place = jnp.where(is_apart, nearest, fixed), jnp.where(is_apart, place, fixed_place)
-    return s
 
 
 def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:

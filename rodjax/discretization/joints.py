@@ -51,9 +51,20 @@ class JointDerivatives(eqx.Module):
     after_before: Float[Array, "2 2 k"]
 
 
-def joints(scene: Scene, tangents: Float[Array, "3 n"]) -> Joints:
-    """The joints of a polyline of n equal edges; a support that holds the tangent makes one half an edge away."""
+def joints(scene: Scene, tangents: Float[Array, "3 n"], lengths: Float[Array, "n"] | None = None) -> Joints:
+    """The joints of a polyline of n edges; a support that holds the tangent makes one half an edge away.
+
+    `lengths`: those of the edges, `None` where they are equal.
+    """
     points = with_held_tangents(scene, tangents)
+    if lengths is not None:
+        halves = lengths / 2
+        spacing = [halves[:-1] + halves[1:]]
+        if isinstance(scene.start, Directed):
+            spacing = [halves[:1], *spacing]
+        if isinstance(scene.end, Directed):
+            spacing = [*spacing, halves[-1:]]
+        return Joints(points[:, :-1], points[:, 1:], jnp.concatenate(spacing))
     h = 1 / tangents.shape[1]
     half = jnp.full(1, h / 2, tangents.dtype)
     spacing = [jnp.full(tangents.shape[1] - 1, h, tangents.dtype)]

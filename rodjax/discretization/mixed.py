@@ -18,6 +18,7 @@ share, are a border of four columns (`linalg.SaddlePointSystem`). Arrays along t
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,6 +52,18 @@ class MixedPoint(eqx.Module):
         return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist))
 
 
+class Stretched(NamedTuple):
+    """Parts of a `Linearization` and the lengths of the points; the last three are `None` without closure."""
+
+    energy: Float[Array, ""]
+    gradient: Float[Array, "b m"]
+    diagonal: Float[Array, "b b m"]
+    lengths: Float[Array, "m"]
+    border: Float[Array, "b c m"] | None
+    closure: Float[Array, "c"] | None
+    compliance: Float[Array, "c c"] | None
+
+
 class MixedForm(Form):
     """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
@@ -66,9 +79,9 @@ class MixedForm(Form):
     force_spread: Float[Array, "3 3 m"] | None
     axes: Float[Array, "3 a"] | None = None
 
-    @staticmethod
-    def of(scene: Scene, field: TangentField) -> "MixedForm":
-        return MixedForm(
+    @classmethod
+    def of(cls, scene: Scene, field: TangentField) -> "MixedForm":
+        return cls(
             scene=scene, field=field, forces_beyond=field.forces_beyond(scene), force_spread=field.force_spread(scene)
         )
 
@@ -116,6 +129,14 @@ class MixedForm(Form):
     @property
     def has_potential(self) -> bool:
         return dead_end_moment(self.scene) is None
+
+    def with_end_force(self, point: MixedPoint, loads: Float[Array, "3 *c n"]) -> Float[Array, "3 *c n"]:
+        """The force through the rod, from what the loads beyond exert; `n`: elements or edges."""
+        return point.end_force[(slice(None), *[None] * (loads.ndim - 1))] + loads
+
+    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3"]:
+        """What elements or edges add up to between held ends."""
+        return jnp.sum(ways, axis=1)
 
     def edge_tension(self, point: MixedPoint) -> Float[Array, "n"]:
         return dot(point.end_force[:, None] + self.forces_beyond, point.tangents)
@@ -206,38 +227,17 @@ class MixedForm(Form):
                 columns.append(torque_column)
                 closure.append(jnp.zeros(1, energy.dtype))
                 compliance.append(1 / stiffness[None, None])
-        gradient, diagonal = blocks.gradient, blocks.diagonal
-
-        forces = point.end_force[:, None] + self.forces_beyond
-        tension = dot(forces, tangents)
-        strain, softness = self._strain(point)
-        lengths = weights * (1 + strain)
-        across = components(bases, forces)
-        gradient -= lengths[None] * across
-        identity = jnp.eye(bases.shape[1], dtype=energy.dtype)[..., None]
-        diagonal += (lengths * tension)[None, None] * identity
-        diagonal -= (weights * softness)[None, None] * outer(across, across)
-        energy += jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
-        if self.force_spread is not None:
-            spread = _times(self.force_spread, tangents)
-            along = softness * dot(spread, tangents)
-            of_bases = short_sum(self.force_spread[:, :, None] * bases[None], axis=1)
-            energy -= jnp.sum(along) / 2
-            gradient -= softness[None] * components(bases, spread)
-            diagonal += along[None, None] * identity
-            diagonal -= softness[None, None] * short_sum(bases[:, :, None] * of_bases[:, None], axis=0)
-        if isinstance(scene.start, Held) and isinstance(scene.end, Held):
-            span = scene.end.position - scene.start.position
-            energy += jnp.sum(point.end_force * span)
-            lacking = span - tangents @ lengths
-            directions, along = jnp.swapaxes(bases, 0, 1), tangents
-            if self.axes is not None:
-                lacking = lacking @ self.axes
-                directions = short_sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
-                along = self.axes.T @ tangents
-            columns.append(-lengths[None, None] * directions - (weights * softness)[None, None] * outer(across, along))
-            closure.append(lacking)
-            compliance.append(((weights * softness)[None] * along) @ along.T)
+        stretched = self._stretched(point, bases, weights, energy, blocks.gradient, blocks.diagonal)
+        energy, gradient, diagonal, lengths = (
+            stretched.energy,
+            stretched.gradient,
+            stretched.diagonal,
+            stretched.lengths,
+        )
+        if stretched.border is not None:
+            columns.append(stretched.border)
+            closure.append(stretched.closure)
+            compliance.append(stretched.compliance)
         rows = None
         moment = dead_end_moment(scene)
         if moment is not None:
@@ -269,6 +269,49 @@ class MixedForm(Form):
             energy=energy,
             residual=field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
         )
+
+    def _stretched(
+        self,
+        point: MixedPoint,
+        bases: Float[Array, "3 b m"],
+        weights: Float[Array, "m"],
+        energy: Float[Array, ""],
+        gradient: Float[Array, "b m"],
+        diagonal: Float[Array, "b b m"],
+    ) -> Stretched:
+        """With what stretch, loads and closure add to the derivatives of bending and torsion."""
+        scene, rod, tangents = self.scene, self.scene.rod, point.tangents
+        forces = point.end_force[:, None] + self.forces_beyond
+        tension = dot(forces, tangents)
+        strain, softness = self._strain(point)
+        lengths = weights * (1 + strain)
+        across = components(bases, forces)
+        gradient -= lengths[None] * across
+        identity = jnp.eye(bases.shape[1], dtype=energy.dtype)[..., None]
+        diagonal += (lengths * tension)[None, None] * identity
+        diagonal -= (weights * softness)[None, None] * outer(across, across)
+        energy += jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
+        if self.force_spread is not None:
+            spread = _times(self.force_spread, tangents)
+            along = softness * dot(spread, tangents)
+            of_bases = short_sum(self.force_spread[:, :, None] * bases[None], axis=1)
+            energy -= jnp.sum(along) / 2
+            gradient -= softness[None] * components(bases, spread)
+            diagonal += along[None, None] * identity
+            diagonal -= softness[None, None] * short_sum(bases[:, :, None] * of_bases[:, None], axis=0)
+        if isinstance(scene.start, Held) and isinstance(scene.end, Held):
+            span = scene.end.position - scene.start.position
+            energy += jnp.sum(point.end_force * span)
+            lacking = span - tangents @ lengths
+            directions, along = jnp.swapaxes(bases, 0, 1), tangents
+            if self.axes is not None:
+                lacking = lacking @ self.axes
+                directions = short_sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
+                along = self.axes.T @ tangents
+            border = -lengths[None, None] * directions - (weights * softness)[None, None] * outer(across, along)
+            compliance = ((weights * softness)[None] * along) @ along.T
+            return Stretched(energy, gradient, diagonal, lengths, border, lacking, compliance)
+        return Stretched(energy, gradient, diagonal, lengths, None, None, None)
 
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""

@@ -5,9 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.joints import Joints, bending_derivatives, tangent_bases, twist_derivatives
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.twist import angle_about, transport, transport_along
 from rodjax.energy import axial_strain_under
 from rodjax.rod import Rod
@@ -34,7 +36,9 @@ def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
     """Of an equilibrium."""
     if isinstance(form.field, HermiteElements):
         return _on_elements(form, form.field, point)
-    return _on_edges(form.scene, point.tangents, form.edge_tension(point), form.end_forces(point), point.total_twist)
+    assert isinstance(form.field, EdgeTangents)
+    tension, forces = form.edge_tension(point), form.end_forces(point)
+    return _on_edges(form.scene, form.field, point.tangents, tension, forces, point.total_twist)
 
 
 def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> Resultants:
@@ -42,7 +46,8 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
     torque = rod.GJ * point.total_twist
-    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
+    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
     curvature = root(dot(moments, moments)) / rod.EI
     moments += torque * nodes
@@ -74,8 +79,9 @@ def positions_between(
     assert isinstance(field, HermiteElements)
     rod, tangents = scene.rod, point.tangents
     torque = rod.GJ * point.total_twist
-    by_start, by_end = field.by_end_tangents(scene, tangents, point.end_force, torque)
-    forces = point.end_force[:, None, None] + field.forces_in_elements(scene)
+    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
+    forces = form.with_end_force(point, field.forces_in_elements(scene))
     weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
     cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
 
@@ -106,6 +112,27 @@ def positions_between(
     return nodes[cell] + sum(weight[:, None] * value.T for weight, value in zip(weights, values, strict=True))
 
 
+def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
+    """What the clips apply to the rod, nondimensional: the derivatives of the energy by rotations of their tangents."""
+    scene, field, tangents = form.scene, form.field, point.tangents
+    moments = [jnp.zeros(3, tangents.dtype)] * len(scene.clips)
+    directed = held_nodes(scene, field.clip_nodes)
+    if isinstance(field, HermiteElements):
+        section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+        by_ends = field.by_end_tangents(scene, tangents, section_forces, scene.rod.GJ * point.total_twist)
+        for k, node, _ in directed:
+            moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])
+    else:
+        assert isinstance(field, EdgeTangents)
+        for (k, _, _), (_, halves) in zip(directed, field.halves(scene, tangents), strict=True):
+            held = halves.after[:, :1]
+            basis = tangent_bases(jnp.concatenate([held, held], axis=1))
+            by_rotation = bending_derivatives(scene.rod, halves, (basis, basis))
+            along = basis[..., 0] @ (by_rotation.after[:, 0] + by_rotation.before[:, 1])
+            moments[k] = jnp.cross(held[:, 0], along)
+    return jnp.stack(moments)
+
+
 def _given_moment(end: Support, held: Float[Array, "3"], *, sign: int) -> Float[Array, "3"]:
     """The section moment at an end: that which holds it, or the given one."""
     if isinstance(end, Directed):
@@ -115,32 +142,37 @@ def _given_moment(end: Support, held: Float[Array, "3"], *, sign: int) -> Float[
 
 def _on_edges(
     scene: Scene,
+    field: EdgeTangents,
     tangents: Float[Array, "3 n"],
     edge_tension: Float[Array, "n"],
     end_forces: tuple[Float[Array, "3"], Float[Array, "3"]],
     twist: Float[Array, ""],
 ) -> Resultants:
-    """Of a polyline of n equal edges with these unit tangents and tensions, under the forces at s = 0 and s = L."""
+    """Of a polyline with these unit tangents and tensions, under the forces at s = 0 and s = L."""
     rod = scene.rod
     n = tangents.shape[1]
-    h = 1 / n
+    is_equal = field.places is None
+    h, last_h = (1 / n, 1 / n) if is_equal else (field.weights[0], field.weights[-1])
     start_moment = _end_moment(scene.start, rod, tangents[:, 0], h, rod.GJ * twist, at_start=True)
-    end_moment = _end_moment(scene.end, rod, tangents[:, -1], h, rod.GJ * twist, at_start=False)
+    end_moment = _end_moment(scene.end, rod, tangents[:, -1], last_h, rod.GJ * twist, at_start=False)
     start_tangent = _end_tangent(scene.start, tangents[:, 0], h)
-    end_tangent = _end_tangent(scene.end, tangents[:, -1], h)
-    inner = tangents[:, :-1] + tangents[:, 1:]
-    inner /= jnp.sqrt(dot(inner, inner))[None]
+    end_tangent = _end_tangent(scene.end, tangents[:, -1], last_h)
+    inner = field.tangents_at_nodes(scene, tangents)
+    spacing = jnp.full(n - 1, h, tangents.dtype) if is_equal else (field.weights[:-1] + field.weights[1:]) / 2
+    inner_joints = Joints(tangents[:, :-1], tangents[:, 1:], spacing)
+    inner_curvatures = inner_joints.squared_curvature
+    for edge, halves in field.halves(scene, tangents):
+        inner_curvatures = inner_curvatures.at[edge - 1].set(halves.squared_curvature[0])
     at_nodes = jnp.concatenate([start_tangent[:, None], inner, end_tangent[:, None]], axis=1)
-    inner_joints = Joints(tangents[:, :-1], tangents[:, 1:], jnp.full(n - 1, h, tangents.dtype))
     squared_curvatures = [
         _squared(_across(start_moment, start_tangent) / rod.EI)[None],
-        inner_joints.squared_curvature,
+        inner_curvatures,
         _squared(_across(end_moment, end_tangent) / rod.EI)[None],
     ]
     end_tensions = [jnp.sum(force * t)[None] for force, t in zip(end_forces, (start_tangent, end_tangent), strict=True)]
     tension = jnp.concatenate([end_tensions[0], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1]])
     return Resultants(
-        frames=_frames(scene, tangents, at_nodes, twist),
+        frames=_frames(scene, tangents, at_nodes, twist, field.places),
         curvature=root(jnp.concatenate(squared_curvatures)),
         twist=jnp.full(n + 1, twist),
         tension=tension,
@@ -153,7 +185,13 @@ def _on_edges(
 
 
 def _end_moment(
-    end: Support, rod: Rod, edge_tangent: Float[Array, "3"], h: float, torque: Float[Array, ""], *, at_start: bool
+    end: Support,
+    rod: Rod,
+    edge_tangent: Float[Array, "3"],
+    h: float | Float[Array, ""],
+    torque: Float[Array, ""],
+    *,
+    at_start: bool,
 ) -> Float[Array, "3"]:
     """The section moment at an end: the derivative of the energy by a rotation of the support, or the given moment."""
     sign = -1 if at_start else 1
@@ -174,7 +212,7 @@ def _end_moment(
     return sign * cross(end.tangent[:, None], along)[:, 0] + spin * end.tangent
 
 
-def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float) -> Float[Array, "3"]:
+def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float | Float[Array, ""]) -> Float[Array, "3"]:
     """The tangent at an end: prescribed, or that of the edge, turned by what a dead moment bends half an edge."""
     if isinstance(end, Directed):
         return end.tangent
@@ -185,17 +223,24 @@ def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float) -> Flo
 
 
 def _frames(
-    scene: Scene, edges: Float[Array, "3 n"], nodes: Float[Array, "3 n+1"], twist: Float[Array, ""]
+    scene: Scene,
+    edges: Float[Array, "3 n"],
+    nodes: Float[Array, "3 n+1"],
+    twist: Float[Array, ""],
+    s: Float[Array, "n+1"] | None,
 ) -> Float[Array, "n+1 3 3"]:
     """Material frames at the nodes, from the end that holds the twist (or a choice where none does).
 
-    `edges`, `nodes`: the tangents there. A node's tangent lies on the arc between those of its edges.
+    `edges`, `nodes`: the tangents there. A node's tangent lies on the arc between those of its edges. `s`: arclengths,
+    `None` where the nodes are equally spaced.
     """
     start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(nodes[:, 0])
     along_edges = transport_along(start_d1, jnp.concatenate([nodes[:, :1], edges], axis=1))
     d1 = transport(along_edges[:, 1:], edges, nodes[:, 1:])
     d1 = jnp.concatenate([start_d1[:, None], d1], axis=1)
-    return _turning_frames(scene, nodes, d1, twist * jnp.linspace(0.0, 1.0, nodes.shape[1], dtype=twist.dtype))
+    if s is None:
+        s = jnp.linspace(0.0, 1.0, nodes.shape[1], dtype=twist.dtype)
+    return _turning_frames(scene, nodes, d1, twist * s)
 
 
 def _turning_frames(

@@ -3,7 +3,7 @@
 from typing import Protocol
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.scene import Scene
 
@@ -35,6 +35,11 @@ class TangentField(Protocol):
     @property
     def weights(self) -> Float[Array, "m"]:
         """The length of rod that each point stands for."""
+        ...
+
+    @property
+    def clip_nodes(self) -> Int[Array, "clips"] | None:
+        """The numbers of the nodes at which clips hold the rod; `None` without clips."""
         ...
 
     @property
@@ -76,6 +81,25 @@ class TangentField(Protocol):
 
     def principal_twist(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
         """The total twist between two clamps [rad], up to whole turns."""
+        ...
+
+    @property
+    def side_weights(self) -> Float[Array, "p n"]:
+        """The length of rod that each of the p points of a cell stands for; a cell lies between two nodes."""
+        ...
+
+    def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 clips"]: ...
+
+    def of_sides(self, by_point: Float[Array, "*c m"]) -> Float[Array, "*c p n"]:
+        """What belongs to the points of each cell."""
+        ...
+
+    def of_points(self, by_side: Float[Array, "*c p n"]) -> Float[Array, "*c m"]:
+        """Sums over the cells at each point."""
+        ...
+
+    def side_forces(self, scene: Scene) -> Float[Array, "3 p n"]:
+        """As `forces_beyond`, on the side of a cell."""
         ...
 
     def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:

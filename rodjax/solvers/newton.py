@@ -82,7 +82,7 @@ class NewtonState(eqx.Module):
     residual: Float[Array, ""]
     shift: Float[Array, ""]
     rotation: Float[Array, "b n"]
-    force_change: Float[Array, "3"]
+    force_change: Float[Array, "3 *spans"]
     # The augmented Lagrangian at the point with the new force, its slope along the step, and the fraction of it to try.
     weight: Float[Array, ""]
     merit: Float[Array, ""]
@@ -275,7 +275,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         residual=zero,
         shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
-        force_change=jnp.zeros(3, dtype),
+        force_change=jnp.zeros_like(point.end_force),
         weight=zero,
         merit=zero,
         slope=zero,

@@ -1,0 +1,65 @@
+"""Rods that slide through clips: how the axial forces there change as more or less of the rod has passed."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.clipped import ClippedForm
+from rodjax.discretization.form import Form, Point
+from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.shape import Shape
+from rodjax.linalg import factor
+from rodjax.scene import Scene, slid, sliding_places
+from rodjax.stability import Motion, carried_to
+
+
+class Slide(NamedTuple):
+    """Of an equilibrium under clips at given arclengths, nondimensional.
+
+    `axial`: what the sliding clips apply along the rod; `rates`: the derivatives by the arclengths of these clips, one
+    column for each; `nodes`: those of the nodes. By as much as a clip pulls along the rod the energy falls as its
+    arclength grows, so that the reverse of `rates` is the energy's second derivative.
+    """
+
+    axial: Float[Array, "slides"]
+    rates: Float[Array, "slides slides"]
+    nodes: Float[Array, "slides n+1 3"]
+
+    @property
+    def stiffness(self) -> Float[Array, "slides slides"]:
+        """Against sliding, [EI/L^3]."""
+        return -(self.rates + self.rates.T) / 2
+
+
+def slide(scene: Scene, shape: Shape, point: MixedPoint) -> Slide:
+    """Of an equilibrium of a nondimensional scene."""
+    places = sliding_places(scene)
+    assert places is not None
+    form, begin = carried_to(scene, shape, point)
+    here = form.linearized(begin)
+    factors = factor(form.regular(here.system))
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+
+    def unbalanced(places: Float[Array, "slides"]) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        form, there = carried_to(slid(scene, places), shape, point)
+        return form.unbalanced(there)
+
+    def seen(places: Float[Array, "slides"], motion: Motion) -> tuple[Float[Array, "slides"], Float[Array, "n+1 3"]]:
+        form, there = carried_to(slid(scene, places), shape, point, motion)
+        return axial_forces(form, there), form.nodes(form.edges(there))
+
+    def rate(direction: Float[Array, "slides"]) -> tuple[Float[Array, "slides"], Float[Array, "n+1 3"]]:
+        _, (f, c) = jax.jvp(unbalanced, (places,), (direction,))
+        return jax.jvp(seen, (places, nothing), (direction, Motion(*factors.solve(-f, -c))))[1]
+
+    rates, nodes = jax.vmap(rate)(jnp.eye(len(places), dtype=places.dtype))
+    return Slide(axial_forces(form, begin), rates.T, nodes)
+
+
+def axial_forces(form: Form, point: Point) -> Float[Array, "slides"]:
+    """What the sliding clips apply along the rod."""
+    assert isinstance(form, ClippedForm)
+    assert isinstance(point, MixedPoint)
+    return form.axial_forces(point)

@@ -18,6 +18,7 @@ import rodjax as rj
 from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Status, Swivel, frame, problems
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.scene import nondimensional
 
 LEVEL = frame((1, 0, 0))

@@ -13,6 +13,7 @@ from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
+from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Plane, Sphere, Union
 from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Law, Rod
@@ -25,6 +26,7 @@ from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel, frame, rotate
 from rodjax.tracing import BranchEnd
+from rodjax.triangle_mesh import Mesh
 
 if TYPE_CHECKING:
     from rodjax.continuum import solve_continuum
@@ -46,12 +48,16 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Box",
     "Branch",
     "BranchEnd",
+    "Capsule",
     "Centerline",
     "Clamp",
     "CriticalPoint",
     "CriticalValue",
+    "Cylinder",
+    "Distance",
     "DistributedCouple",
     "DistributedForce",
     "EndForce",
@@ -64,21 +70,26 @@ __all__ = [
     "Guess",
     "Law",
     "LineSearch",
+    "Mesh",
     "Mode",
     "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Obstacle",
     "Pin",
+    "Plane",
     "PointForce",
     "Reading",
     "Rod",
     "Scene",
     "SceneFileError",
     "Smooth",
+    "Sphere",
     "Status",
     "Steps",
     "Swivel",
+    "Union",
     "Unknown",
     "critical_point",
     "critical_points",

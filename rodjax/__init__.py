@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from rodjax import problems
 from rodjax.along import Smooth, Steps
 from rodjax.batch import solve_batch
+from rodjax.clearance import Clearance, clearance
 from rodjax.compilation import enable_compilation_cache
 from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
 from rodjax.equilibrium import solve
@@ -54,6 +55,7 @@ __all__ = [
     "Capsule",
     "Centerline",
     "Clamp",
+    "Clearance",
     "CriticalPoint",
     "CriticalValue",
     "Cylinder",
@@ -91,6 +93,7 @@ __all__ = [
     "Swivel",
     "Union",
     "Unknown",
+    "clearance",
     "critical_point",
     "critical_points",
     "describe",

@@ -1,8 +1,11 @@
-"""Obstacles: signed distances and their gradients, and meshes from files."""
+"""Obstacles: signed distances and their gradients, meshes from files, and the clearance of rods."""
 
+import functools
 import itertools
 import sys
+from typing import Any
 
+import equinox as eqx
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import jax
@@ -177,6 +180,8 @@ def test_points_of_any_shape_have_distances():
 def test_an_obstacle_of_ones_own():
     assert float(Torus(3, 1.0).distance((0, 5, 0))) == pytest.approx(1, abs=1e-15)
     assert float(rj.Union(Torus(3, 1.0), SPHERE).distance((0, 0, 4))) == pytest.approx(3, abs=1e-15)
+    ring = rj.clearance(solved(), [Torus(3.0, 1.0), Torus(2, 0.5)])
+    np.testing.assert_allclose(ring.distance, [0.995, 0.495], rtol=0, atol=1e-12)
 
 
 def test_distances_have_derivatives_by_the_obstacle():
@@ -243,6 +248,90 @@ def test_what_is_no_stl_of_a_body_is_refused(tmp_path, monkeypatch):
         rj.Mesh.from_stl(path)
 
 
+ROD = rj.problems.cable()
+STRAIGHT = rj.Scene(ROD, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free(), gravity=(0, 0, 0))
+
+
+@functools.cache
+def solved(weight: float = 0.0, EI: float | None = None) -> rj.Equilibrium:
+    """A clamped cable, straight without weight: scenes of one program."""
+    rod = rj.Rod(1.0, ROD.EI if EI is None else EI, ROD.GJ, ROD.EA, ROD.mass_per_length, ROD.radius)
+    return rj.solve(rj.Scene(rod, STRAIGHT.start, STRAIGHT.end, (0, 0, -weight)), segments=4)
+
+
+def test_clearance_of_a_straight_rod_in_closed_form():
+    sphere, floor = rj.Sphere((0.55, 0.3, 0.4), 0.1), rj.Plane((0, 0, -0.2), (0, 0, 1))
+    found = rj.clearance(solved(), [sphere, floor])
+    np.testing.assert_allclose(found.distance, [0.5 - 0.1 - 0.005, 0.2 - 0.005], rtol=0, atol=1e-12)
+    assert float(found.s[0]) == pytest.approx(0.55)
+    np.testing.assert_allclose(found.point[0], [0.55, 0, 0], rtol=0, atol=1e-12)
+    # Among the nodes alone the nearest is 0.05 m off.
+    nodes = rj.clearance(solved(), [sphere], points=0)
+    assert float(nodes.distance[0]) == pytest.approx(np.hypot(0.5, 0.05) - 0.105, abs=1e-12)
+
+
+def test_clearance_has_derivatives_by_the_obstacle():
+    def distance(radius, center):
+        return rj.clearance(solved(), [rj.Sphere(center, radius)]).distance[0]
+
+    by_radius, by_center = jax.grad(distance, argnums=(0, 1))(0.1, jnp.array([0.55, 0.3, 0.4]))
+    assert float(by_radius) == pytest.approx(-1, abs=1e-14)
+    np.testing.assert_allclose(by_center, [0, 0.6, 0.8], rtol=0, atol=1e-12)
+
+
+def test_clearance_has_derivatives_by_the_scene():
+    """By the bending stiffness of a cable that hangs beside a box, against central differences."""
+    box = rj.Box((0.6, 0, -1), (0.4, 0.4, 0.4))
+
+    def distance(EI, weight):
+        scene = rj.Scene(
+            rj.Rod(1.0, EI, ROD.GJ, ROD.EA, ROD.mass_per_length, ROD.radius),
+            STRAIGHT.start,
+            STRAIGHT.end,
+            jnp.array([0.0, 0.0, -1.0]) * weight,
+        )
+        return rj.clearance(rj.solve(scene, segments=4), [box]).distance[0]
+
+    EI, h = float(ROD.EI), 1e-4
+    found = jax.grad(distance)(EI, 0.4)
+    above, below = (rj.clearance(solved(0.4, EI * (1 + step)), [box]).distance[0] for step in (h, -h))
+    assert float(found) == pytest.approx(float((above - below) / (2 * h * EI)), rel=1e-6)
+
+
+def test_clearances_of_stacks():
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), solved(), solved(0.4))
+    obstacles = [rj.Sphere((0.55, 0.3, 0.4), 0.1), OBSTACLES["mesh"], OBSTACLES["union"]]
+    found = rj.clearance(stack, obstacles)
+    assert found.distance.shape == found.s.shape == (2, 3)
+    assert found.point.shape == (2, 3, 3)
+    mapped = jax.jit(jax.vmap(lambda equilibrium: rj.clearance(equilibrium, obstacles)))(stack)
+    each = [rj.clearance(equilibrium, obstacles) for equilibrium in (solved(), solved(0.4))]
+    for k in range(2):
+        for one in (jax.tree.map(lambda leaf: leaf[k], found), jax.tree.map(lambda leaf: leaf[k], mapped)):  # noqa: B023
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), one, each[k])
+
+
+def with_radius(radius: Any) -> rj.Equilibrium:
+    """The straight rod, thinner or thicker, which changes nothing else."""
+    rod = rj.Rod(1.0, ROD.EI, ROD.GJ, ROD.EA, radius=radius)
+    return eqx.tree_at(lambda equilibrium: equilibrium.scene.rod.radius, solved(), rod.radius)
+
+
+@pytest.mark.parametrize(
+    ("radius", "distance", "s"),
+    [
+        (rj.Steps([0.5], [0.01, 0.03]), 0.17, 0.5),
+        (rj.Steps([0.25, 0.5], [0.01, 0.03, 0.02]), 0.17, 0.25),
+        (rj.Smooth([0, 0.5, 1], [0.01, 0.02, 0.04]), 0.16, 1),
+    ],
+)
+def test_clearance_of_a_rod_whose_radius_varies(radius, distance, s):
+    """Above a floor it is least at the first of the thickest places; a jump counts as thick."""
+    found = rj.clearance(with_radius(radius), [rj.Plane((0, 0, -0.2), (0, 0, 1))])
+    assert float(found.distance[0]) == pytest.approx(distance, abs=1e-12)
+    assert float(found.s[0]) == pytest.approx(s)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -281,6 +370,12 @@ def test_what_is_no_stl_of_a_body_is_refused(tmp_path, monkeypatch):
         (lambda: rj.Mesh(CORNERS, [(0, 3, 1), *TRIANGLES[1:]]), "faces must close a surface"),
         (lambda: rj.Mesh.from_stl(5), "path must be the name of a file, got 5"),
         (lambda: rj.Mesh.from_stl("body.stl", scale=0), "scale must be positive"),
+        (lambda: rj.clearance(STRAIGHT, [SPHERE]), "equilibrium must be an Equilibrium, got Scene"),
+        (lambda: rj.clearance(solved(), SPHERE), "obstacles must be a list of Obstacle, got Sphere"),
+        (lambda: rj.clearance(solved(), []), "obstacles must hold at least one Obstacle, got none"),
+        (lambda: rj.clearance(solved(), [SPHERE, ROD]), r"obstacles\[1\] must be an Obstacle, got Rod"),
+        (lambda: rj.clearance(solved(), [SPHERE], points=-1), "points must be a whole number from 0 to 10000, got -1"),
+        (lambda: rj.clearance(with_radius(None), [SPHERE]), "equilibrium.scene.rod must have a radius, got None"),
     ],
 )
 def test_bad_obstacles_are_refused(make, message):

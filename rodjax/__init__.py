@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from rodjax import problems
 from rodjax.along import Smooth, Steps
 from rodjax.batch import solve_batch
+from rodjax.clearance import Clearance, clearance
 from rodjax.compilation import enable_compilation_cache
 from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
 from rodjax.equilibrium import solve
@@ -13,6 +14,7 @@ from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
+from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Plane, Sphere, Union
 from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Law, Rod
@@ -25,6 +27,7 @@ from rodjax.solvers.nonlinear_cg import NonlinearCG
 from rodjax.status import Status
 from rodjax.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
 from rodjax.tracing import BranchEnd
+from rodjax.triangle_mesh import Mesh
 
 if TYPE_CHECKING:
     from rodjax.continuum import solve_continuum
@@ -46,13 +49,18 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Box",
     "Branch",
     "BranchEnd",
+    "Capsule",
     "Centerline",
     "Clamp",
+    "Clearance",
     "Clip",
     "CriticalPoint",
     "CriticalValue",
+    "Cylinder",
+    "Distance",
     "DistributedCouple",
     "DistributedForce",
     "EndForce",
@@ -65,22 +73,28 @@ __all__ = [
     "Guess",
     "Law",
     "LineSearch",
+    "Mesh",
     "Mode",
     "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Obstacle",
     "Pin",
+    "Plane",
     "PointForce",
     "Reading",
     "Rod",
     "Scene",
     "SceneFileError",
     "Smooth",
+    "Sphere",
     "Status",
     "Steps",
     "Swivel",
+    "Union",
     "Unknown",
+    "clearance",
     "critical_point",
     "critical_points",
     "describe",

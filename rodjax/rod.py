@@ -67,7 +67,7 @@ class Rod(eqx.Module):
     - `GJ`: torsional stiffness [N m^2].
     - `EA`: stretching stiffness [N].
     - `mass_per_length` [kg/m]: gives the weight in a scene with gravity.
-    - `radius` [m]: for pictures only; `None` where unknown.
+    - `radius` [m]: for pictures and clearances only; `None` where unknown.
     - `rest_curvature`: a pair (k1, k2) [1/m], components of t x t' along d1 and d2 in the shape without stress; `None`
         for a straight one. Not a first guess.
     - `rest_twist` [rad/m] in the shape without stress; `None` for none.

@@ -59,7 +59,7 @@ def test_samples_tell_the_largest_value():
 
 
 def test_a_radius_that_varies_leaves_the_rod_plain():
-    """It is for pictures only: no angle about the tangent is needed, and the radius is scaled with the rod."""
+    """No angle about the tangent is needed for it, and it is scaled with the rod."""
     rod = rj.Rod(2.0, 3.0, 1.0, 1e4, radius=rj.Steps([0.5], [0.01, 0.02]))
     assert rod.is_plain
     scene = rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free(force=(0, 0, 1)))

@@ -246,6 +246,8 @@ def is_points(value: Any) -> bool:
 # Functions, good arguments, and bad ones to take the place of one of them.
 SECTION = dict(length=1.0, youngs_modulus=1e7, shear_modulus=3e6, density=1e3)
 MODULI = dict(length=POSITIVE, youngs_modulus=POSITIVE, shear_modulus=optional(POSITIVE), density=NOT_NEGATIVE)
+SEGMENT = dict(start=(0, 0, 0), end=(0, 0, 1), radius=0.1)
+TETRAHEDRON = [(0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)]
 CALLS: dict[str, tuple[Callable, dict[str, Any], dict[str, st.SearchStrategy]]] = {
     "Rod": (
         rj.Rod,
@@ -278,6 +280,25 @@ CALLS: dict[str, tuple[Callable, dict[str, Any], dict[str, st.SearchStrategy]]] 
         rj.rotate,
         dict(frame=LEVEL, rotation_vector=(0, 0, 0)),
         dict(frame=ROTATION, rotation_vector=VECTOR | st.just((1e200, 0, 0))),
+    ),
+    "Plane": (rj.Plane, dict(point=(0, 0, 0), normal=(0, 0, 1)), dict(point=VECTOR, normal=DIRECTION)),
+    "Sphere": (rj.Sphere, dict(center=(0, 0, 0), radius=1.0), dict(center=VECTOR, radius=POSITIVE)),
+    "Capsule": (rj.Capsule, SEGMENT, dict(start=VECTOR, end=VECTOR | st.just((0, 0, 0)), radius=POSITIVE)),
+    "Cylinder": (rj.Cylinder, SEGMENT, dict(start=VECTOR, end=VECTOR | st.just((0, 0, 0)), radius=POSITIVE)),
+    "Box": (
+        rj.Box,
+        dict(center=(0, 0, 0), size=(1, 1, 1)),
+        dict(center=VECTOR, size=VECTOR | st.floats(max_value=0).map(lambda x: (1, x, 1)), frame=optional(ROTATION)),
+    ),
+    "Mesh": (
+        rj.Mesh,
+        dict(vertices=np.eye(4)[:, :3], faces=TETRAHEDRON),
+        dict(
+            vertices=not_finite((4, 3)) | numbers((4, 3)).filter(lambda value: not is_points(value)),
+            faces=ANYTHING
+            | st.integers(min_value=4).map(lambda vertex: [*TETRAHEDRON[:3], (0, vertex, 3)])
+            | st.just(TETRAHEDRON[:3]),
+        ),
     ),
     "Guess": (
         rj.Guess,
@@ -342,6 +363,8 @@ def refuses_the_argument(example, world):
 
 
 for group in (["Rod", "circular", "tube", "poisson"], ["Clamp", "Swivel", "Pin", "Free", "PointForce"]):
+    PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument
+for group in (["Plane", "Sphere", "Capsule"], ["Cylinder", "Box", "Mesh"]):
     PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument
 for group in (["frame", "rotate"], ["Scene", "Guess"], ["Newton", "NonlinearCG", "LineSearch"]):
     PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument

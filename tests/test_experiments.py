@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rodjax as rj
 from rodjax import problems
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -320,3 +321,67 @@ def test_general_rods(tmp_path):
     assert len(at_45) == 4
     with open(tmp_path / "general_rods.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == len(rows)
+
+
+@pytest.mark.slow
+def test_wire_loops(tmp_path):
+    """One made-up loop in the data's form; the data themselves are not part of the project."""
+    loops = script("wire_loops")
+    s = np.linspace(0, 1.5, 51)
+    wire = loops.Loop("white", "0", s, np.zeros((51, 2)), 0.0174)
+    turn = 2 * np.pi * s / 1.5
+    circle = 1.5 / (2 * np.pi) * np.stack([np.sin(turn), 1 - np.cos(turn)], axis=1) - 0.12 * s[:, None] / 1.5 * [1, 0]
+    first = wire._replace(points=circle)
+    EI = 1e-4
+    estimate = {"rod.EI": EI, loops.ANGLES[0]: 0.1, loops.ANGLES[1]: -0.2}
+    shape = rj.solve(
+        loops.with_estimate(loops.experiment(first).scene, estimate), guess=loops.first(first), segments=64
+    )
+    points = np.asarray(shape.position_at(s))[:, :2]
+    with open(tmp_path / "loops.csv", "w") as file:
+        print("wire,repeat,node,s_m,x_m,y_down_m", file=file)
+        for repeat in range(2):
+            for k, (x, y) in enumerate(points):
+                print("white", repeat, k, s[k], x, y, sep=",", file=file)
+    (tmp_path / "wires.csv").write_text("wire,mass_per_length_kg_m\nwhite,0.0174\n")
+    loops.main(["--data", str(tmp_path), "--out", str(tmp_path)])
+    with open(tmp_path / "fits.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["model"] for row in rows] == ["EI"] * 2 + ["EI+angles"] * 2 + ["EI+angles+tilt"] * 2 + [
+        "EI+angles, pooled"
+    ]
+    assert all(row["converged"] == "True" for row in rows)
+    # With the angles of the truth; the meshes of 32 elements have an error of 4e-4 of the length.
+    for row in (*rows[2:4], rows[6]):
+        assert float(row["EI"]) == pytest.approx(EI, rel=5e-3)
+        assert float(row["theta0_deg"]) == pytest.approx(np.degrees(0.1), abs=0.2)
+        assert float(row["thetaL_deg"]) == pytest.approx(np.degrees(-0.2), abs=0.2)
+        assert float(row["rms_m"]) < 1e-3
+    assert float(rows[0]["rms_m"]) > 1e-3
+    with open(tmp_path / "prediction.csv", newline="") as file:
+        assert [row["left_out"] for row in csv.DictReader(file)] == ["0", "1"]
+    assert "rod.GJ cannot be found from these measurements" in (tmp_path / "report_white.txt").read_text()
+    assert (tmp_path / "wire_loops.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_identify_synthetic(tmp_path):
+    rows = script("identify_synthetic").main(
+        ["--count", "16", "--peers", "1", "--joint", "2", "--joint-peer", "0", "--out", str(tmp_path)]
+    )
+    found = {row.case: row.value for row in rows}
+    assert float(found["recovery: converged"]) == 1
+    # Of 16 intervals of 95 % fewer than 11 hold the truth once in 100000 times.
+    assert min(float(value) for case, value in found.items() if "coverage" in case) > 10 / 16
+    assert float(found["peer, compiled: its estimates beside ours"]) < 1e-4
+    assert (tmp_path / "identify_synthetic.csv").exists()
+
+
+@pytest.mark.slow
+def test_contact_free_force(tmp_path, capsys):
+    alone, both = script("contact_free_force").main(["--few", "--out", str(tmp_path)])
+    assert alone.stiffness_by_truth == "refused: rod.EI x 2.72 with rod.mass_per_length x 2.72"
+    error = float(both.stiffness_error)
+    assert error < 0.05
+    assert float(both.stiffness_by_truth) == pytest.approx(1, abs=4 * error)
+    assert "best first" in capsys.readouterr().out

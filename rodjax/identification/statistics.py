@@ -14,6 +14,8 @@ from rodjax.identification.unknowns import Unknown
 LARGEST_DEVIATION = 3.0
 # The same where the information is rounding beside that of the best known combination: derivatives have ten digits.
 LEAST_INFORMATION = 1e-15
+# A held number whose relative standard error would be above this is hardly to be found.
+HARDLY_FOUND = 0.3
 # Parts of a combination that are smaller beside the largest are not named.
 LEAST_PART = 0.03
 
@@ -152,9 +154,10 @@ def held_numbers(
             combination = _combination([*unknowns, one], follows, deviation, length)
             told.append(f"{one.label} cannot be told apart: {combination.words} leaves all measurements as they are")
         else:
+            can = "could" if deviation < HARDLY_FOUND else "could hardly"
             size = "a relative" if one.scale == "log" else "a"
             told.append(
-                f"{one.label} could be found too, with {size} standard error of {_size(one, deviation, length)}"
+                f"{one.label} {can} be found too, with {size} standard error of {_size(one, deviation, length)}"
             )
     return told
 

@@ -10,7 +10,8 @@ import rodjax
 
 # Before JAX's first program. Most of the tests' time is compiling: without optimisation half as long, and what is
 # compiled runs half as fast. `RODJAX_TESTS_OPTIMIZED` asks for programs as users have them.
-if not os.environ.get("RODJAX_TESTS_OPTIMIZED"):
+IS_OPTIMIZED = bool(os.environ.get("RODJAX_TESTS_OPTIMIZED"))
+if not IS_OPTIMIZED:
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
     # As `rodjax.compilation.QUICK`, also for the programs in which tests use solves.
     if jax.__version_info__ < (0, 11):
@@ -26,6 +27,11 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if "optimized" in item.keywords and not IS_OPTIMIZED:
+            item.add_marker(
+                pytest.mark.skip(reason="two programs are the same to the last bit only as users have them")
+            )
     if not config.getoption("--slow"):
         skip = pytest.mark.skip(reason="slow: run with --slow")
         for item in items:

@@ -64,6 +64,7 @@ def test_an_unchanged_scene_takes_no_iteration(figure_1):
     np.testing.assert_array_equal(again.nodes, jnp.broadcast_to(last.nodes, again.nodes.shape))
 
 
+@pytest.mark.optimized
 def test_progress_changes_nothing(figure_1, capsys):
     path = solve_path(problems.figure_1(), guess=problems.figure_1_start(), progress=True)
     np.testing.assert_array_equal(path.nodes, figure_1.nodes)

@@ -38,7 +38,8 @@ FIRST = 1000.0
 VIEW = rj.orthographic((1, 0, 0), (0, 1, 0))
 ANGLES = ("start.frame.2", "end.frame.2")
 TILT = "gravity.0"
-SEGMENTS = 32
+# The white wire turns sharply at the clamps: 32 elements change its stiffness by 1.4 %, 64 by 0.1 %.
+SEGMENTS = 64
 
 
 class Row(NamedTuple):

@@ -351,12 +351,12 @@ def test_wire_loops(tmp_path):
         "EI+angles, pooled"
     ]
     assert all(row["converged"] == "True" for row in rows)
-    # With the angles of the truth; the meshes of 32 elements have an error of 4e-4 of the length.
+    # With the angles of the truth; the meshes of 64 elements change the stiffness by 0.1 %.
     for row in (*rows[2:4], rows[6]):
         assert float(row["EI"]) == pytest.approx(EI, rel=5e-3)
         assert float(row["theta0_deg"]) == pytest.approx(np.degrees(0.1), abs=0.2)
         assert float(row["thetaL_deg"]) == pytest.approx(np.degrees(-0.2), abs=0.2)
-        assert float(row["rms_m"]) < 1e-3
+        assert float(row["rms_m"]) < 1e-4
     assert float(rows[0]["rms_m"]) > 1e-3
     with open(tmp_path / "prediction.csv", newline="") as file:
         assert [row["left_out"] for row in csv.DictReader(file)] == ["0", "1"]

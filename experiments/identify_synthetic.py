@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 
 import rodjax as rj
 
-SEGMENTS = 24
+SEGMENTS = 32
 EI, GJ, MASS = 4.9e-3, 3.3e-3, 0.08
 SD_POINT, SD_FORCE, SD_MOMENT = 1e-3, 1e-2, 1e-3
 S = np.linspace(0.05, 0.95, 21)
@@ -88,7 +88,7 @@ def timed(function: Any) -> tuple[Any, float]:
 
 
 def recovery(count: int, peers: int) -> list[Row]:
-    experiments, truth = made_up(count, seed=1, spread=SPREAD)
+    experiments, truth = made_up(count, seed=5, spread=SPREAD)
     unknowns = [rj.Unknown(name) for name in (*MATERIAL, *NUISANCE)]
     fits, seconds = timed(lambda: rj.fit_each(experiments, unknowns, segments=SEGMENTS))
     rows = [

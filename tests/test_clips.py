@@ -270,9 +270,8 @@ def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
     [
         ("hermite", None, (False, False)),
         ("hermite", Free(), (False, False)),
-        ("hermite", None, (True, True)),
+        ("hermite", None, (False, True)),
         ("finite_difference", None, (False, False)),
-        ("finite_difference", None, (False, True)),
     ],
 )
 def test_derivatives_by_place_position_and_direction(discretization, end, sliding):

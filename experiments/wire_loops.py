@@ -181,8 +181,9 @@ def with_estimate(scene: rj.Scene, estimate: dict[str, float]) -> rj.Scene:
 
 
 def draw(loops: Sequence[Loop], rows: Sequence[Row], out: Path) -> None:
-    figure, axes = plt.subplots(1, 3, figsize=(12, 5), layout="constrained")
-    for axis, wire in zip(axes, dict.fromkeys(loop.wire for loop in loops), strict=True):
+    wires = list(dict.fromkeys(loop.wire for loop in loops))
+    figure, axes = plt.subplots(1, len(wires), figsize=(4 * len(wires), 5), layout="constrained", squeeze=False)
+    for axis, wire in zip(axes[0], wires, strict=True):
         for k, loop in enumerate(loop for loop in loops if loop.wire == wire):
             color = f"C{k}"
             axis.plot(*loop.points.T, ".", color=color, markersize=3)

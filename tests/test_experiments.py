@@ -342,7 +342,7 @@ def test_wire_loops(tmp_path):
         print("wire,repeat,node,s_m,x_m,y_down_m", file=file)
         for repeat in range(2):
             for k, (x, y) in enumerate(points):
-                print("white", repeat, k, s[k], x, y, sep=",", file=file)
+                print("white", repeat, k, s[k], f"{x:.6f},{y:.6f}", sep=",", file=file)
     (tmp_path / "wires.csv").write_text("wire,mass_per_length_kg_m\nwhite,0.0174\n")
     loops.main(["--data", str(tmp_path), "--out", str(tmp_path)])
     with open(tmp_path / "fits.csv", newline="") as file:

@@ -3,6 +3,7 @@
 import functools
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -163,9 +164,34 @@ def test_bounds_and_priors():
     error = free.standard_error["rod.EI"] / free.estimate["rod.EI"]
     weak = rj.Unknown("rod.EI", prior=(EI, error / free.sigma))
     fit = rj.fit(experiments(1.0), (weak, UNKNOWNS[1], shift), **SETTINGS)
+    # The prior is one more deviation in the scatter.
+    rows = [x / sd for of_one in fit.residuals for x, sd in zip(of_one, (SD, 1e-2), strict=True)]
+    squares = sum(float(np.sum(x**2)) for x in rows) + (math.log(fit.estimate["rod.EI"] / EI) * free.sigma / error) ** 2
+    assert fit.degrees_of_freedom == free.degrees_of_freedom + 1
+    assert fit.sigma == pytest.approx(math.sqrt(squares / fit.degrees_of_freedom), rel=1e-9)
     middle = math.sqrt(EI * free.estimate["rod.EI"])
     # As certain as the data: half way, on the scale of logarithms, to second order in the error of 1 %.
     assert fit.estimate["rod.EI"] == pytest.approx(middle, rel=0.05 * error)
+
+
+@pytest.mark.slow
+def test_an_experiment_left_out_takes_its_own_unknown_along():
+    """As where it had no equilibrium to begin with: the data say nothing of it, which is no fault of the others."""
+    fit = noisy_fit()
+
+    found = eqx.tree_at(
+        lambda found: [found.evaluation.is_used, *(getattr(found.information, name) for name in BLOCKS)],
+        fit.found,
+        replace_fn=lambda x: x.at[0].set(False) if x.dtype == bool else x.at[0].set(0.0),
+    )
+    less = Fit.of(fit.setup, fit.structure, fit.problem, found, [], math.nan)
+    assert less.undetermined == []
+    assert less.degrees_of_freedom == fit.degrees_of_freedom - 30 + 1
+    assert np.isnan(less.standard_error["measured.0.shift"][0])
+    assert np.all(np.isfinite(less.standard_error["measured.0.shift"][1:]))
+
+
+BLOCKS = ("each", "so", "oo", "scores")
 
 
 @pytest.mark.slow

@@ -2,9 +2,8 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,27 +12,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
-from rodjax.checks import leaf, one_of, positive, whole_number
+from rodjax.checks import leaf
 from rodjax.compilation import compiled
-from rodjax.equilibrium import Discretization, checked_options
-from rodjax.identification.fit import MAX_STEPS, rtol_of
+from rodjax.equilibrium import Discretization
 from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates
-from rodjax.identification.loss import THRESHOLDS, Loss
+from rodjax.identification.loss import Loss
 from rodjax.identification.measurements import Experiment
 from rodjax.identification.problem import Group, Problem, Structure, search, values
 from rodjax.identification.setup import (
+    MAX_STEPS,
     Setup,
     beginnings,
     begun,
+    checked_threshold,
+    finer,
     largest_error,
     prepared,
     stacked,
     structure_of,
 )
-from rodjax.identification.statistics import LARGEST_DEVIATION
+from rodjax.identification.statistics import LARGEST_DEVIATION, inverse, rates
 from rodjax.identification.unknowns import Unknown
-from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium
 
 
@@ -100,8 +100,7 @@ def fit_each(
     Returns `Fits`; an experiment that does not converge is marked and does not affect others. Raises `ValueError` or
     `TypeError` for arguments that make no sense.
     """
-    one_of(loss, "loss", get_args(Loss))
-    threshold = THRESHOLDS[loss] if threshold is None else float(positive(threshold, "threshold"))
+    threshold = checked_threshold(loss, threshold)
     setup = prepared(experiments, unknowns)
     labels = [one if isinstance(one, str) else one.label for one in unknowns]
     both = sorted((*setup.shared, *setup.own), key=lambda unknown: labels.index(unknown.label))
@@ -120,17 +119,7 @@ def fit_each(
     if is_free.shape != (count, p) or is_free.dtype != bool:
         raise ValueError(f"free must be of bool of shape {(count, p)}, got {is_free.dtype} of shape {is_free.shape}")
     is_free = is_free[np.array(setup.order)]
-    options, tolerance = checked_options(
-        setup.experiments[0].scene, segments, rtol_of(rtol, segments), discretization, None, None, planar
-    )
-    structure = structure_of(
-        setup,
-        loss=loss,
-        segments=options.segments,
-        discretization=options.discretization,
-        planar=planar,
-        max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
-    )
+    structure, tolerance = structure_of(setup, loss, rtol, segments, discretization, planar, max_steps)
     problem, starts = _begun(setup, groups, threshold)
     first = Coordinates(jnp.zeros(0, starts.dtype), starts)
     as_own = structure._replace(shared=(), own=structure.shared)
@@ -138,13 +127,12 @@ def fit_each(
     shapes = beginnings(as_own, at_start, first, guesses)[0]
     while True:
         found = _each(structure, problem, starts, leaf(is_free), shapes)
-        error = math.nan if tolerance is None else largest_error((found.equilibria,))
-        finest = SIZES[structure.discretization][-1]
-        if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
+        error = largest_error((found.equilibria,), tolerance)
+        better = finer(structure, error, tolerance)
+        if better is None:
             break
-        finer = next_size(structure.segments, error, tolerance, structure.discretization)
-        structure, starts = structure._replace(segments=finer), found.at
-        as_own = as_own._replace(segments=finer)
+        structure, starts = better, found.at
+        as_own = as_own._replace(segments=better.segments)
         shapes = beginnings(as_own, at_start, first._replace(own=starts), (found.equilibria,))[0]
     return _fits(setup, structure, problem, found, is_free, error)
 
@@ -228,17 +216,15 @@ def _fits(
     with np.errstate(divide="ignore", invalid="ignore"):
         estimated = np.asarray(found.squares) / freedom / np.asarray(found.slope) ** 2
     dispersion = np.where(freedom > 0, estimated, 1.0 if setup.has_sd else np.nan)
-    finite = np.all(np.isfinite(matrix), axis=(1, 2))
-    eigenvalues, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, np.eye(matrix.shape[1])))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        covariance = (vectors / np.maximum(eigenvalues, np.finfo(float).tiny)[:, None]) @ np.swapaxes(vectors, 1, 2)
-        covariance = np.where(finite[:, None, None], covariance * dispersion[:, None, None], np.nan)
-        deviations = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    finite = np.all(np.isfinite(matrix), axis=(1, 2))[:, None, None]
+    covariance = np.where(finite, inverse(np.where(finite, matrix, np.eye(matrix.shape[1]))), np.nan)
+    covariance = covariance * dispersion[:, None, None]
+    deviations = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     is_log = np.array([unknown.scale == "log" for unknown in setup.shared])
     estimates = np.asarray(found.values, float)
-    rates = np.where(is_log, estimates, 1.0) * np.asarray(problem.shared.size)[None]
-    covariance = covariance * rates[:, :, None] * rates[:, None, :]
-    errors = np.where(is_free, deviations * rates, np.nan)
+    by_size = rates(setup.shared, estimates, float(setup.experiments[0].scene.rod.length))
+    covariance = covariance * by_size[:, :, None] * by_size[:, None, :]
+    errors = np.where(is_free, deviations * by_size, np.nan)
     determined = np.all((deviations < LARGEST_DEVIATION) | ~is_free, axis=1)
     return Fits(
         labels=[unknown.label for unknown in setup.shared],

@@ -4,7 +4,6 @@ import functools
 import math
 import warnings
 from collections.abc import Sequence
-from typing import get_args
 
 import equinox as eqx
 import jax
@@ -13,18 +12,21 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
-from rodjax.checks import leaf, one_of, positive, whole_number
+from rodjax.checks import leaf
 from rodjax.continuation import critical_point
-from rodjax.equilibrium import Discretization, checked_options
+from rodjax.equilibrium import Discretization
 from rodjax.identification.least_squares import Coordinates
-from rodjax.identification.loss import THRESHOLDS, Loss
+from rodjax.identification.loss import Loss
 from rodjax.identification.measurements import CriticalValue, Experiment
 from rodjax.identification.problem import Critical, Found, Group, Problem, Ranges, Structure, in_units, search_compiled
 from rodjax.identification.result import Fit, NotIdentifiableError
 from rodjax.identification.setup import (
+    MAX_STEPS,
     Setup,
     beginnings,
     begun,
+    checked_threshold,
+    finer,
     largest_error,
     prepared,
     stacked,
@@ -32,11 +34,8 @@ from rodjax.identification.setup import (
     warn_of_lost,
 )
 from rodjax.identification.unknowns import Unknown, with_values
-from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium, NotConvergedWarning
 
-DEFAULT_RTOL = 1e-4
-MAX_STEPS = 100
 # The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.
 MAX_ROUNDS = 20
 SETTLED = 1e-6
@@ -74,22 +73,9 @@ def fit(
     it names; `ValueError` or `TypeError` for arguments that make no sense. Experiments without an equilibrium at the
     start are left out, with a `NotConvergedWarning`.
     """
-    one_of(loss, "loss", get_args(Loss))
-    if threshold is not None and loss == "linear":
-        raise ValueError("threshold must be None where loss is 'linear', which has none")
-    threshold = THRESHOLDS[loss] if threshold is None else float(positive(threshold, "threshold"))
+    threshold = checked_threshold(loss, threshold)
     setup = prepared(experiments, unknowns)
-    options, tolerance = checked_options(
-        setup.experiments[0].scene, segments, rtol_of(rtol, segments), discretization, None, None, planar
-    )
-    structure = structure_of(
-        setup,
-        loss=loss,
-        segments=options.segments,
-        discretization=options.discretization,
-        planar=planar,
-        max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
-    )
+    structure, tolerance = structure_of(setup, loss, rtol, segments, discretization, planar, max_steps)
     groups, guesses = stacked(setup)
     problem, at = begun(setup, groups, threshold)
     held = _held_numbers(setup, groups)
@@ -98,13 +84,11 @@ def fit(
     while True:
         found, problem = _settled(setup, structure, problem, at, results)
         at, results = found.at, found.evaluation.results
-        error = math.nan if tolerance is None else largest_error(results)
-        finest = SIZES[structure.discretization][-1]
-        if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
+        error = largest_error(results, tolerance)
+        better = finer(structure, error, tolerance)
+        if better is None:
             break
-        finer = next_size(structure.segments, error, tolerance, structure.discretization)
-        structure = structure._replace(segments=finer)
-        results = beginnings(structure, problem, at, results)
+        structure, results = better, beginnings(better, problem, at, results)
     warn_of_lost(setup, np.asarray(found.evaluation.is_used))
     if not found.converged:
         warnings.warn(
@@ -117,10 +101,6 @@ def fit(
     if result.undetermined:
         raise NotIdentifiableError(result)
     return result
-
-
-def rtol_of(rtol: float | None, segments: int | None) -> float | None:
-    return DEFAULT_RTOL if rtol is None and segments is None else rtol
 
 
 def _settled(

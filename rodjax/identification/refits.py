@@ -18,8 +18,8 @@ from rodjax.identification.lanes import LANES
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment, Measurement
 from rodjax.identification.problem import Found, Problem, Structure, looked_at, search, values
-from rodjax.identification.setup import Setup, beginnings, begun, clusters_of, prepared, stacked, structure_of
-from rodjax.identification.statistics import Blocks
+from rodjax.identification.setup import Setup, beginnings, begun, clusters_of, prepared, stacked
+from rodjax.identification.statistics import Blocks, rates
 from rodjax.identification.unknowns import outside
 from rodjax.result import Equilibrium
 
@@ -206,34 +206,23 @@ def next_experiment(
     there = eqx.tree_at(lambda p: p.scale, there, problem.scale)
     p = len(setup.shared)
     at = Coordinates(found.at.shared[:p], start.own)
-    settings = structure._replace(factors=())._asdict()
-    of_candidates = structure_of(planned, **{k: v for k, v in settings.items() if k not in ("shared", "own")})
+    of_candidates = structure._replace(factors=())
     told = looked_at(of_candidates, there, at, beginnings(of_candidates, there, at, guesses))
-    normal = told.information
-    is_free = np.asarray(there.is_free.own)
-    own = np.asarray(normal.oo) + np.eye(is_free.shape[1])[None] * ~is_free[..., None]
-    known = _on_shared(problem, found)[:p, :p]
+    each = np.asarray(told.information.each, float)
+    blocks = Blocks.of(told.information, np.asarray(there.is_free.own))
+    is_free = np.asarray(problem.is_free.own) & np.asarray(found.evaluation.is_used)[:, None]
+    known = Blocks.of(found.information, is_free).of_shared(p).on_shared
     converged = np.asarray(told.evaluation.is_used)
     gains, errors = np.full(len(planned.order), np.nan), np.full((len(planned.order), len(setup.shared)), np.nan)
     for row, k in enumerate(planned.order):
         if not converged[row]:
             continue
-        alone = Blocks(np.asarray(normal.each[row]), np.asarray(normal.so[row : row + 1]), own[row : row + 1])
+        alone = Blocks(each[row], blocks.so[row : row + 1], blocks.oo[row : row + 1])
         both = known + alone.on_shared
         gains[k] = 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(known)[1])
         errors[k] = np.sqrt(dispersion * np.diag(np.linalg.inv(both)))
-    shared = np.asarray(values(structure, problem, found.at)[0])
-    sizes = [float(x) for x in problem.shared.size[:p]]
-    rates = [
-        x * size if one.scale == "log" else size for one, x, size in zip(setup.shared, shared[:p], sizes, strict=True)
-    ]
+    shared = np.asarray(values(structure, problem, found.at)[0], float)[:p]
+    errors = errors * rates(setup.shared, shared, float(setup.experiments[0].scene.rod.length))
     order = [int(k) for k in np.argsort(-np.where(np.isnan(gains), -np.inf, gains))]
     labels = [unknown.label for unknown in setup.shared]
-    return Ranking(order, gains, {label: errors[:, k] * rates[k] for k, label in enumerate(labels)})
-
-
-def _on_shared(problem: Problem, found: Found) -> Float[np.ndarray, "p p"]:
-    normal = found.information
-    is_free = np.asarray(problem.is_free.own)
-    fixed = np.eye(is_free.shape[1])[None] * ~is_free[..., None]
-    return Blocks(np.asarray(normal.ss), np.asarray(normal.so), np.asarray(normal.oo) + fixed).on_shared
+    return Ranking(order, gains, {label: errors[:, k] for k, label in enumerate(labels)})

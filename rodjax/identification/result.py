@@ -12,11 +12,11 @@ from scipy import stats
 
 from rodjax.checks import number_array
 from rodjax.identification import refits
-from rodjax.identification.least_squares import Coordinates, NormalEquations
+from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment
 from rodjax.identification.problem import Found, Problem, Structure, values
 from rodjax.identification.setup import Setup, clusters_of
-from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, undetermined
+from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, rates, undetermined
 from rodjax.identification.unknowns import Unknown
 from rodjax.result import Equilibrium
 from rodjax.status import Status
@@ -83,35 +83,39 @@ class Fit:
         error: float,
     ) -> "Fit":
         length = float(setup.experiments[0].scene.rod.length)
-        p, q = len(setup.shared), len(setup.own)
-        is_free = np.asarray(problem.is_free.own)
-        whole = blocks_of(found.information, is_free)
-        blocks = Blocks(whole.ss[:p, :p], whole.so[:, :p], whole.oo)
+        p = len(setup.shared)
         is_used = np.asarray(found.evaluation.is_used)
+        is_free = np.asarray(problem.is_free.own) & is_used[:, None]
+        whole = Blocks.of(found.information, is_free)
+        blocks = whole.of_shared(p)
         numbers = count_of_numbers(setup, is_used)
         priors = int(np.sum(np.asarray(problem.shared.information) > 0))
         priors += int(np.sum(is_free * (np.asarray(problem.own.information) > 0)[None]))
-        count = p + int(np.sum(is_free[is_used]))
+        count = p + int(np.sum(is_free))
         freedom = numbers + priors - count
         slope = float(found.slope)
-        scatter = float(found.counted) + float(np.sum(np.asarray(problem.critical.deviation) ** 2))
+        beyond = (
+            np.asarray(problem.critical.deviation),
+            np.asarray(problem.shared.deviations(found.at.shared)),
+            np.where(is_free, np.asarray(problem.own.deviations(found.at.own)), 0.0),
+        )
+        scatter = float(found.counted) + sum(float(np.sum(x**2)) for x in beyond)
         dispersion = scatter / freedom / slope**2 if freedom > 0 else (1.0 if setup.has_sd else math.nan)
         shared, own = (np.asarray(x, float) for x in values(structure, problem, found.at))
         shared = shared[:p]
         covariance, own_covariance = blocks.covariance()
         scores = np.asarray(found.information.scores, float)[:, :p]
         robust, clusters = clustered(blocks, scores, clusters_of(setup), slope, numbers, count, is_used)
-        rates = _rates(setup.shared, shared, length)
-        own_rates = np.stack([_rates(setup.own, row, length) for row in own]) if q else np.zeros_like(own)
+        by_size = rates(setup.shared, shared, length)
         order = np.argsort(np.array(setup.order))
-        own_errors = own_rates * np.sqrt(dispersion * np.diagonal(own_covariance, axis1=1, axis2=2))
+        own_errors = rates(setup.own, own, length) * np.sqrt(dispersion * np.diagonal(own_covariance, axis1=1, axis2=2))
         own, own_errors = np.where(is_free, own, np.nan)[order], np.where(is_free, own_errors, np.nan)[order]
         names = [unknown.label for unknown in setup.shared]
         own_names = [unknown.label for unknown in setup.own]
-        errors = np.sqrt(dispersion * np.diag(covariance)) * rates
+        errors = np.sqrt(dispersion * np.diag(covariance)) * by_size
         with np.errstate(invalid="ignore"):
-            robust_errors = np.sqrt(np.diag(robust)) * rates
-        is_lost = not math.isnan(dispersion)
+            robust_errors = np.sqrt(np.diag(robust)) * by_size
+        is_known = not math.isnan(dispersion)
         return Fit(
             setup=setup,
             structure=structure,
@@ -121,8 +125,8 @@ class Fit:
             standard_error=dict(zip(names, errors.tolist(), strict=True))
             | dict(zip(own_names, own_errors.T, strict=True)),
             clustered_error=dict(zip(names, robust_errors.tolist(), strict=True)),
-            covariance=dispersion * covariance * np.outer(rates, rates),
-            clustered_covariance=robust * np.outer(rates, rates),
+            covariance=dispersion * covariance * np.outer(by_size, by_size),
+            clustered_covariance=robust * np.outer(by_size, by_size),
             sigma=math.sqrt(dispersion) * float(problem.scale),
             dispersion=dispersion,
             degrees_of_freedom=freedom,
@@ -130,8 +134,8 @@ class Fit:
             numbers=numbers,
             residuals=_residuals(setup, found),
             statuses=_statuses(setup, found),
-            undetermined=undetermined(blocks, dispersion, setup.shared, setup.own, length) if is_lost else [],
-            held=held_numbers(whole, dispersion, setup.shared, held, length) if is_lost else [],
+            undetermined=undetermined(blocks, dispersion, setup.shared, setup.own, length) if is_known else [],
+            held=held_numbers(whole, dispersion, setup.shared, held, length) if is_known else [],
             at_bounds=_at_bounds(setup, problem, found.at),
             error_estimate=error,
         )
@@ -178,7 +182,8 @@ class Fit:
         freedom = self.clusters - 1 if clustered else self.degrees_of_freedom
         reach = float(stats.t.ppf((1 + level) / 2, freedom)) * error
         if self.setup.shared[k].scale == "log":
-            return value * math.exp(-reach / value), value * math.exp(reach / value)
+            with np.errstate(over="ignore"):  # of what is hardly known
+                return float(value * np.exp(-reach / value)), float(value * np.exp(reach / value))
         return value - reach, value + reach
 
     def equilibrium(self, k: int) -> Equilibrium:
@@ -201,6 +206,8 @@ class Fit:
         `at` (k,): values; `None`: 13 of them, within 3 standard errors.
         """
         k = self._index(label)
+        if not self.dispersion > 0:
+            raise ValueError("profile needs a fit with more numbers than unknowns and some scatter, which this has not")
         if at is None:
             low, high = self.estimate[label], self.standard_error[label]
             offsets = np.linspace(-3, 3, 13) * high
@@ -241,17 +248,6 @@ class Fit:
         if label not in self.labels:
             raise ValueError(f"label must be of an unknown in common, {', '.join(self.labels)}, got {label!r}")
         return self.labels.index(label)
-
-
-def blocks_of(normal: NormalEquations, is_free: Bool[np.ndarray, "e q"]) -> Blocks:
-    fixed = np.eye(is_free.shape[1])[None] * ~is_free[..., None]
-    return Blocks(np.asarray(normal.ss, float), np.asarray(normal.so, float), np.asarray(normal.oo, float) + fixed)
-
-
-def _rates(unknowns: Sequence[Unknown], at: Float[np.ndarray, "n"], length: float) -> Float[np.ndarray, "n"]:
-    """The change of each value by the unknown's coordinate in its sizes."""
-    rates = [x if unknown.scale == "log" else 1.0 for unknown, x in zip(unknowns, at, strict=True)]
-    return np.array(rates) * np.array([unknown.natural_size(length) for unknown in unknowns])
 
 
 def count_of_numbers(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> int:

@@ -2,9 +2,10 @@
 
 import functools
 import itertools
+import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -12,18 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.checks import instance, leaf, sequence
+from rodjax.checks import instance, leaf, one_of, positive, sequence, whole_number
 from rodjax.compilation import compiled
-from rodjax.equilibrium import checked_options, first_state, solve
+from rodjax.equilibrium import Discretization, checked_options, first_state, solve
 from rodjax.guess import Guess
 from rodjax.identification.least_squares import Coordinates
+from rodjax.identification.loss import THRESHOLDS, Loss
 from rodjax.identification.measurements import Centerline, CriticalValue, Experiment
 from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
 from rodjax.path import stack_scenes
+from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.supports import Held
 
+DEFAULT_RTOL = 1e-4
+MAX_STEPS = 100
 # Points of a first shape, as all of a group have the same number.
 GUESS_POINTS = 65
 # Of a rod that a measured centerline must span to serve for the first shape.
@@ -264,12 +269,47 @@ def _first_scale(setup: Setup) -> float:
     return FIRST_SCALE * (scatter or 1.0)
 
 
-def structure_of(setup: Setup, **settings: Any) -> Structure:
-    return Structure(
+def structure_of(
+    setup: Setup,
+    loss: Loss,
+    rtol: float | None,
+    segments: int | None,
+    discretization: Discretization | None,
+    planar: bool,
+    max_steps: int,
+) -> tuple[Structure, float | None]:
+    """What is compiled for these arguments of a fit; and the tolerance to refine for, `None` for a fixed mesh."""
+    if rtol is None and segments is None:
+        rtol = DEFAULT_RTOL
+    scene = setup.experiments[0].scene
+    options, tolerance = checked_options(scene, segments, rtol, discretization, None, None, planar)
+    structure = Structure(
         shared=tuple(Sought(unknown.names, unknown.scale) for unknown in setup.shared),
         own=tuple(Sought(unknown.names, unknown.scale) for unknown in setup.own),
-        **settings,
+        loss=loss,
+        segments=options.segments,
+        discretization=options.discretization,
+        planar=planar,
+        max_steps=whole_number(max_steps, "max_steps", 1, 10_000),
     )
+    return structure, tolerance
+
+
+def checked_threshold(loss: Loss, threshold: float | None) -> float:
+    one_of(loss, "loss", get_args(Loss))
+    if threshold is None:
+        return THRESHOLDS[loss]
+    if loss == "linear":
+        raise ValueError("threshold must be None where loss is 'linear', which has none")
+    return float(positive(threshold, "threshold"))
+
+
+def finer(structure: Structure, error: float, tolerance: float | None) -> Structure | None:
+    """The same on a mesh that should have an error of the shapes below the tolerance; `None` where that has it."""
+    finest = SIZES[structure.discretization][-1]
+    if tolerance is None or SAFETY * error <= tolerance or structure.segments >= finest:
+        return None
+    return structure._replace(segments=next_size(structure.segments, error, tolerance, structure.discretization))
 
 
 @functools.partial(compiled, static_argnames=("structure",))
@@ -300,8 +340,10 @@ def beginnings(
     )
 
 
-def largest_error(results: tuple[Equilibrium, ...]) -> float:
-    """Of the shapes that have converged, by the length."""
+def largest_error(results: tuple[Equilibrium, ...], tolerance: float | None) -> float:
+    """Of the shapes that have converged, by the length; not a number where nobody asks for a tolerance."""
+    if tolerance is None:
+        return math.nan
     errors = [
         np.max(np.linalg.norm(estimated_errors(result).nodes, axis=-1), axis=-1)[np.asarray(result.converged)]
         for result in results

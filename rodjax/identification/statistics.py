@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rodjax.identification.least_squares import NormalEquations
 from rodjax.identification.unknowns import Unknown
 
 # A combination of unknowns that may change by so many of their large sizes within one standard deviation is one that
@@ -46,10 +47,19 @@ class Blocks(NamedTuple):
     so: Float[np.ndarray, "e p q"]
     oo: Float[np.ndarray, "e q q"]
 
+    @staticmethod
+    def of(normal: NormalEquations, is_free: Bool[np.ndarray, "e q"]) -> "Blocks":
+        fixed = np.eye(is_free.shape[1])[None] * ~is_free[..., None]
+        return Blocks(np.asarray(normal.ss, float), np.asarray(normal.so, float), np.asarray(normal.oo, float) + fixed)
+
+    def of_shared(self, p: int) -> "Blocks":
+        """Of the first p unknowns in common."""
+        return Blocks(self.ss[:p, :p], self.so[:, :p], self.oo)
+
     @property
     def following(self) -> Float[np.ndarray, "e q p"]:
         """How the own unknowns follow those in common: o = -F s."""
-        return _inverse(self.oo) @ np.swapaxes(self.so, 1, 2)
+        return inverse(self.oo) @ np.swapaxes(self.so, 1, 2)
 
     @property
     def on_shared(self) -> Float[np.ndarray, "p p"]:
@@ -58,12 +68,12 @@ class Blocks(NamedTuple):
 
     def covariance(self) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "e q q"]]:
         """Of those in common, and of those of each experiment, for deviations of one."""
-        shared = _inverse(self.on_shared)
+        shared = inverse(self.on_shared)
         following = self.following
-        return shared, _inverse(self.oo) + following @ shared @ np.swapaxes(following, 1, 2)
+        return shared, inverse(self.oo) + following @ shared @ np.swapaxes(following, 1, 2)
 
 
-def _inverse(matrix: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n n"]:
+def inverse(matrix: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n n"]:
     """Of symmetric matrices; with large numbers for what is nothing but rounding."""
     if matrix.shape[-1] == 0:
         return matrix
@@ -130,6 +140,13 @@ def part_of(unknown: Unknown, share: float, length: float) -> tuple[float, str]:
     return (math.exp(change), "x") if unknown.scale == "log" else (change, unknown.unit)
 
 
+def rates(unknowns: Sequence[Unknown], at: Float[np.ndarray, "*e n"], length: float) -> Float[np.ndarray, "*e n"]:
+    """The change of each value by its unknown's coordinate in its sizes."""
+    is_log = np.array([unknown.scale == "log" for unknown in unknowns], bool)
+    sizes = np.array([unknown.natural_size(length) for unknown in unknowns])
+    return np.where(is_log, at, 1.0) * sizes
+
+
 def held_numbers(
     blocks: Blocks, dispersion: float, unknowns: Sequence[Unknown], held: Sequence[Unknown], length: float
 ) -> list[str]:
@@ -139,7 +156,7 @@ def held_numbers(
     """
     p = len(unknowns)
     information = blocks.on_shared
-    inner = _inverse(information[:p, :p])
+    inner = inverse(information[:p, :p])
     told = []
     for k, one in enumerate(held, start=p):
         alone = information[k, k]
@@ -187,6 +204,6 @@ def clustered(
     sums = np.stack(
         [np.sum([s for s, label in zip(scores, labels, strict=True) if label == name], axis=0) for name in names]
     )
-    bread = _inverse(blocks.on_shared) / slope
+    bread = inverse(blocks.on_shared) / slope
     factor = count / (count - 1) * (numbers - 1) / (numbers - unknowns)
     return factor * bread @ (sums.T @ sums) @ bread, count

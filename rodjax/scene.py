@@ -182,6 +182,13 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
 
 
+def held_position(scene: Scene) -> Float[Array, "3"]:
+    """The position of the start where it is held, else of the end."""
+    held = scene.start if isinstance(scene.start, Held) else scene.end
+    assert isinstance(held, Held), "a scene holds at least one position"
+    return held.position
+
+
 def held_at_both_ends(scene: Scene) -> bool:
     """Whether the positions of both ends are given."""
     return isinstance(scene.start, Held) and isinstance(scene.end, Held)
@@ -237,9 +244,7 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
     Tolerances then mean the same for a hair and a hawser, and a scene far from the origin loses no digits.
     """
     rod = scene.rod
-    held = scene.start if isinstance(scene.start, Held) else scene.end
-    assert isinstance(held, Held), "a scene holds at least one position"
-    units = Units(origin=held.position, length=rod.length, energy=rod.bending_scale / rod.length)
+    units = Units(origin=held_position(scene), length=rod.length, energy=rod.bending_scale / rod.length)
     gravity = None if scene.gravity is None else scene.gravity * (rod.mean_mass_per_length * rod.length / units.force)
     scaled = Scene(
         rod.in_units(units),

@@ -312,6 +312,7 @@ POINTS = np.zeros((3, 3))
         (lambda: rj.fit(experiment(), [rj.Unknown("rod.EI", bounds=(1, 2))]), "bounds of rod.EI must hold the start"),
         (lambda: rj.fit(experiment(rj.EndForce((0, 0, 1))), ["rod.EI"]), "sd must be given for every measurement"),
         (lambda: rj.fit_each(experiment(), ["rod.EI"], loss="huber"), "sd must be given for a loss"),
+        (lambda: rj.fit_each(experiment(), ["rod.EI"], threshold=2), "threshold must be None where loss is 'linear'"),
         (lambda: rj.fit_each(experiment(), ["rod.EI"], free=[[1]]), "free must be of bool"),
     ],
 )

@@ -20,7 +20,7 @@ from rodjax.discretization.form import FLOOR_SAFETY
 from rodjax.discretization.mixed import MixedForm, MixedPoint, Stretched
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
-from rodjax.scene import Scene
+from rodjax.scene import Scene, held_position
 from rodjax.supports import Free, Held
 from rodjax.vectors import dot
 
@@ -144,10 +144,9 @@ class ClippedForm(MixedForm):
         return lengths[None] * self.field.of_sides(point.tangents)
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
-        start, end = self.scene.start, self.scene.end
-        held = start if isinstance(start, Held) else end
-        assert isinstance(held, Held), "a scene holds at least one end"
-        return -jnp.sum(self.side_forces * self._ways(point)) - jnp.sum(total_force(self.scene) * held.position)
+        return -jnp.sum(self.side_forces * self._ways(point)) - jnp.sum(
+            total_force(self.scene) * held_position(self.scene)
+        )
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod

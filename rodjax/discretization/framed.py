@@ -27,7 +27,7 @@ from rodjax.energy import Sections
 from rodjax.linalg import DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rotations import Vector, columns, from_frame, inner, inverse, nearer, rotated, swung, tangent, turned, unit
-from rodjax.scene import Scene, has_potential
+from rodjax.scene import Scene, has_potential, held_position
 from rodjax.staging import staged
 from rodjax.supports import Clamp, Free, Held, Swivel
 from rodjax.vectors import components, dot
@@ -227,14 +227,11 @@ class FrameForm(Form):
 
     def load_energy(self, point: FramePoint) -> Float[Array, ""]:
         """The potential of dead forces, zero at the origin; other loads have none."""
-        start, end = self.scene.start, self.scene.end
-        held = start if isinstance(start, Held) else end
-        assert isinstance(held, Held), "a scene holds at least one position"
         here = self.strained(point)
         work = jnp.sum((self.field.lengths * (1 + here.axial)) * dot(self.loads, here.tangents))
         rest = self._rest_of_ways(point, jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
-        return -work - jnp.sum(total_force(self.scene) * held.position)
+        return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""

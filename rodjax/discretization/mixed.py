@@ -32,7 +32,7 @@ from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import AnySystem, SaddlePointSystem, short_sum
-from rodjax.scene import Scene, dead_end_moment
+from rodjax.scene import Scene, dead_end_moment, held_position
 from rodjax.supports import Clamp, Free, Held
 from rodjax.vectors import components, dot
 
@@ -156,12 +156,9 @@ class MixedForm(Form):
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
         """The potential of gravity and dead forces, zero at the origin."""
-        start, end = self.scene.start, self.scene.end
-        held = start if isinstance(start, Held) else end
-        assert isinstance(held, Held), "a scene holds at least one position"
         work = jnp.sum(self.field.weights * dot(self.forces_beyond, self.slopes(point)))
         work += 2 * self.stretching_of_spread(point)
-        return -work - jnp.sum(total_force(self.scene) * held.position)
+        return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod

@@ -25,7 +25,7 @@ from rodjax.identification.unknowns import Subject, Unknown, known_names, nomina
 from rodjax.path import stack_scenes
 from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium, NotConvergedWarning, estimated_errors
-from rodjax.supports import Held
+from rodjax.scene import held_position
 
 DEFAULT_RTOL = 1e-4
 MAX_STEPS = 100
@@ -140,9 +140,7 @@ def _first_guess(experiment: Experiment) -> Guess:
     measured, scene = _spanning(experiment), experiment.scene
     assert measured is not None
     assert measured.s is not None
-    held = scene.start if isinstance(scene.start, Held) else scene.end
-    assert isinstance(held, Held), "a scene holds at least one position"
-    points = measured.lifted(np.asarray(held.position))
+    points = measured.lifted(np.asarray(held_position(scene)))
     at = np.linspace(0, float(scene.rod.length), GUESS_POINTS)
     return Guess(_resampled(np.asarray(measured.s), points, at))
 

@@ -168,6 +168,7 @@ def between_clamps(x: jax.Array) -> Scene:
     return Scene(problems.cable(), Clamp((0, 0, 0), frame((1, 0, 0))), end, gravity=(0, 0, -9.81))
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 @pytest.mark.parametrize("discretization", ["finite_difference", "hermite"])
 def test_the_value_beside_a_derivative_is_the_plain_one_bit_by_bit(discretization):

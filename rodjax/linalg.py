@@ -21,6 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.chain import ChainFactors, ChainSystem, factor_chain
+
 
 class SaddlePointSystem(eqx.Module):
     """The matrix above: `diagonal[..., i]` is block (i, i) of H, `lower[..., i]` block (i + 1, i).
@@ -135,8 +137,8 @@ class Factors(eqx.Module):
         return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
 
 
-AnyFactors = Factors | DenseFactors
-AnySystem = SaddlePointSystem | DenseSystem
+AnyFactors = Factors | DenseFactors | ChainFactors
+AnySystem = SaddlePointSystem | DenseSystem | ChainSystem
 
 
 def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
@@ -151,6 +153,8 @@ def factor(system: AnySystem) -> "AnyFactors":
     """
     if isinstance(system, DenseSystem):
         return DenseFactors(system, jax.scipy.linalg.lu_factor(system.matrix), jnp.zeros((), int))
+    if isinstance(system, ChainSystem):
+        return factor_chain(system)
     return _factor(system, system.border)[0]
 
 
@@ -158,10 +162,9 @@ def factor_and_solve(
     system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"]
 ) -> tuple["AnyFactors", Float[Array, "b n"], Float[Array, "k"]]:
     """Factorisation and the solution for one right side, in one sweep."""
-    if isinstance(system, DenseSystem):
-        dense = factor(system)
-        x, y = dense.solve(f, c)
-        return dense, x, y
+    if isinstance(system, DenseSystem | ChainSystem):
+        factors = factor(system)
+        return factors, *factors.solve(f, c)
     factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1))
     return factors, *factors._bordered(x[:, -1], c)
 

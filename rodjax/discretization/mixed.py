@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import outer, rotated, tangent_bases
-from rodjax.discretization.tangent_field import TangentField
+from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import AnySystem, SaddlePointSystem, short_sum
@@ -50,6 +50,19 @@ class MixedPoint(eqx.Module):
         sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
         in_plane = jnp.where(sizes > 0, in_plane / jnp.where(sizes > 0, sizes, 1.0), jnp.eye(2, 1, dtype=sizes.dtype))
         return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist))
+
+
+class Elastic(NamedTuple):
+    """Bending and torsion of a `Linearization`.
+
+    `torque_column`: by the torque; `softness`: of the rod against it where the total twist is given; else `None`.
+    """
+
+    bases: Float[Array, "3 b m"]
+    energy: Float[Array, ""]
+    blocks: Blocks
+    torque_column: Float[Array, "b 1 m"] | None
+    softness: Float[Array, ""] | None
 
 
 class Stretched(NamedTuple):
@@ -207,24 +220,14 @@ class MixedForm(Form):
         return MixedPoint(tangents, point.end_force + force_change, twist)
 
     def linearized(self, point: MixedPoint) -> Linearization:
-        scene, rod, field, tangents = self.scene, self.scene.rod, self.field, point.tangents
-        weights = field.weights
-        all_bases = self.bases(field.with_held(scene, tangents))
-        bases = field.basis(scene, all_bases)
-        energy, blocks = field.bending(scene, tangents, all_bases)
+        scene, tangents = self.scene, point.tangents
+        bases, energy, blocks, torque_column, softness = self._elastic(point)
         columns, closure, compliance = [], [], []
-        torque_column = None
-        if self.has_torsion or not self.has_potential:
-            twist = field.twist(scene, tangents, all_bases)
-            torsion, torque, stiffness = _with_derivatives(lambda twist: density(rod, twist=twist), point.total_twist)
-            blocks = jax.tree.map(lambda bent, twisted: bent + torque * twisted, blocks, twist)
-            torque_column = twist.gradient[:, None]
-            if self.has_torsion:
-                energy += torsion
-                columns.append(torque_column)
-                closure.append(jnp.zeros(1, energy.dtype))
-                compliance.append(1 / stiffness[None, None])
-        stretched = self._stretched(point, bases, weights, energy, blocks.gradient, blocks.diagonal)
+        if softness is not None:
+            columns.append(torque_column)
+            closure.append(jnp.zeros(1, energy.dtype))
+            compliance.append(softness[None, None])
+        stretched = self._stretched(point, bases, self.field.weights, energy, blocks.gradient, blocks.diagonal)
         energy, gradient, diagonal, lengths = (
             stretched.energy,
             stretched.gradient,
@@ -256,7 +259,7 @@ class MixedForm(Form):
             gradient=gradient,
             closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
-                field.held(scene, diagonal),
+                self.field.held(scene, diagonal),
                 blocks.lower,
                 jnp.concatenate(columns, axis=1) if columns else jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1])),
                 jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
@@ -264,8 +267,23 @@ class MixedForm(Form):
                 blocks.across,
             ),
             energy=energy,
-            residual=field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
+            residual=self.field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
         )
+
+    def _elastic(self, point: MixedPoint) -> Elastic:
+        scene, rod, field, tangents = self.scene, self.scene.rod, self.field, point.tangents
+        all_bases = self.bases(field.with_held(scene, tangents))
+        bases = field.basis(scene, all_bases)
+        energy, blocks = field.bending(scene, tangents, all_bases)
+        if not self.has_torsion and self.has_potential:
+            return Elastic(bases, energy, blocks, None, None)
+        twist = field.twist(scene, tangents, all_bases)
+        torsion, torque, stiffness = _with_derivatives(lambda twist: density(rod, twist=twist), point.total_twist)
+        blocks = jax.tree.map(lambda bent, twisted: bent + torque * twisted, blocks, twist)
+        torque_column = twist.gradient[:, None]
+        if not self.has_torsion:
+            return Elastic(bases, energy, blocks, torque_column, None)
+        return Elastic(bases, energy + torsion, blocks, torque_column, 1 / stiffness)
 
     def _stretched(
         self,

@@ -1,0 +1,202 @@
+"""Saddle-point systems of a rod whose nodes have positions of their own, by block elimination from node to node.
+
+The tangents of Hermite elements and the force in each element are the unknowns, as in `linalg`, and the positions of
+the nodes, at which something may push: its stiffness stands on their diagonal. The force of an element is the
+multiplier of its way from node to node. Tangents in the middle of elements go first; then a node has eight unknowns,
+rotation, force of the element before it and displacement, coupled with those of its neighbours only: O(n).
+
+    rotation     H theta + B F + border y = f
+    gap          B^T theta - C F + u_after - u_before = gap,    for each element
+    balance      S u + F_before - F_after = balance,            for each node that is not held
+    border       border^T theta - compliance y = c
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class ChainSystem(eqx.Module):
+    """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
+
+    `diagonal`, `lower`, `across`: the blocks of H, as in `linalg.SaddlePointSystem`; `by_force`: those of B at start,
+    middle and end of each element; `cell_compliance`: C; `stiffness`: S; `held`: the nodes whose place is given. What
+    is no rotation comes as one vector: border, then the nodes, then the elements.
+    """
+
+    diagonal: Float[Array, "2 2 m"]
+    lower: Float[Array, "2 2 m-1"]
+    across: Float[Array, "2 2 n"]
+    border: Float[Array, "2 k m"]
+    compliance: Float[Array, "k k"]
+    by_force: Float[Array, "2 3 3 n"]
+    cell_compliance: Float[Array, "3 3 n"]
+    stiffness: Float[Array, "n+1 3 3"]
+    held: Bool[Array, "n+1"]
+
+    def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
+        """H + shift I in the place of H, with one shift or one for each point."""
+        identity = jnp.eye(2, dtype=shift.dtype)[..., None]
+        shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
+        return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
+
+    def times(self, x: Float[Array, "2 m"], y: Float[Array, "j"]) -> tuple[Float[Array, "2 m"], Float[Array, "j"]]:
+        """The matrix times (x, y): the right sides."""
+        first, u, force = self.parted(y)
+        u = jnp.where(self.held[:, None], 0.0, u)
+        f = jnp.einsum("ijm,jm->im", self.diagonal, x) + jnp.einsum("ikm,k->im", self.border, first)
+        f = f.at[:, 1:].add(jnp.einsum("ijm,jm->im", self.lower, x[:, :-1]))
+        f = f.at[:, :-1].add(jnp.einsum("jim,jm->im", self.lower, x[:, 1:]))
+        f = f.at[:, 2::2].add(jnp.einsum("ijm,jm->im", self.across, x[:, :-1:2]))
+        f = f.at[:, :-1:2].add(jnp.einsum("jim,jm->im", self.across, x[:, 2::2]))
+        gap = jnp.diff(u, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
+        for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
+            f = f.at[:, at].add(jnp.einsum("icn,nc->in", self.by_force[:, :, point], force))
+            gap += jnp.einsum("icn,in->nc", self.by_force[:, :, point], x[:, at])
+        none = jnp.zeros_like(force[:1])
+        balance = jnp.concatenate([none, force]) - jnp.concatenate([force, none])
+        balance = jnp.where(
+            self.held[:, None], self.parted(y)[1], balance + jnp.einsum("kij,kj->ki", self.stiffness, u)
+        )
+        first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
+        return f, jnp.concatenate([first, balance.reshape(-1), gap.reshape(-1)])
+
+    def parted(self, y: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "n+1 3"], Float[Array, "n 3"]]:
+        """What belongs to the border, the nodes and the elements."""
+        k, nodes = len(self.compliance), len(self.held)
+        return y[:k], y[k : k + 3 * nodes].reshape(nodes, 3), y[k + 3 * nodes :].reshape(nodes - 1, 3)
+
+
+class _Middles(eqx.Module):
+    """The elimination of the tangents in the middle: what couples them to start, end and force, before and after."""
+
+    solved: Float[Array, "n 2 7"]
+    inverse: Float[Array, "n 2 2"]
+
+
+class ChainFactors(eqx.Module):
+    """The factorisation of a `ChainSystem`; `negative` as in `linalg.Factors`."""
+
+    system: ChainSystem
+    middles: _Middles
+    inverses: Float[Array, "n+1 8 8"]
+    below: Float[Array, "n 8 8"]
+    border_solution: tuple[Float[Array, "2 k m"], Float[Array, "k j"]]
+    complement: Float[Array, "k k"]
+    negative: Int[Array, ""]
+
+    @property
+    def is_minimum(self) -> Bool[Array, ""]:
+        """Whether H is positive definite under the constraints."""
+        return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
+
+    def solve(self, f: Float[Array, "2 m"], c: Float[Array, "j"]) -> tuple[Float[Array, "2 m"], Float[Array, "j"]]:
+        first, nodes, gaps = self.system.parted(c)
+        x, y = self._without_border(f[:, None], nodes[None], gaps[None])
+        x, y = x[:, 0], y[0]
+        by_border, of_border = self.border_solution
+        multipliers = self.complement @ (first - jnp.einsum("ikm,im->k", self.system.border, x))
+        x -= jnp.einsum("ikm,k->im", by_border, multipliers)
+        return x, jnp.concatenate([multipliers, y - multipliers @ of_border])
+
+    def _without_border(
+        self, f: Float[Array, "2 r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
+    ) -> tuple[Float[Array, "2 r m"], Float[Array, "r j"]]:
+        middles = self.middles
+        of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
+        moved = jnp.einsum("npq,npr->nqr", middles.solved, of_middles)
+        none = jnp.zeros_like(of_nodes[:1])
+        rotations = of_nodes - jnp.concatenate([moved[:, :2], none]) - jnp.concatenate([none, moved[:, 2:4]])
+        forces = gaps.transpose(1, 2, 0) - moved[:, 4:]
+        right = jnp.concatenate(
+            [rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), nodes.transpose(1, 2, 0)], axis=1
+        )
+
+        def forward(before: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            inverse, below, right = given
+            here = inverse @ (right - below @ before)
+            return here, here
+
+        def backward(after: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            inverse, above, here = given
+            here -= inverse @ (above.T @ after)
+            return here, here
+
+        first = self.inverses[0] @ right[0]
+        _, reached = jax.lax.scan(forward, first, (self.inverses[1:], self.below, right[1:]))
+        last = reached[-1]
+        reached = jnp.concatenate([first[None], reached[:-1]])
+        _, solved = jax.lax.scan(backward, last, (self.inverses[:-1], self.below, reached), reverse=True)
+        z = jnp.concatenate([solved, last[None]])
+        around = jnp.concatenate([z[:-1, :2], z[1:, :2], z[1:, 2:5]], axis=1)
+        of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
+        of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)
+        x = jnp.zeros_like(f).at[..., ::2].set(z[:, :2].transpose(1, 2, 0))
+        x = x.at[..., 1::2].set(of_middles.transpose(1, 2, 0))
+        r = f.shape[1]
+        displacements, forces = z[:, 5:].transpose(2, 0, 1), z[1:, 2:5].transpose(2, 0, 1)
+        return x, jnp.concatenate([displacements.reshape(r, -1), forces.reshape(r, -1)], axis=1)
+
+
+def factor_chain(system: ChainSystem) -> ChainFactors:
+    """Factorisation from node to node, O(n)."""
+    n = system.across.shape[-1]
+    dtype = system.diagonal.dtype
+    middles, coupled, negative = _eliminated(system)
+    of_nodes = system.diagonal[..., ::2].transpose(2, 0, 1)
+    of_nodes = of_nodes.at[:-1].add(-coupled[:, :2, :2]).at[1:].add(-coupled[:, 2:4, 2:4])
+    free = jnp.where(system.held, 0.0, 1.0).astype(dtype)
+    identity = jnp.eye(3, dtype=dtype)
+    by_end = system.by_force[:, :, 2].transpose(2, 1, 0) - coupled[:, 4:, 2:4]
+    of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, 4:, 4:]
+    blocks = jnp.zeros((n + 1, 8, 8), dtype)
+    blocks = blocks.at[:, :2, :2].set(of_nodes)
+    blocks = blocks.at[1:, 2:5, :2].set(by_end).at[1:, :2, 2:5].set(by_end.transpose(0, 2, 1))
+    # The first node has no element before it.
+    blocks = blocks.at[1:, 2:5, 2:5].set(of_force).at[0, 2:5, 2:5].set(-identity)
+    pushed = free[1:, None, None] * identity[None]
+    blocks = blocks.at[1:, 2:5, 5:].set(pushed).at[1:, 5:, 2:5].set(pushed)
+    blocks = blocks.at[:, 5:, 5:].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
+    below = jnp.zeros((n, 8, 8), dtype)
+    below = below.at[:, :2, :2].set(system.across.transpose(2, 0, 1) - coupled[:, 2:4, :2])
+    below = below.at[:, 2:5, :2].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, 4:, :2])
+    below = below.at[:, 2:5, 5:].set(-free[:-1, None, None] * identity[None])
+
+    def eliminated(inverse: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        block, below = given
+        pivot = block - below @ inverse @ below.T
+        inverse = jnp.linalg.inv(pivot)
+        return inverse, (pivot, inverse)
+
+    first = jnp.linalg.inv(blocks[0])
+    _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below))
+    pivots, inverses = jnp.concatenate([blocks[:1], pivots]), jnp.concatenate([first[None], inverses])
+    # Each force is a multiplier, and so is that of the element before the first node.
+    signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
+    negative += jnp.sum(signs < 0) - 3 * (n + 1)
+    k = len(system.compliance)
+    nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
+    blank = jnp.zeros((2, k, 2 * n + 1), dtype), jnp.zeros((k, 6 * n + 3), dtype)
+    factors = ChainFactors(system, middles, inverses, below, blank, jnp.zeros((k, k), dtype), negative)
+    if not k:
+        return factors
+    by_border, of_border = factors._without_border(system.border, *nothing)
+    matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, by_border)
+    negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
+    return ChainFactors(system, middles, inverses, below, (by_border, of_border), jnp.linalg.inv(matrix), negative)
+
+
+def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n 7 7"], Int[Array, ""]]:
+    """The middles eliminated, what that takes from start, end and force, and how many negative eigenvalues they had."""
+    diagonal = system.diagonal[..., 1::2].transpose(2, 0, 1)
+    before = system.lower[..., 0::2].transpose(2, 0, 1)
+    after = system.lower[..., 1::2].transpose(2, 1, 0)
+    coupling = jnp.concatenate([before, after, system.by_force[:, :, 1].transpose(2, 0, 1)], axis=2)
+    a, b, d = diagonal[:, 0, 0], diagonal[:, 1, 0], diagonal[:, 1, 1]
+    determinant = a * d - b * b
+    inverse = jnp.stack([jnp.stack([d, -b], axis=-1), jnp.stack([-b, a], axis=-1)], axis=-2)
+    inverse /= determinant[:, None, None]
+    solved = inverse @ coupling
+    negative = jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
+    return _Middles(solved, inverse), coupling.transpose(0, 2, 1) @ solved, negative

@@ -190,7 +190,7 @@ def _solve_here(
 
     once = jnp.ones((), int)
     starts = jax.vmap(state, in_axes)(scenes, guess)
-    if not isinstance(options.solver, Newton) or slides(scenes):
+    if not isinstance(options.solver, Newton) or slides(scenes) or scenes.obstacles:
         results = jax.vmap(
             lambda scene, start: equilibrium(scene, solve_from(scene, start[0], start[1], options), once)
         )

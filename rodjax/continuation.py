@@ -287,6 +287,8 @@ def _checked(scenes: Any, name: str) -> Scene:
         )
     if slides(stacked):
         raise ValueError(f"{name} needs scenes without sliding clips")
+    if stacked.obstacles:
+        raise ValueError(f"{name} needs scenes without obstacles")
     return stacked
 
 

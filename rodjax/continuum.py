@@ -115,6 +115,8 @@ def solve_continuum(
             raise ValueError(f"guess must be a single equilibrium, got several of shape {guess.s.shape[:-1]}")
     if segments is None:
         segments = DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1
+    if scene.obstacles:
+        raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
     if scene.clips:
         raise ValueError("clips must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
-from rodjax.discretization.clipped import ClippedForm
+from rodjax.contact_search import find_touching
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
@@ -23,7 +23,9 @@ from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import Guess, first_shape
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
@@ -215,7 +217,20 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
     else:
         shape = Polyline.through(shape.points(options.segments))
-    return SolverState(shape, state.end_force, state.units, state.places)
+    end_force = state.end_force
+    if coarse.scene.obstacles:
+        assert isinstance(state.shape, Curve)
+        assert isinstance(shape, Curve)
+        end_force = _of_elements(end_force, state.shape.s, shape.s)
+    return SolverState(shape, end_force, state.units, state.places)
+
+
+def _of_elements(
+    forces: Float[Array, "3 k"], s: Float[Array, "k+1"], others: Float[Array, "n+1"]
+) -> Float[Array, "3 n"]:
+    """The forces in elements, in other elements: as in the middle of each."""
+    middles = (others[:-1] + others[1:]) / 2
+    return forces[:, jnp.clip(jnp.searchsorted(s, middles, side="right") - 1, 0, forces.shape[1] - 1)]
 
 
 def checked_options(
@@ -251,6 +266,11 @@ def checked_options(
             raise ValueError("solver must be a Newton for a scene with clips")
         if planar:
             raise ValueError("planar must be False for a scene with clips")
+    if scene.obstacles:
+        if discretization == "finite_difference":
+            raise ValueError("discretization must be 'hermite' for a scene with obstacles")
+        if planar:
+            raise ValueError("planar must be False for a scene with obstacles")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     if rtol is not None:
@@ -328,7 +348,7 @@ def _kind(options: Options) -> type[Polyline] | type[Curve]:
 def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
     """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
     shape = guess.state.shape
-    if guess.state.end_force.shape != force_shape(scene) or _sliding(guess.scene) != _sliding(scene):
+    if guess.state.end_force.shape != force_shape(scene, options.segments) or _sliding(guess.scene) != _sliding(scene):
         return False
     if needs_frames(scene):
         return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
@@ -342,11 +362,11 @@ def _first_state(
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
-    no_force = jnp.zeros(force_shape(scene), scene.rod.length.dtype)
+    no_force = jnp.zeros(force_shape(scene, options.segments), scene.rod.length.dtype)
     if needs_frames(scene):
         return _first_frames(scaled, units, guess, options)
     if guess is None:
-        no_twist = jnp.zeros((), no_force.dtype) if scene.clips else jnp.zeros_like(no_force[0])
+        no_twist = jnp.zeros_like(no_force[0]) if no_force.ndim == 1 else jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
         return SolverState(shape, no_force, units, sliding_places(scaled)), no_twist
     if isinstance(guess, Guess):
@@ -450,6 +470,9 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     solver = options.solver
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, twist, options)
+        if isinstance(search.form, TouchingForm):
+            assert isinstance(search.point, MixedPoint)
+            return search.found(find_touching(search.form, search.point, solver, options.find))
         return search.found(find_equilibrium(search.form, search.point, solver, options.find))
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, twist)
@@ -487,7 +510,7 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
         quaternions = shape.turned_to_ends(scene, form.field, twist)
         end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
         return shape, form.holding(FramePoint(quaternions, end_force, twist))
-    if isinstance(form, ClippedForm):
+    if isinstance(form, PartedForm):
         end_force = form.force_change(form.of_force(guess.end_force))
         if isinstance(shape, Curve):
             assert isinstance(field, HermiteElements)

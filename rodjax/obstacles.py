@@ -190,6 +190,17 @@ class Distance(Obstacle):
         return self.function(point)
 
 
+class InUnits(Obstacle):
+    """An obstacle in other units: seen from `origin` (3,) [m], in parts of `length` [m]."""
+
+    obstacle: Obstacle
+    origin: Float[Array, "3"]
+    length: Float[Array, ""]
+
+    def at(self, point: Float[Array, "3"]) -> Float[Array, ""]:
+        return self.obstacle.at(self.origin + self.length * point) / self.length
+
+
 def rows(value: Any, name: str, least: int, shape: str) -> Float[Numbers, "... 3"]:
     """`value` as points, at least so many along its first axis; `shape` says in messages what is allowed."""
     try:
@@ -202,9 +213,9 @@ def rows(value: Any, name: str, least: int, shape: str) -> Float[Numbers, "... 3
     return number_array(value, name, given)
 
 
-def checked_obstacles(obstacles: Any) -> tuple[Obstacle, ...]:
+def checked_obstacles(obstacles: Any, least: int = 1) -> tuple[Obstacle, ...]:
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
-    if not obstacles:
+    if len(obstacles) < least:
         raise ValueError("obstacles must hold at least one Obstacle, got none")
     for k, obstacle in enumerate(obstacles):
         instance(obstacle, f"obstacles[{k}]", Obstacle)

@@ -104,6 +104,8 @@ def _check_stop(scenes: Scene) -> None:
         )
     if slides(scenes):
         raise ValueError("at_critical must be 'jump' for scenes with sliding clips")
+    if scenes.obstacles:
+        raise ValueError("at_critical must be 'jump' for scenes with obstacles")
 
 
 def _before_critical(scenes: Scene, path: Equilibrium) -> int:
@@ -143,6 +145,7 @@ def _structure(scene: Scene) -> str:
     parts += [name for name in ("gravity", "turns") if getattr(scene, name) is not None]
     parts.append(f"{len(scene.point_forces)} point forces")
     parts += [f"{len(scene.clips)} clips"] if scene.clips else []
+    parts += [", ".join(type(obstacle).__name__ for obstacle in scene.obstacles)] if scene.obstacles else []
     return ", ".join(parts)
 
 

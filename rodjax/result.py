@@ -24,6 +24,7 @@ from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import cubic
 from rodjax.linalg import factor
 from rodjax.scene import Scene, has_potential, nondimensional, slid, slides
@@ -69,6 +70,7 @@ class Equilibrium(eqx.Module):
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
       position, zero where it holds no direction; the moments are computed when they are asked for
+    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
       (dead moments, couples along the rod, follower loads) this is not examined and False, and
@@ -122,8 +124,16 @@ class Equilibrium(eqx.Module):
     def clip_forces(self) -> Float[Array, "... clips 3"]:
         if not self.scene.clips:
             return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        if self.scene.obstacles:
+            return _node_forces(self)[0]
         seen = self.state.end_force * self.state.units.force[..., None, None]
         return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
+
+    @property
+    def contact_forces(self) -> Float[Array, "... n+1 3"]:
+        if not self.scene.obstacles:
+            return jnp.zeros_like(self.nodes)
+        return _node_forces(self)[1]
 
     @property
     def clip_moments(self) -> Float[Array, "... clips 3"]:
@@ -278,6 +288,19 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
         stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
         negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
     return _Examination(critical, negative, jnp.any(turn.rotation != 0))
+
+
+@over_leading_axes
+def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Float[Array, "n+1 3"]]:
+    """What clips and what obstacles apply to the rod, of a scene with obstacles."""
+    form, _ = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    state = equilibrium.state
+    # The forces at both ends are those of the supports there, or of the loads and contacts beyond a free one.
+    around = jnp.pad(state.end_force, ((0, 0), (1, 1)))
+    forces = (around[:, :-1] - around[:, 1:]).T * state.units.force
+    clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
+    return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 
 
 @over_leading_axes

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.rod import Rod
 from rodjax.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
@@ -37,6 +38,9 @@ class Scene(eqx.Module):
         total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
+    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
+        the nodes of the mesh. Where none touches the rod they only cost time: to see how far it is from things that it
+        stays away from, `rodjax.clearance` needs no obstacles in the scene.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
@@ -51,6 +55,7 @@ class Scene(eqx.Module):
     turns: Float[Array, ""] | None
     distributed: tuple[DistributedForce | DistributedCouple, ...]
     clips: tuple[Clip, ...]
+    obstacles: tuple[Obstacle, ...]
 
     def __init__(
         self,
@@ -62,6 +67,7 @@ class Scene(eqx.Module):
         turns: Any = None,
         distributed: Sequence[DistributedForce | DistributedCouple] = (),
         clips: Sequence[Clip] = (),
+        obstacles: Sequence[Obstacle] = (),
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -77,11 +83,12 @@ class Scene(eqx.Module):
         clips = sequence(clips, "clips", "Clip")
         for k, clip in enumerate(clips):
             instance(clip, f"clips[{k}]", Clip)
-        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed, clips))
-        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, self.distributed, self.clips = (
-            parts
-        )
+        obstacles = checked_obstacles(obstacles, least=0)
+        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles))
+        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
+        self.distributed, self.clips, self.obstacles = rest
         _check_supports(self)
+        _check_obstacles(self)
         _check_numbers(self)
 
 
@@ -111,6 +118,19 @@ def _check_supports(scene: Scene) -> None:
             raise ValueError("clips must be () where a moment acts on a free end: the two together are not supported")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
+
+
+def _check_obstacles(scene: Scene) -> None:
+    if not scene.obstacles:
+        return
+    if scene.rod.radius is None:
+        raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
+    if needs_frames(scene):
+        raise ValueError("obstacles must be () for a rod or loads that need frames along the rod")
+    if slides(scene):
+        raise ValueError("obstacles must be () where the rod slides through clips")
+    if dead_end_moment(scene) is not None:
+        raise ValueError("obstacles must be () where a moment acts on a free end")
 
 
 def _check_numbers(scene: Scene) -> None:
@@ -194,8 +214,12 @@ def held_at_both_ends(scene: Scene) -> bool:
     return isinstance(scene.start, Held) and isinstance(scene.end, Held)
 
 
-def force_shape(scene: Scene) -> tuple[int, ...]:
-    """The shape of what a solver knows of the force at s = L: with clips one vector for each span between supports."""
+def force_shape(scene: Scene, segments: int) -> tuple[int, ...]:
+    """The shape of what a solver knows of the force at s = L: with clips one vector for each span between supports,
+    with obstacles one for each segment.
+    """
+    if scene.obstacles:
+        return (3, segments)
     return (3, len(scene.clips) + 1) if scene.clips else (3,)
 
 
@@ -255,5 +279,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         scene.turns,
         [load.in_units(units) for load in scene.distributed],
         [clip.in_units(units) for clip in scene.clips],
+        [InUnits(obstacle, units.origin, units.length) for obstacle in scene.obstacles],
     )
     return scaled, units

@@ -107,9 +107,7 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
 
     def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
         rotation = form.turn(point, here.bases, axis)
-        of_force = form.force_turned(point, axis)
-        multipliers = jnp.zeros_like(here.closure)
-        motion = Motion(rotation, multipliers.at[len(multipliers) - len(of_force) :].set(of_force))
+        motion = Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
         return motion, *here.system.times(motion.rotation, motion.multipliers)
 
     axes = jnp.eye(3, dtype=point.tangents.dtype)

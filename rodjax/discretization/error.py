@@ -104,7 +104,8 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     closure = -form.of_force(form.along_spans(gap))
     if form.has_torsion:
         missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
-        closure = jnp.concatenate([missing[None], closure])
+        between = jnp.zeros(len(here.closure) - len(closure) - 1, closure.dtype)  # what pushes at the nodes
+        closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
     elif len(here.closure) > len(closure):
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
     _, rotation, multipliers = factor_and_solve(form.regular(here.system), -gradient, -closure)

@@ -177,6 +177,13 @@ class Form(eqx.Module):
         """The components of what the end force changes by as the whole rod turns about an axis."""
         return self.of_force(jnp.cross(axis, point.end_force))
 
+    def multipliers_turned(
+        self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
+    ) -> Float[Array, "k"]:
+        """The same with zeros, as many as `multipliers`, before it."""
+        of_force = self.force_turned(point, axis)
+        return multipliers.at[len(multipliers) - len(of_force) :].set(of_force)
+
     def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3 *spans"]:
         """A change of the end force from its components."""
         if not self._closures:

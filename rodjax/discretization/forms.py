@@ -8,6 +8,7 @@ from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
+from rodjax.discretization.touching import TouchingForm
 from rodjax.scene import Scene
 
 
@@ -15,6 +16,8 @@ def form_of(scene: Scene, shape: Shape) -> Form:
     """Of a nondimensional scene."""
     if isinstance(shape, FramedCurve):
         return form_of_frames(scene, shape)
+    if scene.obstacles:
+        return TouchingForm.of(scene, field_of(scene, shape))
     return (ClippedForm if scene.clips else MixedForm).of(scene, field_of(scene, shape))
 
 

@@ -24,7 +24,7 @@ from rodjax.discretization.cells import REFERENCE, Cells, ElementCells, Frames, 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.energy import Sections
-from rodjax.linalg import DenseSystem, SaddlePointSystem
+from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rotations import Vector, columns, from_frame, inner, inverse, nearer, rotated, swung, tangent, turned, unit
 from rodjax.scene import Scene, has_potential, held_position
@@ -364,7 +364,7 @@ class FrameForm(Form):
         """Largest component of the moment left at a frame, per length of rod."""
         return jnp.max(jnp.abs(gradient) / self.field.weights[None])
 
-    def regular(self, system: SaddlePointSystem | DenseSystem) -> SaddlePointSystem | DenseSystem:
+    def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
         m = len(self.field.places)
         return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.chain import ChainSystem
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import outer, rotated, tangent_bases
@@ -330,7 +331,7 @@ class MixedForm(Form):
 
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
-        assert isinstance(system, SaddlePointSystem)
+        assert isinstance(system, SaddlePointSystem | ChainSystem)
         return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
 
     def under_force(

@@ -1,0 +1,255 @@
+"""A rod that touches obstacles: the mixed form with a force of its own in each element, and pressure on its nodes.
+
+Where a node is nearer to an obstacle than the rod is thick, it is pushed back by a force in proportion to how deep it
+is, straight out of the obstacle, so that the energy stays a smooth function: without friction. The stiffness is so
+high that loads of the size of those on the rod press it in by a small part of its radius only.
+
+The force through an element is that of all loads and contacts beyond it: unknown, one for each element, as the position
+of each node is. At a node the forces on its two sides differ by the contact; from node to node the way is that of the
+element (`chain.ChainSystem`). Positions follow from the elements, so that tangents and forces alone make a point.
+Hermite elements only. Contact acts at the nodes; between them the rod is not looked at.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rodjax.along import value_at
+from rodjax.chain import ChainSystem
+from rodjax.discretization.form import FLOOR_SAFETY, Linearization
+from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.parted import PartedForm
+from rodjax.discretization.tangent_field import TangentField
+from rodjax.energy import axial_strain_under, density
+from rodjax.linalg import short_sum
+from rodjax.obstacles import Obstacle
+from rodjax.scene import Scene
+from rodjax.supports import Free
+
+# A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
+PENETRATION = 3e-5
+BENDING = 100.0
+
+
+class TouchingForm(PartedForm):
+    """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element.
+
+    `softening`: by how much the contacts are softer than those of a result, 1 or less.
+    """
+
+    softening: Float[Array, ""] = eqx.field(kw_only=True)
+
+    @classmethod
+    def of(cls, scene: Scene, field: TangentField) -> "TouchingForm":
+        side_forces = field.side_forces(scene)
+        return cls(
+            scene=scene,
+            field=field,
+            forces_beyond=field.of_points(field.side_weights[None] * side_forces) / field.weights[None],
+            force_spread=None,
+            side_forces=side_forces,
+            softening=jnp.ones((), side_forces.dtype),
+        )
+
+    def softened(self, softening: Float[Array, ""]) -> "TouchingForm":
+        return eqx.tree_at(lambda form: form.softening, self, softening)
+
+    # --- what is unknown ---------------------------------------------------------------------------------------------
+
+    def of_cells(self, end_force: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return end_force
+
+    @property
+    def _closures(self) -> int:
+        return 3 * (len(self.field.s) - 1)
+
+    def of_force(self, vector: Float[Array, "3 n"]) -> Float[Array, "3n"]:
+        return vector.T.reshape(-1)
+
+    def force_change(self, closure: Float[Array, "3n"]) -> Float[Array, "3 n"]:
+        return closure.reshape(-1, 3).T
+
+    def multipliers_turned(
+        self, point: MixedPoint, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
+    ) -> Float[Array, "k"]:
+        positions = self.positions(self.edges(point))
+        places, _ = self.held_places
+        arms = jnp.where(self.is_held[:, None], 0.0, positions - places[:, 0][None])
+        by_node = jnp.cross(axis[None], arms).reshape(-1)
+        of_force = self.of_force(jnp.cross(axis[:, None], point.end_force, axis=0))
+        return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
+
+    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return ways
+
+    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        return super().is_closed(self.closure(closure), tolerance)
+
+    # --- places and contacts -----------------------------------------------------------------------------------------
+
+    @property
+    def is_held(self) -> Bool[Array, "n+1"]:
+        _, nodes = self.held_places
+        return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
+
+    def positions(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
+        """Nodes along the edges, each from the last held one before it, or from the first."""
+        places, held = self.held_places
+        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        last = jnp.maximum(jnp.searchsorted(held, jnp.arange(len(sums)), side="right") - 1, 0)
+        return places.T[last] + (sums - sums[held[last]])
+
+    @property
+    def _radius(self) -> Float[Array, "n+1"]:
+        radius = self.scene.rod.radius
+        assert radius is not None, "a scene with obstacles has a radius"
+        s = self.field.s
+        return value_at(radius, s, s, s)
+
+    @property
+    def stiffness(self) -> Float[Array, ""]:
+        """Of a contact [EI/L^3]."""
+        scene = self.scene
+        forces = [load.force for load in scene.point_forces]
+        forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+        forces += [] if scene.gravity is None else [scene.gravity]
+        load = jnp.asarray(BENDING, self.side_forces.dtype)
+        for force in forces:
+            load += jnp.sqrt(1.0 + jnp.sum(force**2))
+        radius = self._radius
+        return self.softening * load / (PENETRATION * radius[jnp.argmin(radius)])
+
+    def depths(self, positions: Float[Array, "n+1 3"]) -> Float[Array, "obstacles n+1"]:
+        """How far the rod is within each obstacle, at the nodes that are free to move; 0 outside."""
+        return jnp.stack([self._depths(obstacle, positions) for obstacle in self.scene.obstacles])
+
+    def _depths(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
+        depths = self._radius - jax.vmap(obstacle.at)(positions)
+        return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
+
+    def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
+        energy = jnp.zeros((), positions.dtype)
+        for obstacle in self.scene.obstacles:
+            energy += self._energy_at(obstacle, positions)
+        return energy
+
+    def _energy_at(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
+        return self.stiffness / 2 * jnp.sum(self._depths(obstacle, positions) ** 2)
+
+    def _contacts(self, positions: Float[Array, "n+1 3"]) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
+        """First and second derivatives of the energy of the contacts by the positions of the nodes."""
+        nothing = jnp.zeros_like(positions), jnp.zeros((*positions.shape, 3), positions.dtype)
+        first, second = nothing
+        for obstacle in self.scene.obstacles:
+            # Where the rod is far from all of an obstacle, the distance is all that is computed of it.
+            touches = jnp.any(self._depths(obstacle, positions) > 0)
+            one, two = jax.lax.cond(
+                touches, functools.partial(self._contacts_with, obstacle), lambda _: nothing, positions
+            )
+            first, second = first + one, second + two
+        return first, second
+
+    def _contacts_with(
+        self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]
+    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
+        def energy(positions):
+            return self._energy_at(obstacle, positions)
+
+        first, by_all = jax.linearize(jax.grad(energy), positions)
+        axes = jnp.eye(3, dtype=positions.dtype)[:, None] * jnp.ones_like(positions)[None]
+        # Each component of all nodes at once, as each node is alone with the obstacle.
+        return first, jnp.moveaxis(jax.vmap(by_all)(axes), 0, -1)
+
+    # --- derivatives -------------------------------------------------------------------------------------------------
+
+    def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
+        return super().load_energy(point) + self._contact_energy(self.positions(self.edges(point)))
+
+    def linearized(self, point: MixedPoint) -> Linearization:
+        field, tangents = self.field, point.tangents
+        assert isinstance(field, HermiteElements)
+        bases, energy, blocks, torque_column, softness = self._elastic(point)
+        assert blocks.across is not None
+        cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
+        edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
+        positions = self.positions(edges)
+        first, second = self._contacts(positions)
+        beyond = jnp.pad(point.end_force, ((0, 0), (1, 1)))
+        balance = first + (beyond[:, :-1] - beyond[:, 1:]).T
+        balance = jnp.where(self.is_held[:, None], 0.0, balance)
+        closure = [balance.reshape(-1), self._gaps(positions, edges).reshape(-1)]
+        dtype = energy.dtype
+        if softness is None:
+            border, compliance = jnp.zeros((2, 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
+        else:
+            assert torque_column is not None
+            border, compliance = torque_column, softness[None, None]
+            closure = [jnp.zeros(1, dtype), *closure]
+        forces = short_sum(bases * cells.gradient[None], axis=1)
+        residual = field.residual(self.scene, forces, field.of_points(cells.lengths))
+        system = ChainSystem(
+            field.held(self.scene, cells.diagonal),
+            blocks.lower,
+            blocks.across,
+            border,
+            compliance,
+            cells.by_force,
+            jnp.einsum("ipn,jpn->ijn", cells.softness[None] * cells.along, cells.along),
+            second,
+            self.is_held,
+        )
+        return Linearization(
+            bases=bases,
+            gradient=cells.gradient,
+            closure=jnp.concatenate(closure),
+            system=system,
+            energy=energy + self._stretching(tangents, point.end_force)[0],
+            residual=jnp.where(jnp.max(jnp.abs(balance)) > residual, jnp.max(jnp.abs(balance)), residual),
+        )
+
+    def _gaps(self, positions: Float[Array, "n+1 3"], edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """What the elements lack of the ways between their nodes: those before held nodes."""
+        places, held = self.held_places
+        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        missing = jnp.diff(places, axis=1).T - jnp.diff(sums[held], axis=0)
+        return jnp.zeros_like(edges).at[held[1:] - 1].set(missing)
+
+    def _stretching(
+        self, tangents: Float[Array, "3 m"], end_force: Float[Array, "3 n"]
+    ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        """The energy of stretch, loads, contacts and of what closes the spans; and the gaps."""
+        weights = self.field.side_weights
+        _, tension = self._by_sides(tangents, end_force)
+        strain = axial_strain_under(self.scene.rod, tension)
+        ways = (weights * (1 + strain))[None] * self.field.of_sides(tangents)
+        edges = jnp.sum(ways, axis=1).T
+        positions = self.positions(edges)
+        gaps = self._gaps(positions, edges)
+        energy = jnp.sum(weights * density(self.scene.rod, axial_strain=strain)) - jnp.sum(self.side_forces * ways)
+        return energy + self._contact_energy(positions) + jnp.sum(end_force * gaps.T), gaps
+
+    def under_force(
+        self,
+        point: MixedPoint,
+        bases: Float[Array, "3 b m"],
+        rotation: Float[Array, "b m"],
+        change: Float[Array, "3 n"],
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        turning = jnp.sum(bases * rotation[None], axis=1)
+        (energy, gaps), (rate, gap_rates) = jax.jvp(
+            lambda tangents: self._stretching(tangents, point.end_force + change), (point.tangents,), (turning,)
+        )
+        before, _ = self._stretching(point.tangents, point.end_force)
+        # Of the gradient by rotations, which has the forces as they are.
+        forces, tension = self._by_sides(point.tangents, point.end_force)
+        lengths = self.field.side_weights * (1 + axial_strain_under(self.scene.rod, tension))
+        counted = -jnp.sum(lengths * short_sum(forces * self.field.of_sides(turning), axis=0))
+        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
+
+    def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
+        floor = super().rounding_floor(point)
+        return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * self.stiffness

@@ -163,15 +163,26 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     below = below.at[:, 2:5, :2].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, 4:, :2])
     below = below.at[:, 2:5, 5:].set(-free[:-1, None, None] * identity[None])
 
-    def eliminated(inverse: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        block, below = given
-        pivot = block - below @ inverse @ below.T
-        inverse = jnp.linalg.inv(pivot)
+    # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units in which they
+    # have the stiffness 1.
+    stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
+    unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
+    scale = jnp.concatenate(
+        [jnp.ones((n + 1, 2), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1
+    )
+
+    def inverted(block: Array, scale: Array) -> tuple[Array, Array]:
+        pivot = scale[:, None] * block * scale[None]
+        return pivot, scale[:, None] * jnp.linalg.inv(pivot) * scale[None]
+
+    def eliminated(inverse: Array, given: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        block, below, scale = given
+        pivot, inverse = inverted(block - below @ inverse @ below.T, scale)
         return inverse, (pivot, inverse)
 
-    first = jnp.linalg.inv(blocks[0])
-    _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below))
-    pivots, inverses = jnp.concatenate([blocks[:1], pivots]), jnp.concatenate([first[None], inverses])
+    begin, first = inverted(blocks[0], scale[0])
+    _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, scale[1:]))
+    pivots, inverses = jnp.concatenate([begin[None], pivots]), jnp.concatenate([first[None], inverses])
     # Each force is a multiplier, and so is that of the element before the first node.
     signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
     negative += jnp.sum(signs < 0) - 3 * (n + 1)

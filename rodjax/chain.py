@@ -163,8 +163,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     below = below.at[:, 2:5, :2].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, 4:, :2])
     below = below.at[:, 2:5, 5:].set(-free[:-1, None, None] * identity[None])
 
-    # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units in which they
-    # have the stiffness 1.
+    # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
     stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
     unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
     scale = jnp.concatenate(

@@ -28,13 +28,15 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.loads import DistributedCouple, DistributedForce
+from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Plane, Sphere, Union
 from rodjax.result import Equilibrium
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel
+from rodjax.triangle_mesh import Mesh
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 6
+FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -64,7 +66,10 @@ FIELDS = {
     "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
     "state/shape/quaternions": ("1", "frames of a general rod, at nodes and middles of the elements, or by joints"),
     "state/shape/s": ("1", "Hermite elements and frames: arclength of the nodes as a part of the length"),
-    "state/end_force": ("1", "force at s = L between held ends, with clips for each span, in the solver's units"),
+    "state/end_force": (
+        "1",
+        "force at s = L between held ends, with clips for each span, with obstacles for each element, solver's units",
+    ),
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
@@ -99,6 +104,21 @@ FIELDS = {
     "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
     "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
+    **{
+        f"scene/obstacles/*{part}/{name}": (unit, f"{description}, global axes")
+        for part in ("", "/obstacles/*", "/obstacles/*/obstacles/*")
+        for name, unit, description in (
+            ("point", "m", "point of the plane of a half space"),
+            ("normal", "1", "direction out of a half space"),
+            ("center", "m", "centre of a ball or box"),
+            ("radius", "m", "radius of a ball, capsule or cylinder"),
+            ("start", "m", "where the axis of a capsule or cylinder begins"),
+            ("end", "m", "where the axis of a capsule or cylinder ends"),
+            ("size", "m", "edges of a box"),
+            ("frame", "1", "directions of these edges, in columns"),
+            ("triangles", "m", "corners of the triangles of a body"),
+        )
+    },
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
@@ -114,6 +134,9 @@ FIELDS = {
     },
 }
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
+OBSTACLES = (Plane, Sphere, Capsule, Cylinder, Box, Union, Mesh)
+# How deep unions may lie in one another in a file.
+MOST_UNIONS = 2
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
 KINDS = {
     kind.__name__: kind
@@ -122,6 +145,7 @@ KINDS = {
         *(Polyline, Curve, FramedCurve),
         *(Steps, Smooth),
         *(DistributedForce, DistributedCouple),
+        *OBSTACLES,
     )
 }
 
@@ -143,6 +167,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
             f"equilibrium.scene.rod.law must be None, got a {type(equilibrium.scene.rod.law).__name__}: "
             "a law is code, which cannot be saved"
         )
+    _check_obstacles(equilibrium.scene.obstacles, "equilibrium.scene.obstacles", MOST_UNIONS)
     leading = equilibrium.s.shape[:-1]
     if len(leading) > 1:
         raise ValueError(
@@ -161,6 +186,18 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
     seal(image)
     replace_file(path, image.getvalue())
+
+
+def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) -> None:
+    for k, obstacle in enumerate(obstacles):
+        if type(obstacle) not in OBSTACLES:
+            raise ValueError(f"{name}[{k}] is a {type(obstacle).__name__}: code of one's own, which cannot be saved")
+        if isinstance(obstacle, Union):
+            if not unions:
+                raise ValueError(
+                    f"{name}[{k}] is a Union within {MOST_UNIONS} others, which cannot be saved: put them into one"
+                )
+            _check_obstacles(obstacle.obstacles, f"{name}[{k}].obstacles", unions - 1)
 
 
 def load(path: str | os.PathLike[str]) -> Equilibrium:

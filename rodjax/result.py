@@ -15,7 +15,7 @@ from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.compilation import compiled
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
-from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements
+from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements, with_contacts
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
@@ -32,6 +32,9 @@ from rodjax.sliding import slide
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
+
+# A rod deeper within an obstacle than this part of its radius is so by forces beyond all loads on it, as in a jam.
+MOST_PENETRATION = 1e-4
 
 
 class NotConvergedWarning(UserWarning):
@@ -259,6 +262,8 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
         errors = errors_of_elements(form, point)
     else:
         errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+    if isinstance(form, TouchingForm):
+        return with_contacts(errors, form, point)
     if errors.axial is None:
         return errors
     # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
@@ -288,6 +293,21 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
         stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
         negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
     return _Examination(critical, negative, jnp.any(turn.rotation != 0))
+
+
+def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:
+    """How deep the nodes are within obstacles, as a part of the radius."""
+    if not equilibrium.scene.obstacles:
+        return np.zeros(equilibrium.s.shape[:-1])
+    return np.asarray(_deepest(equilibrium))
+
+
+@over_leading_axes
+def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    depths = form.depths(form.positions(form.edges(point)))
+    return jnp.max(depths / form.radius[None])
 
 
 @over_leading_axes
@@ -344,6 +364,8 @@ def describe(equilibrium: Equilibrium) -> str:
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
         "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(equilibrium.axial_strain, -1)
         <= -1,
+        f"pressed into an obstacle by more than {MOST_PENETRATION:g} of the radius": _penetration(equilibrium)
+        > MOST_PENETRATION,
     }
     counts = {remark: int(np.sum(np.asarray(holds) & converged)) for remark, holds in remarks.items()}
     if converged.ndim == 0:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from rodjax.chain import ChainSystem
 from rodjax.linalg import DenseSystem, SaddlePointSystem, factor, factor_and_solve
 
 
@@ -176,3 +177,45 @@ def test_wrong_shapes_are_named(shapes):
     message = r"shapes \(b, b, n\), .* with b = 1 to 3, got " + ", ".join(rf"\({str(s)[1:-1]}\)" for s in shapes)
     with pytest.raises(ValueError, match=message):
         SaddlePointSystem(*map(jnp.zeros, shapes))
+
+
+def random_chain(elements: int, seed: int = 0) -> ChainSystem:
+    """Of elements between nodes of which three are held; every second one is pushed."""
+    rng = np.random.default_rng(seed)
+    m = 2 * elements + 1
+    diagonal = rng.normal(size=(2, 2, m))
+    compliance = rng.normal(size=(3, 3, elements))
+    stiffness = rng.normal(size=(elements + 1, 3, 3))
+    stiffness = stiffness @ stiffness.transpose(0, 2, 1)
+    stiffness[::2] = 0
+    stiffness[1] *= 1e8  # a contact
+    held = np.isin(np.arange(elements + 1), (0, elements // 2, elements))
+    return ChainSystem(
+        jnp.asarray(diagonal + diagonal.transpose(1, 0, 2)),
+        *(jnp.asarray(rng.normal(size=shape)) for shape in ((2, 2, m - 1), (2, 2, elements), (2, 1, m))),
+        jnp.full((1, 1), 0.3),
+        jnp.asarray(rng.normal(size=(2, 3, 3, elements))),
+        jnp.asarray(np.einsum("ijn,kjn->ikn", compliance, compliance) / 10),
+        jnp.asarray(stiffness),
+        jnp.asarray(held),
+    )
+
+
+@pytest.mark.parametrize("elements", [4, 7])
+def test_chains_are_solved_and_their_signs_counted(elements):
+    system = random_chain(elements)
+    m, multipliers = 2 * elements + 1, 1 + 3 * (elements + 1) + 3 * elements
+
+    def column(unit):
+        f, c = system.times(unit[: 2 * m].reshape(2, m), unit[2 * m :])
+        return jnp.concatenate([f.reshape(-1), c])
+
+    matrix = np.asarray(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
+    np.testing.assert_array_equal(matrix, matrix.T)
+    right = np.random.default_rng(1).normal(size=len(matrix))
+    factors = factor(system)
+    x, y = factors.solve(jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :]))
+    # The contact, of 1e8, costs the dense solve some digits.
+    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(matrix, right), rtol=1e-8, atol=1e-10)
+    assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - 3 * elements
+    assert int(factors.negative) > 0

@@ -20,13 +20,14 @@ from jaxtyping import Array, Float
 from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.touching import TouchingForm
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve, short_sum
 from rodjax.scene import slides
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
-from rodjax.vectors import components, cross, dot
+from rodjax.vectors import components, cross, dot, root
 
 # Steps of the integration of an element: an even number.
 STEPS = 4
@@ -34,6 +35,9 @@ STEPS = 4
 # that.
 TURN_REACH = 4.0
 COUPLE_REACH = 12.0
+# A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
+# displaces it by about half of that.
+CONTACT_REACH = 16.0
 
 
 class Section(NamedTuple):
@@ -123,6 +127,22 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     moved = form.moved(point, here.bases, rotation, force_change)
     axial = _axial_error(form, form, moved, point)
     return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH, axial)
+
+
+def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Errors:
+    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node."""
+    h = jnp.diff(form.field.s)
+    around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
+    forces = jnp.where(form.is_held[None], 0.0, around[:, :-1] - around[:, 1:])
+    beside = jnp.pad(forces, ((0, 0), (1, 1)))
+    alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
+    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2
+    misplaced = alone * (spacing**2 / CONTACT_REACH)[None]
+    sizes = root(dot(misplaced, misplaced))
+    defects = errors.defects
+    if defects is not None:
+        defects = defects + (sizes[:-1] + sizes[1:]) / 2
+    return errors._replace(nodes=errors.nodes + misplaced[:, jnp.argmax(sizes)][None], defects=defects)
 
 
 def _axial_error(

@@ -104,7 +104,7 @@ class TouchingForm(PartedForm):
         return places.T[last] + (sums - sums[held[last]])
 
     @property
-    def _radius(self) -> Float[Array, "n+1"]:
+    def radius(self) -> Float[Array, "n+1"]:
         radius = self.scene.rod.radius
         assert radius is not None, "a scene with obstacles has a radius"
         s = self.field.s
@@ -120,7 +120,7 @@ class TouchingForm(PartedForm):
         load = jnp.asarray(BENDING, self.side_forces.dtype)
         for force in forces:
             load += jnp.sqrt(1.0 + jnp.sum(force**2))
-        radius = self._radius
+        radius = self.radius
         return self.softening * load / (PENETRATION * radius[jnp.argmin(radius)])
 
     def depths(self, positions: Float[Array, "n+1 3"]) -> Float[Array, "obstacles n+1"]:
@@ -128,7 +128,7 @@ class TouchingForm(PartedForm):
         return jnp.stack([self._depths(obstacle, positions) for obstacle in self.scene.obstacles])
 
     def _depths(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
-        depths = self._radius - jax.vmap(obstacle.at)(positions)
+        depths = self.radius - jax.vmap(obstacle.at)(positions)
         return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
 
     def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:

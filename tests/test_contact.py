@@ -1,0 +1,279 @@
+"""Rods that touch obstacles, against closed forms, another solver, rods that touch nothing, and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp
+
+import rodjax as rj
+from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
+
+EI, GJ, RADIUS = 0.02, 0.015, 0.005
+DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)
+LEVEL = frame((1, 0, 0))
+FLOOR = rj.Plane((0, 0, 0), (0, 0, 1))
+# The deepest that a rod may be within an obstacle, in parts of its radius.
+DEEPEST = 1e-4
+
+
+def cable(length=1.0, EA=1e6, mass_per_length=DENSITY) -> Rod:
+    return Rod(length, EI, GJ, EA, mass_per_length, radius=RADIUS)
+
+
+def solved(scene: Scene, segments: int = 64, guess: rj.Guess | None = None) -> rj.Equilibrium:
+    result = rj.solve(scene, segments=segments, guess=guess)
+    assert result.converged
+    assert result.stable
+    clearances = rj.clearance(result, scene.obstacles, points=0).distance
+    assert float(jnp.min(clearances)) > -DEEPEST * RADIUS
+    return result
+
+
+def lift_off(result: rj.Equilibrium, curvature: float) -> float:
+    """Where the curvature begins to differ from that along the obstacle, from the nodes beyond the last contact."""
+    touching = np.flatnonzero(np.linalg.norm(result.contact_forces, axis=1))
+    last = touching[-1]
+    beyond = slice(last + 1, last + 5)
+    s = np.asarray(result.s)
+    parabola = np.polyfit(s[beyond] - s[last], np.asarray(result.curvature)[beyond] - curvature, 2)
+    roots = np.roots(parabola)
+    return float(s[last] + roots[np.argmin(np.abs(roots))].real)
+
+
+# --- a heavy cable on a floor ----------------------------------------------------------------------------------------
+
+
+def lifted(force: float) -> Scene:
+    """A cable that lies on the floor, its end lifted by a force."""
+    return Scene(cable(), Clamp((0, 0, RADIUS), LEVEL), Free(force=(0, 0, force)), GRAVITY, obstacles=[FLOOR])
+
+
+def heavy_elastica(force: float) -> tuple[float, np.ndarray]:
+    """The lifted length and its end (angle, curvature, height, way): no slope, no curvature at the floor, and none at
+    the end; the floor pushes where the cable leaves it with what is left of the lifted weight.
+    """
+    weight = DENSITY * 10.0
+
+    def slopes(x, y, p):
+        shear = weight * p[0] - force - weight * p[0] * x
+        return p[0] * np.vstack([y[1], shear * np.cos(y[0]) / EI, np.sin(y[0]), np.cos(y[0])])
+
+    def misses(first, last, p):
+        return np.array([*first, last[1]])
+
+    x, a = np.linspace(0, 1, 200), 2 * force / weight
+    pushed = weight * a - force
+    angle = (pushed * (a * x) ** 2 / 2 - weight * (a * x) ** 3 / 6) / EI
+    begin = np.vstack([angle, np.gradient(angle, a * x), 0 * x, a * x])
+    found = solve_bvp(slopes, misses, x, begin, p=[a], tol=1e-10, max_nodes=100_000)
+    assert found.success
+    return float(found.p[0]), found.sol(1.0)
+
+
+@pytest.fixture(scope="module")
+def lying() -> rj.Equilibrium:
+    return solved(lifted(0.3))
+
+
+def test_a_lifted_cable_is_the_heavy_elastica(lying):
+    """Contact length, lift-off and height within 1e-3, as a contact at a node may be half an element off its place."""
+    length, end = heavy_elastica(0.3)
+    assert 1.0 - lift_off(lying, 0.0) == pytest.approx(length, rel=1e-3)
+    assert float(lying.nodes[-1, 2]) - RADIUS == pytest.approx(end[2], rel=1e-3)
+    assert float(lying.nodes[-1, 0]) == pytest.approx(1.0 - length + end[3], abs=1e-4)
+
+
+def test_floor_and_supports_carry_the_weight(lying):
+    floor = jnp.sum(lying.contact_forces, axis=0)
+    carried = floor + lying.end_force - lying.start_force
+    # Each to 64 roundings of a contact as stiff as 1e9 EI/L^3.
+    np.testing.assert_allclose(carried, [0, 0, DENSITY * 10.0], rtol=0, atol=1e-9)
+    assert np.all(np.asarray(lying.contact_forces)[:, 2] >= 0)
+    # The floor pushes on what lies as that weighs: 0.1 m in the middle of it, to the ripple of nodes beside the ends.
+    middle = slice(13, 26)
+    weight = DENSITY * 10.0 * 13 / 64
+    assert float(jnp.sum(lying.contact_forces[middle, 2])) == pytest.approx(weight, rel=1e-3)
+
+
+def test_the_estimate_knows_how_coarse_contacts_are(lying):
+    _, end = heavy_elastica(0.3)
+    error = abs(float(lying.nodes[-1, 2]) - RADIUS - end[2])
+    estimate = float(lying.error_estimate)
+    assert error < estimate < 10 * error
+
+
+def test_meshes_are_chosen_with_contacts():
+    result = rj.solve(lifted(0.3), rtol=1e-4)
+    _, end = heavy_elastica(0.3)
+    assert float(result.error_estimate) < 1e-4
+    assert float(result.nodes[-1, 2]) - RADIUS == pytest.approx(end[2], abs=1e-4)
+
+
+# --- over a cylinder -------------------------------------------------------------------------------------------------
+
+
+def test_a_cable_is_bent_round_a_cylinder():
+    """Half of a cable that hangs over a cylinder, without weight, pulled down at its end by F.
+
+    On the way down EI kappa^2/2 + F sin(slope) stays the same, from kappa = 1/R where the slope is that of the
+    lift-off to none where the cable hangs straight (to exp(-L sqrt(F/EI)) = 1e-6). Along the cylinder the tension is
+    that at its end, and pushes with tension/R.
+    """
+    around, force = 0.1, 4.0
+    cylinder = rj.Cylinder((0, -1, 0), (0, 1, 0), around - RADIUS)
+    rod = cable(mass_per_length=0.0)
+    result = solved(
+        Scene(rod, Clamp((0, 0, around), LEVEL), Free(force=(0, 0, -force)), obstacles=[cylinder]), segments=128
+    )
+    slope = np.arcsin(1 - EI / (2 * force * around**2))
+    assert lift_off(result, 1 / around) == pytest.approx(around * slope, rel=2e-3)
+    np.testing.assert_allclose(result.curvature[:8], 1 / around, rtol=1e-3)
+    assert float(jnp.max(result.curvature)) == pytest.approx(1 / around, rel=1e-2)  # between the last two contacts
+    tension = force * np.sin(slope)
+    pressures = np.linalg.norm(result.contact_forces, axis=1)[2:6] * 128
+    np.testing.assert_allclose(pressures, tension / around, rtol=5e-3)  # ripple of nodes beside the lift-off
+
+
+# --- other obstacles, other supports ---------------------------------------------------------------------------------
+
+
+def among_obstacles(p: jax.Array) -> Scene:
+    """A cable through a clip, which touches a slanting cylinder and the floor, and stays clear of a box."""
+    rod = Rod(1.0 + p[0], EI * (1 + p[1]), GJ, 1e5, DENSITY * (1 + p[2]), radius=RADIUS * (1 + p[3]))
+    obstacles = [
+        rj.Cylinder(jnp.stack([0.25 + 0 * p[4], -0.3 + 0 * p[4], 0.1 + p[4]]), (0.3, 0.3, 0.1), 0.07),
+        rj.Plane((0, 0, 0.02), (0, 0.1, 1)),
+        rj.Box((0.2, 0.1, 0.4), (0.1, 0.1, 0.2)),
+    ]
+    end = Clamp(jnp.stack([0.8 + 0 * p[5], p[5] + 0.03, 0.1 + 0 * p[5]]), LEVEL)
+    clips = [Clip(0.85, (0.68, 0.02, 0.09))]
+    return Scene(rod, Clamp((0, 0, 0.2), LEVEL), end, GRAVITY, clips=clips, obstacles=obstacles)
+
+
+NOMINAL = jnp.zeros(6)
+
+
+@pytest.fixture(scope="module")
+def touching() -> rj.Equilibrium:
+    over = np.stack(
+        [np.linspace(0, 0.8, 9), np.linspace(0, 0.03, 9), [0.2, 0.21, 0.22, 0.22, 0.2, 0.15, 0.1, 0.05, 0.1]]
+    )
+    return solved(among_obstacles(NOMINAL), segments=48, guess=rj.Guess(over.T))
+
+
+def test_clips_and_obstacles_share_the_weight(touching):
+    forces = np.asarray(touching.contact_forces)
+    touched = rj.clearance(touching, touching.scene.obstacles, points=0).distance <= 0
+    np.testing.assert_array_equal(touched, [True, True, False])
+    carried = forces.sum(0) + np.asarray(touching.end_force - touching.start_force + touching.clip_forces[0])
+    np.testing.assert_allclose(carried, [0, 0, DENSITY * 10.0], rtol=0, atol=1e-9)
+    clip = touching.position_at([0.85])[0]
+    np.testing.assert_allclose(clip, [0.68, 0.02, 0.09], rtol=0, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences(touching):
+    def seen(p):
+        result = rj.solve(among_obstacles(p), segments=48, guess=touching)
+        contacts = jnp.sum(result.contact_forces, axis=0)
+        return jnp.concatenate(
+            [
+                result.start_force,
+                result.end_moment,
+                result.nodes[16],
+                contacts,
+                result.clip_forces[0],
+                result.energy[None],
+            ]
+        )
+
+    forward = np.asarray(jax.jacfwd(seen)(NOMINAL))
+    step = 1e-6
+    columns = [(seen(NOMINAL.at[k].add(step)) - seen(NOMINAL.at[k].add(-step))) / (2 * step) for k in range(6)]
+    differences = np.stack(columns, axis=1)
+    # A difference loses 1e-8 EI/L^2 of residual over 1e-6; the largest derivatives are some 100.
+    sizes = np.max(np.abs(differences), axis=1, keepdims=True)
+    np.testing.assert_allclose(forward / sizes, differences / sizes, rtol=0, atol=1e-5)
+    weights = jnp.linspace(1.0, 2.0, len(forward))
+    backward = jax.grad(lambda p: weights @ seen(p))(NOMINAL)
+    np.testing.assert_allclose(backward, weights @ forward, rtol=1e-9, atol=1e-9 * np.max(sizes))
+
+
+def test_what_is_far_away_changes_nothing():
+    ends = Clamp((0, 0, 0), LEVEL), Pin((0.7, 0.1, 0.05))
+    far = rj.Sphere((0, 0, 5), 1.0)
+    plain = rj.solve(Scene(cable(), *ends, GRAVITY), segments=32)
+    beside = rj.solve(Scene(cable(), *ends, GRAVITY, obstacles=[far]), segments=32)
+    np.testing.assert_array_equal(beside.contact_forces, 0.0)
+    # Both to a residual of 1e-8 EI/L^2.
+    np.testing.assert_allclose(beside.nodes, plain.nodes, rtol=0, atol=1e-9)
+    for name in ("start_force", "end_force", "start_moment", "energy", "elastic_energy", "tension"):
+        np.testing.assert_allclose(getattr(beside, name), getattr(plain, name), rtol=0, atol=1e-8, err_msg=name)
+    assert int(beside.index) == 0
+    assert not beside.critical
+    assert float(rj.lowest_mode(beside).stiffness) == pytest.approx(float(rj.lowest_mode(plain).stiffness), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_batches_and_paths_touch_too():
+    scenes = [lifted(force) for force in (0.3, 0.32, 0.34)]
+    each = [rj.solve(scene, segments=64) for scene in scenes]
+    batch, path = rj.solve_batch(scenes, segments=64), rj.solve_path(scenes, segments=64)
+    for k, one in enumerate(each):
+        for many in (batch, path):
+            assert many.converged[k]
+            np.testing.assert_allclose(many.nodes[k], one.nodes, rtol=0, atol=1e-8)
+            np.testing.assert_allclose(many.contact_forces[k], one.contact_forces, rtol=0, atol=1e-6)
+
+
+def test_files_keep_obstacles(touching, tmp_path):
+    path = tmp_path / "touching.vtkhdf"
+    rj.save(touching, path)
+    again = rj.load(path)
+    assert jax.tree.structure(again) == jax.tree.structure(touching)
+    jax.tree.map(np.testing.assert_array_equal, again, touching)
+    np.testing.assert_array_equal(again.contact_forces, touching.contact_forces)
+
+
+def test_files_keep_no_code(touching, tmp_path):
+    distance = rj.Distance(lambda point: point[2])
+    scene = Scene(cable(), Clamp((0, 0, 0), LEVEL), Free(), GRAVITY, obstacles=[rj.Union(distance)])
+    with pytest.raises(ValueError, match=r"scene\.obstacles\[0\]\.obstacles\[0\] is a Distance: code of one's own"):
+        rj.save(rj.solve(scene, segments=4), tmp_path / "x.vtkhdf")
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, **others) -> Scene:
+    return Scene(rod or cable(), Clamp((0, 0, 1), LEVEL), end or Free(), GRAVITY, obstacles=[FLOOR], **others)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: with_floor(Rod(1.0, EI, GJ, 1e5, DENSITY)), "rod must have a radius where there are obstacles"),
+        (lambda: with_floor(Rod(1.0, (EI, EI / 2), GJ, 1e5, DENSITY, radius=RADIUS)), "obstacles must be () for a rod"),
+        (lambda: with_floor(end=Free(moment=(0, 0, 0.1))), "obstacles must be () where a moment acts"),
+        (lambda: with_floor(clips=[Clip(0.5, (0.5, 0, 1), sliding=True)]), "obstacles must be () where the rod slides"),
+        (
+            lambda: Scene(cable(), Clamp((0, 0, 1), LEVEL), Free(), obstacles=FLOOR),
+            "obstacles must be a list of Obstacle",
+        ),
+        (lambda: Scene(cable(), Clamp((0, 0, 1), LEVEL), Free(), obstacles=[1]), r"obstacles[0] must be an Obstacle"),
+        (lambda: rj.solve(with_floor(), discretization="finite_difference"), "discretization must be 'hermite'"),
+        (lambda: rj.solve(with_floor(), planar=True), "planar must be False for a scene with obstacles"),
+        (lambda: rj.solve(with_floor(), solver=rj.NonlinearCG()), "discretization must be 'hermite' for a scene"),
+        (lambda: rj.solve_continuum(with_floor()), "obstacles must be () in the continuum"),
+        (lambda: rj.follow([with_floor(), with_floor()]), "needs scenes without obstacles"),
+        (
+            lambda: rj.solve_path([with_floor(), with_floor()], at_critical="stop"),
+            "at_critical must be 'jump' for scenes with obstacles",
+        ),
+    ],
+)
+def test_what_obstacles_do_not_go_with_is_said(make, message):
+    with pytest.raises((ValueError, TypeError)) as caught:
+        make()
+    assert message in str(caught.value)

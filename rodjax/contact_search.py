@@ -1,8 +1,8 @@
 """Where a rod lies that touches obstacles: Newton's method, with contacts that become stiffer and stiffer.
 
 A rod that begins within an obstacle, or that its loads drive into one, would be thrown about by full contacts. So the
-first ones are soft; each equilibrium is then the start of the next, until the contacts are those of a result. Where
-the start is in contact already, such as an equilibrium of a scene nearby, they are tried at once.
+first ones are soft; each equilibrium is then the start of the next, until the contacts are those of a result. A start
+that touches already begins with stiffer ones, and one that is all but in equilibrium with full ones.
 """
 
 import equinox as eqx
@@ -13,19 +13,22 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.touching import BENDING, TouchingForm
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium
-from rodjax.status import Outcome, Status, is_converged
+from rodjax.status import Outcome, Status
 
-# Contacts become stiffer by this factor at a time, from such as a force that bends the rod presses in by FIRST_DEPTH.
-STIFFENING = 30.0
+# Into the first contacts a force that bends the rod presses it so deep, in parts of its length; where the start
+# touches, so deep. From there on they become stiffer by STIFFENING at a time.
 FIRST_DEPTH = 0.05
+TOUCHING_DEPTH = 2e-3
+STIFFENING = 30.0
+# The residual [EI/L^2] of a start that is all but in equilibrium.
+NEAR = 1.0
 
 
 class _Stage(eqx.Module):
-    """What was found with the last contacts, and the softening of the next ones; whether these are the last."""
+    """What was found with the last contacts, and the softening of the next ones."""
 
     softening: Float[Array, ""]
     end: NewtonEnd
-    is_first: Bool[Array, ""]
     is_done: Bool[Array, ""]
 
 
@@ -33,8 +36,10 @@ def find_touching(form: TouchingForm, point: MixedPoint, solver: Newton, find: F
     """The equilibrium reached from `point`."""
     depths = form.depths(form.positions(form.edges(point)))
     deepest = depths.reshape(-1)[jnp.argmax(depths)]
-    soft = BENDING / (form.stiffness * jnp.where(deepest > FIRST_DEPTH, deepest, FIRST_DEPTH))
-    touches = jnp.any(point.end_force[:, 1:] != point.end_force[:, :-1]) & (form.stiffness * deepest < BENDING)
+    touches = jnp.any(point.end_force[:, 1:] != point.end_force[:, :-1])
+    least = jnp.where(touches, TOUCHING_DEPTH, FIRST_DEPTH)
+    soft = BENDING / (form.stiffness * jnp.where(deepest > least, deepest, least))
+    is_near = form.linearized(point).residual <= NEAR
     count = jnp.zeros((), int)
     outcome = Outcome(jnp.zeros_like(soft), count, count, jnp.full((), Status.RUNNING, int))
     begin = NewtonEnd(point, outcome, jnp.array(False))
@@ -47,13 +52,8 @@ def find_touching(form: TouchingForm, point: MixedPoint, solver: Newton, find: F
             end,
             (end.outcome.iterations + before.iterations, end.outcome.evaluations + before.evaluations),
         )
-        # Full contacts that were tried at once, in vain, are come to by softer ones.
-        again = stage.is_first & (stage.softening >= 1) & ~is_converged(end.outcome.status)
-        point = jax.tree.map(lambda begin, reached: jnp.where(again, begin, reached), begin.point, end.point)
         stiffer = STIFFENING * stage.softening
-        following = jnp.where(again, soft, jnp.where(stiffer < 1, stiffer, 1.0))
-        end = eqx.tree_at(lambda end: end.point, end, point)
-        return _Stage(following, end, jnp.array(False), (stage.softening >= 1) & ~again)
+        return _Stage(jnp.where(stiffer < 1, stiffer, 1.0), end, stage.softening >= 1)
 
-    stage = _Stage(jnp.where(touches, 1.0, soft), begin, jnp.array(True), jnp.array(False))
+    stage = _Stage(jnp.where(is_near | (soft > 1), 1.0, soft), begin, jnp.array(False))
     return jax.lax.while_loop(lambda stage: ~stage.is_done, solved, stage).end

@@ -10,6 +10,7 @@ element (`chain.ChainSystem`). Positions follow from the elements, so that tange
 Hermite elements only. Contact acts at the nodes; between them the rod is not looked at.
 """
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -33,15 +34,21 @@ from rodjax.supports import Free
 # A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
 PENETRATION = 3e-5
 BENDING = 100.0
+# The most of a contact that counts as it curves, in terms of that which the elements know of: beside one another in a
+# corner each of two obstacles may push as much as both together.
+MOST_CURVING = 2.0
 
 
 class TouchingForm(PartedForm):
     """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element.
 
-    `softening`: by how much the contacts are softer than those of a result, 1 or less.
+    `softening`: by how much the contacts are softer than those of a result, 1 or less; `is_cautious`: an obstacle that
+    curves away counts only by the forces that the elements know of. On the way to an equilibrium a contact may be far
+    too deep for its stiffness, and would throw the rod off a round obstacle.
     """
 
     softening: Float[Array, ""] = eqx.field(kw_only=True)
+    is_cautious: bool = eqx.field(kw_only=True, static=True, default=False)
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "TouchingForm":
@@ -56,7 +63,8 @@ class TouchingForm(PartedForm):
         )
 
     def softened(self, softening: Float[Array, ""]) -> "TouchingForm":
-        return eqx.tree_at(lambda form: form.softening, self, softening)
+        """On the way to an equilibrium."""
+        return dataclasses.replace(self, softening=softening, is_cautious=True)
 
     # --- what is unknown ---------------------------------------------------------------------------------------------
 
@@ -140,29 +148,35 @@ class TouchingForm(PartedForm):
     def _energy_at(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
         return self.stiffness / 2 * jnp.sum(self._depths(obstacle, positions) ** 2)
 
-    def _contacts(self, positions: Float[Array, "n+1 3"]) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
-        """First and second derivatives of the energy of the contacts by the positions of the nodes."""
+    def _contacts(
+        self, positions: Float[Array, "n+1 3"], forces: Float[Array, "n+1 3"]
+    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
+        """First and second derivatives of the energy of the contacts by the positions of the nodes.
+
+        `forces`: of the contacts, as those through the elements have them.
+        """
         nothing = jnp.zeros_like(positions), jnp.zeros((*positions.shape, 3), positions.dtype)
+        most = MOST_CURVING * jnp.sqrt(jnp.sum(forces**2, axis=1)) if self.is_cautious else None
         first, second = nothing
         for obstacle in self.scene.obstacles:
             # Where the rod is far from all of an obstacle, the distance is all that is computed of it.
             touches = jnp.any(self._depths(obstacle, positions) > 0)
             one, two = jax.lax.cond(
-                touches, functools.partial(self._contacts_with, obstacle), lambda _: nothing, positions
+                touches, functools.partial(self._contacts_with, obstacle, most), lambda _: nothing, positions
             )
             first, second = first + one, second + two
         return first, second
 
     def _contacts_with(
-        self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]
+        self, obstacle: Obstacle, most: Float[Array, "n+1"] | None, positions: Float[Array, "n+1 3"]
     ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
-        def energy(positions):
-            return self._energy_at(obstacle, positions)
-
-        first, by_all = jax.linearize(jax.grad(energy), positions)
-        axes = jnp.eye(3, dtype=positions.dtype)[:, None] * jnp.ones_like(positions)[None]
-        # Each component of all nodes at once, as each node is alone with the obstacle.
-        return first, jnp.moveaxis(jax.vmap(by_all)(axes), 0, -1)
+        depths = self._depths(obstacle, positions)
+        normals, curvatures = jax.vmap(lambda x: (jax.grad(obstacle.at)(x), jax.hessian(obstacle.at)(x)))(positions)
+        pressures = self.stiffness * depths
+        curving = pressures if most is None else jnp.where(pressures > most, most, pressures)
+        stiffnesses = jnp.where(depths > 0, self.stiffness, 0.0)
+        second = stiffnesses[:, None, None] * normals[:, :, None] * normals[:, None]
+        return -pressures[:, None] * normals, second - curving[:, None, None] * curvatures
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
@@ -177,9 +191,10 @@ class TouchingForm(PartedForm):
         cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         positions = self.positions(edges)
-        first, second = self._contacts(positions)
-        beyond = jnp.pad(point.end_force, ((0, 0), (1, 1)))
-        balance = first + (beyond[:, :-1] - beyond[:, 1:]).T
+        around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
+        pushing = (around[:, :-1] - around[:, 1:]).T
+        first, second = self._contacts(positions, pushing)
+        balance = first + pushing
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
         closure = [balance.reshape(-1), self._gaps(positions, edges).reshape(-1)]
         dtype = energy.dtype

@@ -1,0 +1,141 @@
+"""What pictures of routes show of each cable: its course, colors and what holds it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+
+from rodjax.plot import COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along
+from rodjax.result import Equilibrium
+from rodjax.routing.limits import Limits
+from rodjax.routing.margins import curvature_along
+from rodjax.routing.reactions import Reaction, reactions
+from rodjax.routing.surfaces import Faces, round_faces, surfaces
+
+# Margins of the bend radius between which colors differ, and the colors: of none red, from none on yellow to blue.
+LEAST_MARGIN, MOST_MARGIN = -0.5, 1.0
+NONE = -LEAST_MARGIN / (MOST_MARGIN - LEAST_MARGIN)
+MARGIN_COLORS = LinearSegmentedColormap.from_list(
+    "bend margin",
+    [(0.0, "#67000d"), (NONE, "#ef3b2c"), (NONE, "#fed976"), (0.55, "#78c679"), (0.75, "#41b6c4"), (1.0, "#225ea8")],
+)
+WITHOUT_LIMIT = (0.6, 0.6, 0.6, 1.0)
+# Of obstacles, one after another.
+PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f")
+CLIP_COLOR = "#3a3a3a"
+# By the largest extent of the cables: the thinnest that is drawn.
+LEAST_RADIUS = 0.005
+# A clip, by the radius of the cable: its own, and half of its length.
+CLIP_RADIUS, CLIP_LENGTH = 1.7, 1.4
+POINTS = 240
+
+
+class Sight(NamedTuple):
+    """One cable: `radius` [m], as it is drawn where thickest; along it, at arclengths `s` (k,) [m]: `centerline` (k, 3)
+    [m], `curvature` (k,) [1/m], `tension` (k,) [N], and of a bend radius that is limited `margin` (k,)."""
+
+    name: str
+    equilibrium: Equilibrium
+    radius: float
+    s: Float[np.ndarray, "k"]
+    centerline: Float[np.ndarray, "k 3"]
+    curvature: Float[np.ndarray, "k"]
+    tension: Float[np.ndarray, "k"]
+    margin: Float[np.ndarray, "k"] | None
+    reactions: list[Reaction]
+
+    @property
+    def forces(self) -> list[Reaction]:
+        """Those that are more than rounding."""
+        least = LEAST_LOAD * float(self.equilibrium.state.units.force)
+        return [reaction for reaction in self.reactions if np.linalg.norm(reaction.force) > least]
+
+
+class Coloring(NamedTuple):
+    """How cables are colored: by the margins of their bend radii, or by curvature where none of them has a limit."""
+
+    label: str
+    norm: Normalize
+    color_map: Colormap | str
+    is_margin: bool
+
+    def of(self, sight: Sight, s: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 4"]:
+        values = sight.margin if self.is_margin else sight.curvature
+        if values is None:
+            return np.tile(WITHOUT_LIMIT, (len(s), 1))
+        return np.asarray(ScalarMappable(self.norm, self.color_map).to_rgba(np.interp(s, sight.s, values)))
+
+
+def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: float) -> Sight:
+    """One cable in a scene of this largest extent [m]."""
+    rod = equilibrium.scene.rod
+    s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS + 1)
+    places, values = (np.asarray(x) for x in curvature_along(equilibrium))
+    curvature = np.interp(s, places, values)
+    margin = None
+    if limits is not None and limits.bend_radius is not None:
+        radius = radius_along(rod.radius, s)
+        limit = 2 * float(limits.bend_radius) * radius
+        with np.errstate(divide="ignore"):
+            margin = np.minimum((1 / curvature - radius) / limit - 1, 2 * MOST_MARGIN)
+    true = 0.0 if rod.radius is None else largest_radius(rod.radius)
+    return Sight(
+        name,
+        equilibrium,
+        max(true, LEAST_RADIUS * extent),
+        np.asarray(s),
+        np.asarray(equilibrium.position_at(s)),
+        curvature,
+        np.interp(s, equilibrium.s, equilibrium.tension),
+        margin,
+        reactions(equilibrium),
+    )
+
+
+def extent(equilibria: Sequence[Equilibrium]) -> float:
+    """The largest extent of cables along an axis of the scene [m]."""
+    nodes = np.concatenate([np.asarray(equilibrium.nodes) for equilibrium in equilibria])
+    return float(np.max(np.ptp(nodes, axis=0)))
+
+
+def coloring(sights: Sequence[Sight]) -> Coloring:
+    if any(sight.margin is not None for sight in sights):
+        norm = Normalize(LEAST_MARGIN, MOST_MARGIN)
+        return Coloring("margin of the inside bend radius", norm, MARGIN_COLORS, True)
+    largest = max(float(np.max(sight.curvature)) for sight in sights)
+    return Coloring(LABELS["curvature"], Normalize(0.0, largest if largest > 1e-9 else 1.0), COLOR_MAP, False)
+
+
+def thickness_note(sights: Sequence[Sight]) -> str:
+    """What to say of cables that are not as thick as they are drawn."""
+    radii = [sight.equilibrium.scene.rod.radius for sight in sights]
+    if any(radius is None for radius in radii):
+        return "thickness not to scale"
+    times = max(sight.radius / largest_radius(radius) for sight, radius in zip(sights, radii, strict=True))
+    return f"drawn up to {times:.2g} times as thick as it is" if times > 1.01 else ""
+
+
+def clip_faces(sight: Sight) -> list[Faces]:
+    """A collar around the cable for each clip."""
+    return [
+        round_faces(
+            clip.position - CLIP_LENGTH * sight.radius * clip.axes[0],
+            clip.position + CLIP_LENGTH * sight.radius * clip.axes[0],
+            CLIP_RADIUS * sight.radius,
+            1e3 * sight.radius,
+            has_caps=False,
+        )
+        for clip in sight.reactions[1:-1]
+    ]
+
+
+def seen_surfaces(sights: Sequence[Sight], obstacles: Sequence) -> list[Faces]:
+    """Those of obstacles near the cables."""
+    points = np.concatenate([sight.centerline for sight in sights])
+    thickest = max(sight.radius for sight in sights)
+    # The room that the tubes take, so that a patch of a floor lies below all of it.
+    return surfaces(obstacles, np.concatenate([points - thickest, points + thickest])) if obstacles else []

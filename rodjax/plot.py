@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -36,6 +37,7 @@ ARROW_LENGTH = 0.22
 LEAST_DEPTH = 0.3
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
+HALO = withStroke(linewidth=2, foreground="white")
 # The view [degrees], and what is right and up in it.
 ELEVATION, AZIMUTH = 22, -62
 RIGHT, UP = np.array((0.88, 0.47, 0.0)), np.array((-0.18, 0.33, 0.93))
@@ -121,7 +123,7 @@ def plot_figure_1(
     radius, note = thickness(shown)
     norm = Normalize(*_limits(np.concatenate([getattr(equilibrium, color_by) for equilibrium in shown])))
     points = [_draw_tube(axes, rod, radius, color_by, norm) for axes, rod in zip(panels, shown, strict=True)]
-    grids = [set_view(axes, np.concatenate(points), labels=False) for axes in panels]
+    grids = [set_view(axes, np.concatenate(points), labels=False, zoom=1.1) for axes in panels]
     for axes, stage, equilibrium in zip(panels, stages, shown, strict=True):
         twist = f"{round(np.degrees(float(equilibrium.total_twist)))}°"
         axes.set_title(f"({'abcdef'[stage]}) {STAGES[stage]}\ntotal twist {twist}", fontsize=10, y=0.95)
@@ -195,14 +197,17 @@ def _draw_tube(
 
 
 def tube_faces(
-    equilibrium: Equilibrium, radius: float, color_at: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "k 4"]]
+    equilibrium: Equilibrium,
+    radius: float,
+    color_at: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "k 4"]],
+    strips: Sequence[tuple[int, tuple[float, float, float]]] = STRIPS,
 ) -> tuple[Float[np.ndarray, "f 4 3"], Float[np.ndarray, "f 3"]]:
-    """The faces of one rod with its caps, and their colors: those at arclengths [m], and the two strips."""
+    """The faces of one rod with its caps, and their colors: those at arclengths [m], and the strips."""
     s, centerline, points = tube(equilibrium, radius)
     rings = color_at((s[:-1] + s[1:]) / 2)[:, :3]
     colors = np.repeat(rings[:, None], FACES_AROUND, axis=1)
     # The strip is faces of the tube: a line of its own would be sorted in depth as a whole, in front or behind.
-    for first, color in STRIPS:
+    for first, color in strips:
         colors[:, first : first + STRIP_FACES] = color
     # Caps, with a hole too small to see: faces without an area have no normal for the shading.
     hole = 1e-3
@@ -265,12 +270,12 @@ def draw_arrows(
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
         x, y, z = foot + (reach + 0.05 * length) * along
         ha, va = "left" if along @ RIGHT > 0 else "right", "bottom" if along @ UP > 0 else "top"
-        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va)
+        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
         tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))
 
 
-def set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True) -> float:
+def set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True, zoom: float = 0.85) -> float:
     """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
     low, high = points.min(axis=0), points.max(axis=0)
     spans = 1.04 * np.maximum(high - low, LEAST_DEPTH * np.max(high - low))
@@ -284,7 +289,7 @@ def set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True
             axis.labelpad = 12  # clear of the tick labels
         else:
             axis.set_major_formatter(NullFormatter())
-    axes.set_box_aspect(tuple(spans), zoom=0.85 if labels else 1.1)  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(tuple(spans), zoom=zoom)  # pyright: ignore[reportArgumentType]
     axes.set_proj_type("ortho")
     axes.view_init(ELEVATION, AZIMUTH)
     return grid

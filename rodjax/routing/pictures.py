@@ -12,7 +12,7 @@ from matplotlib.ticker import PercentFormatter
 
 from rodjax.checks import line
 from rodjax.obstacles import Obstacle
-from rodjax.plot import ARROW_LENGTH, RIGHT, UP, draw_arrows, draw_faces, set_view, tube_faces
+from rodjax.plot import ARROW_LENGTH, HALO, RIGHT, UP, draw_arrows, draw_faces, set_view, tube_faces
 from rodjax.routing.sights import (
     CLIP_COLOR,
     PALETTE,
@@ -27,6 +27,7 @@ from rodjax.routing.sights import (
 # How much of what is behind an obstacle it hides.
 OPACITY = 0.35
 FORCE_COLOR = "tab:red"
+ZOOM = 1.15
 # Characters of a line of the title.
 WIDTH = 100
 
@@ -37,13 +38,13 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     Clips are collars, forces that supports apply to the cables arrows with their sizes. Each obstacle has its name in
     the legend.
     """
-    figure = Figure(figsize=(9, 6.5), layout="constrained")
+    figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     axes.computed_zorder = False  # arrows and words in front of all faces
     colors = coloring(sights)
     faces, shades = [], []
     for sight in sights:
-        tube, shade = tube_faces(sight.equilibrium, sight.radius, lambda s, sight=sight: colors.of(sight, s))
+        tube, shade = tube_faces(sight.equilibrium, sight.radius, lambda s, sight=sight: colors.of(sight, s), ())
         faces.append(tube)
         shades.append(np.pad(shade, ((0, 0), (0, 1)), constant_values=1.0))
         for collar in clip_faces(sight):
@@ -54,7 +55,8 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
         color = to_rgba(PALETTE[k % len(PALETTE)], OPACITY)
         faces.append(surface)
         shades.append(np.tile(color, (len(surface), 1)))
-        legend.append(Patch(facecolor=color, label=line(name) if len(surface) else f"{line(name)} (not in the picture)"))
+        label = line(name) if len(surface) else f"{line(name)} (not in the picture)"
+        legend.append(Patch(facecolor=to_rgba(color, 0.8), label=label))
     # All faces together: each artist by itself would be sorted in depth as a whole.
     draw_faces(axes, np.concatenate(faces), np.concatenate(shades))
     size = extent([sight.equilibrium for sight in sights])
@@ -70,7 +72,7 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     )
     for sight in sights:
         _name(axes, sight, size, len(sights) > 1)
-    set_view(axes, np.concatenate([np.concatenate(faces).reshape(-1, 3), tips]))
+    set_view(axes, np.concatenate([np.concatenate(faces).reshape(-1, 3), tips]), zoom=ZOOM)
     axes.text2D(0.0, 0.0, thickness_note(sights), transform=axes.transAxes, fontsize=8, color="0.4")
     bar = figure.colorbar(
         ScalarMappable(colors.norm, colors.color_map),
@@ -95,4 +97,4 @@ def _name(axes, sight: Sight, size: float, has_name: bool) -> None:
         places.append((line(sight.name), sight.centerline[len(sight.centerline) // 2]))
     for name, place in places:
         x, y, z = place + 0.04 * size * (RIGHT - UP)
-        axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top")
+        axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])

@@ -10,11 +10,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
 from rodjax.plot import COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along
-from rodjax.result import Equilibrium
+from rodjax.result import Equilibrium, over_leading_axes
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import curvature_along
+from rodjax.routing.margins import _curvature
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.surfaces import Faces, round_faces, surfaces
+
+curvature_along = over_leading_axes(_curvature)
 
 # Margins of the bend radius between which colors differ, and the colors: of none red, from none on yellow to blue.
 LEAST_MARGIN, MOST_MARGIN = -0.5, 1.0
@@ -25,7 +27,7 @@ MARGIN_COLORS = LinearSegmentedColormap.from_list(
 )
 WITHOUT_LIMIT = (0.6, 0.6, 0.6, 1.0)
 # Of obstacles, one after another.
-PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f")
+PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
 CLIP_COLOR = "#3a3a3a"
 # By the largest extent of the cables: the thinnest that is drawn.
 LEAST_RADIUS = 0.005

@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +23,7 @@ BEYOND = 0.08
 # Faces around something round, along its meridian, along an edge of the largest extent, and cells of a grid along it.
 FACES_AROUND = 32
 FACES_ALONG = 12
-CELLS = 36
+CELLS = 28
 # Triangles of a mesh at most; more are joined.
 MOST_TRIANGLES = 4000
 # Steps onto the surface of what has only a distance.
@@ -179,11 +178,14 @@ def _split(triangles: Float[np.ndarray, "f 3 3"], longest: float) -> Float[np.nd
 def _level_set(obstacle: Obstacle, region: Region) -> Faces:
     """The surface by a vertex in each cell of a grid through which it passes (Gibson 1998, "Constrained elastic
     surface nets"), moved onto it along the gradient."""
-    spans = region.high - region.low
-    width = float(np.max(spans)) / CELLS
-    counts = np.ceil(spans / width).astype(int)
-    places = region.low + width * np.stack(np.meshgrid(*(np.arange(n + 1) for n in counts), indexing="ij"), axis=-1)
-    distance = np.asarray(obstacle.distance(places))
+    places, distance, width = _sampled(obstacle, region.low, region.high)
+    # Again where it is, as it may be small.
+    is_near = np.abs(distance) <= width
+    if not np.any(is_near):
+        return np.zeros((0, 4, 3))
+    low, high = (np.clip(x, region.low, region.high) for x in _around(places[is_near], width))
+    places, distance, width = _sampled(obstacle, low, high)
+    low, counts = places[0, 0, 0], np.array(distance.shape) - 1
     is_inside = distance < 0
     corners = [tuple(slice(k, n + k) for k, n in zip(corner, counts, strict=True)) for corner in CORNERS]
     inside = sum(is_inside[corner].astype(int) for corner in corners)
@@ -201,11 +203,25 @@ def _level_set(obstacle: Obstacle, region: Region) -> Faces:
         part = np.where(crosses, from_a / np.where(crosses, from_a - from_b, 1.0), 0.0)
         total += crosses[:, None] * (CORNERS[a] + part[:, None] * (CORNERS[b] - CORNERS[a]))
         count += crosses[:, None]
-    vertices = region.low + width * (cells + total / count)
+    vertices = low + width * (cells + total / count)
     vertices = np.asarray(_onto(obstacle, jnp.asarray(vertices), jnp.asarray(width)))
     index = np.full(counts, -1)
     index[tuple(cells.T)] = np.arange(len(cells))
     return vertices[np.concatenate([_around_edges(is_inside, index, axis) for axis in range(3)])]
+
+
+def _sampled(
+    obstacle: Obstacle, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "i j k 3"], Float[np.ndarray, "i j k"], float]:
+    """The corners of cubes that fill a box, the distances there, and the edge of the cubes."""
+    width = float(np.max(high - low)) / CELLS
+    counts = np.maximum(np.ceil((high - low) / width - 1e-9), 1).astype(int)
+    places = low + width * np.stack(np.meshgrid(*(np.arange(n + 1) for n in counts), indexing="ij"), axis=-1)
+    return places, np.asarray(obstacle.distance(places)), width
+
+
+def _around(points: Float[np.ndarray, "p 3"], width: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    return points.min(axis=0) - width, points.max(axis=0) + width
 
 
 def _around_edges(is_inside: np.ndarray, index: np.ndarray, axis: int) -> np.ndarray:
@@ -220,9 +236,7 @@ def _around_edges(is_inside: np.ndarray, index: np.ndarray, axis: int) -> np.nda
 
 
 @compiled
-def _onto(
-    obstacle: Obstacle, points: Float[Array, "v 3"], most: Float[Array, ""]
-) -> Float[Array, "v 3"]:
+def _onto(obstacle: Obstacle, points: Float[Array, "v 3"], most: Float[Array, ""]) -> Float[Array, "v 3"]:
     """Points moved onto the surface, by no more than `most` a step."""
 
     def moved(point: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.report import Report, report
 
 __version__ = "0.1.0"
 
@@ -88,6 +89,7 @@ __all__ = [
     "Plane",
     "PointForce",
     "Reading",
+    "Report",
     "Rod",
     "Scene",
     "SceneFileError",
@@ -115,6 +117,7 @@ __all__ = [
     "pinhole",
     "problems",
     "read_scene",
+    "report",
     "rotate",
     "save",
     "sensitivities",
@@ -153,6 +156,8 @@ _LATER = {
     "Limits": "routing.limits",
     "Margins": "routing.margins",
     "margins": "routing.margins",
+    "Report": "routing.report",
+    "report": "routing.report",
 }
 
 

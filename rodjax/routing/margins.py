@@ -221,13 +221,13 @@ def _largest(
     return Measured(name, unit, False, jnp.abs(chosen), limits, 1 - (chosen / limits) ** 2, s[at])
 
 
-class _Curvature(NamedTuple):
+class Curvature(NamedTuple):
     s: Float[Array, "k"]
     value: Float[Array, "k"]
 
 
 def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
-    s, curvature = _curvature(equilibrium)
+    s, curvature = curvature_along(equilibrium)
     radius = radius_at(equilibrium.scene.rod, s)
     limit = 2 * multiple.astype(radius.dtype) * radius
     slack = 1 - curvature * (limit + radius)
@@ -239,10 +239,10 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: 
     return Measured("bend radius", "m", True, inside, limit[at], slack[at], s[at])
 
 
-def _curvature(equilibrium: Equilibrium) -> _Curvature:
+def curvature_along(equilibrium: Equilibrium) -> Curvature:
     """At places one after another, as close as limits are looked at."""
     if not isinstance(equilibrium.state.shape, Curve):
-        return _Curvature(equilibrium.s, equilibrium.curvature)
+        return Curvature(equilibrium.s, equilibrium.curvature)
     # It jumps at a clip that holds a direction, and so is looked at on both sides of the nodes.
     inset = float(jnp.finfo(equilibrium.s.dtype).eps) ** 0.5
     fractions = np.array([inset, *(np.arange(1, POINTS + 1) / (POINTS + 1)), 1 - inset])
@@ -254,7 +254,7 @@ def _curvature(equilibrium: Equilibrium) -> _Curvature:
     first, second = jax.jvp(slope, (s,), (jnp.ones_like(s),))
     across = jnp.cross(first, second)
     squared = jnp.sum(first**2, axis=1)
-    return _Curvature(s, root(jnp.sum(across**2, axis=1)) / squared**1.5)
+    return Curvature(s, root(jnp.sum(across**2, axis=1)) / squared**1.5)
 
 
 def _clearances(

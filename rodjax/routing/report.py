@@ -82,9 +82,9 @@ class Report:
         return web_page(self, self._sights)
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Writes report.txt, report.csv, report.json, report.png and report.html; makes the folder where it is not there.
+        """Writes report.txt, report.csv, report.json, report.png and report.html; returns their names.
 
-        Returns their names. Raises `OSError` where they cannot be written.
+        The folder is made where it is not there. Raises `OSError` where they cannot be written.
         """
         folder = file_path(folder, "folder")
         image = io.BytesIO()

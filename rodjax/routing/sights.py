@@ -12,11 +12,9 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from rodjax.plot import COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along
 from rodjax.result import Equilibrium, over_leading_axes
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import _curvature
+from rodjax.routing.margins import curvature_along
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.surfaces import Faces, round_faces, surfaces
-
-curvature_along = over_leading_axes(_curvature)
 
 # Margins of the bend radius between which colors differ, and the colors: of none red, from none on yellow to blue.
 LEAST_MARGIN, MOST_MARGIN = -0.5, 1.0
@@ -25,6 +23,8 @@ MARGIN_COLORS = LinearSegmentedColormap.from_list(
     "bend margin",
     [(0.0, "#67000d"), (NONE, "#ef3b2c"), (NONE, "#fed976"), (0.55, "#78c679"), (0.75, "#41b6c4"), (1.0, "#225ea8")],
 )
+# The margin that is told of a place that is nearly straight, at most.
+FREE = 99.0
 WITHOUT_LIMIT = (0.6, 0.6, 0.6, 1.0)
 # Of obstacles, one after another.
 PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
@@ -35,20 +35,31 @@ LEAST_RADIUS = 0.005
 CLIP_RADIUS, CLIP_LENGTH = 1.7, 1.4
 POINTS = 240
 
+_curvature = over_leading_axes(curvature_along)
+
 
 class Sight(NamedTuple):
-    """One cable: `radius` [m], as it is drawn where thickest; along it, at arclengths `s` (k,) [m]: `centerline` (k, 3)
-    [m], `curvature` (k,) [1/m], `tension` (k,) [N], and of a bend radius that is limited `margin` (k,)."""
+    """One cable, and along it at k arclengths `s` [m]:
+
+    `centerline` (k, 3) [m]; `radii` [m] as they are drawn; `curvature` [1/m]; `bend` [m], the bend radius, the inside
+    one where the rod has a radius; `tension` [N]; and where the bend radius has a limit its `margin`.
+    """
 
     name: str
     equilibrium: Equilibrium
-    radius: float
     s: Float[np.ndarray, "k"]
     centerline: Float[np.ndarray, "k 3"]
+    radii: Float[np.ndarray, "k"]
     curvature: Float[np.ndarray, "k"]
+    bend: Float[np.ndarray, "k"]
     tension: Float[np.ndarray, "k"]
     margin: Float[np.ndarray, "k"] | None
     reactions: list[Reaction]
+
+    @property
+    def radius(self) -> float:
+        """As it is drawn where thickest [m]."""
+        return float(np.max(self.radii))
 
     @property
     def forces(self) -> list[Reaction]:
@@ -74,25 +85,28 @@ class Coloring(NamedTuple):
 
 def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: float) -> Sight:
     """One cable in a scene of this largest extent [m]."""
-    rod = equilibrium.scene.rod
+    true = equilibrium.scene.rod.radius
     s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS + 1)
-    places, values = (np.asarray(x) for x in curvature_along(equilibrium))
-    curvature = np.interp(s, places, values)
+    along, nodes = np.asarray(s), np.asarray(equilibrium.s)
+    curvature = np.asarray(np.interp(along, *(np.asarray(x) for x in _curvature(equilibrium))))
+    radii = np.zeros(len(s)) if true is None else radius_along(true, s)
+    with np.errstate(divide="ignore"):
+        bend = 1 / curvature - radii
     margin = None
     if limits is not None and limits.bend_radius is not None:
-        radius = radius_along(rod.radius, s)
-        limit = 2 * float(limits.bend_radius) * radius
-        with np.errstate(divide="ignore"):
-            margin = np.minimum((1 / curvature - radius) / limit - 1, 2 * MOST_MARGIN)
-    true = 0.0 if rod.radius is None else largest_radius(rod.radius)
+        margin = np.minimum(bend / (2 * float(limits.bend_radius) * radii) - 1, FREE)
+    thickest = 0.0 if true is None else largest_radius(true)
+    least = LEAST_RADIUS * extent
+    drawn = np.full(len(s), least) if thickest == 0 else radii * max(1.0, least / thickest)
     return Sight(
         name,
         equilibrium,
-        max(true, LEAST_RADIUS * extent),
-        np.asarray(s),
+        along,
         np.asarray(equilibrium.position_at(s)),
+        drawn,
         curvature,
-        np.interp(s, equilibrium.s, equilibrium.tension),
+        bend,
+        np.asarray(np.interp(along, nodes, np.asarray(equilibrium.tension))),
         margin,
         reactions(equilibrium),
     )

@@ -126,14 +126,16 @@ def _where(fact: Fact) -> str:
 
 
 def _reactions(cable: Cable) -> str:
-    rows = [("what supports apply to the cable", "force [N]", "", "", "size", "moment [N m]", "", "", "size")]
+    rows: list[tuple[str, ...]] = [
+        ("what supports apply to the cable", "force [N]", "", "", "size", "moment [N m]", "", "", "size")
+    ]
     for reaction in cable.reactions:
         sizes = [f"{np.linalg.norm(load) + 0.0:.4g}" for load in (reaction.force, reaction.moment)]
         name = f"{support(reaction)}, axes x, y, z"
         rows.append((name, *_vector(reaction.force), sizes[0], *_vector(reaction.moment), sizes[1]))
         own = [reaction.axes @ load for load in (reaction.force, reaction.moment)]
         rows.append(("  tangent, left, up", *_vector(own[0]), "", *_vector(own[1]), ""))
-    axes = [("axes of the supports", "tangent", "", "", "left", "", "", "up", "", "")]
+    axes: list[tuple[str, ...]] = [("axes of the supports", "tangent", "", "", "left", "", "", "up", "", "")]
     axes += [(reaction.name, *(f"{x + 0.0:.4f}" for x in reaction.axes.ravel())) for reaction in cable.reactions]
     told = "Moments are about the centerline; left is level, up the normal at right angles to it and to the tangent."
     return "\n".join([table(rows, "<>>>>>>>>"), told, table(axes, "<>>>>>>>>>")])
@@ -163,14 +165,11 @@ def _gradients(cable: Cable) -> str:
 
 
 def _columns(gradients: Gradients, which: Sequence[int]) -> str:
-    units = [
-        TOLD.get(gradients.units[k], (gradients.units[k], 1.0)) if gradients.units[k] else ("1", 1.0) for k in which
-    ]
+    # Numbers without a unit are told as they are, not in percent as strains.
+    units = [TOLD.get(gradients.units[k] or "1", (gradients.units[k] or "1", 1.0)) for k in which]
     values = [
-        amount(float(gradients.values[k]), gradients.units[k])
-        if gradients.units[k]
-        else f"{float(gradients.values[k]):.4g}"
-        for k in which
+        f"{factor * float(gradients.values[k]):.4g}{'' if unit == '1' else f' {unit}'}"
+        for k, (unit, factor) in zip(which, units, strict=True)
     ]
     rows = [("", *(gradients.variables[k] for k in which)), ("now", *values)]
     for name, row in zip(gradients.margins, np.asarray(gradients.derivatives), strict=True):

@@ -88,7 +88,8 @@ def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: fl
     true = equilibrium.scene.rod.radius
     s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS + 1)
     along, nodes = np.asarray(s), np.asarray(equilibrium.s)
-    curvature = np.asarray(np.interp(along, *(np.asarray(x) for x in _curvature(equilibrium))))
+    places, curvatures = (np.asarray(x) for x in _curvature(equilibrium))
+    curvature = np.asarray(np.interp(along, places, curvatures))
     radii = np.zeros(len(s)) if true is None else radius_along(true, s)
     with np.errstate(divide="ignore"):
         bend = 1 / curvature - radii

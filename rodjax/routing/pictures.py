@@ -86,7 +86,7 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     bar.ax.tick_params(labelsize=9)
     if legend:
         figure.legend(handles=legend, loc="outside lower center", ncols=min(len(legend), 4), frameon=False, fontsize=9)
-    figure.suptitle("\n".join(textwrap.wrap(title, WIDTH)), fontsize=10)
+    figure.suptitle("\n".join(textwrap.wrap(title.replace(" %", "\u00a0%"), WIDTH)), fontsize=10)
     return figure
 
 

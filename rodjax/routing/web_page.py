@@ -164,6 +164,8 @@ def _panel(report: Any) -> str:
         if len(report.cables) > 1:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
         parts += [_limits(cable, k), _facts(cable, k), _supports(cable, k)]
+        if cable.gradients is not None:
+            parts.append(f"<h2>derivatives</h2><pre>{escape(words.gradients(cable))}</pre>")
         parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
     if report.obstacles:
         boxes = "".join(
@@ -223,11 +225,15 @@ def _supports(cable: Cable, number: int) -> str:
         own = reaction.axes @ reaction.force
         cells = [
             words.support(reaction),
-            words.amount(float(np.linalg.norm(reaction.force)), "N"),
+            _unbroken(words.amount(float(np.linalg.norm(reaction.force)), "N")),
             ", ".join(f"{x:.3g}" for x in reaction.force),
             ", ".join(f"{x:.3g}" for x in own),
-            words.amount(float(np.linalg.norm(reaction.moment)), "N m"),
+            _unbroken(words.amount(float(np.linalg.norm(reaction.moment)), "N m")),
         ]
         rows.append(_row(cells, number, reaction.s))
     heads = ("what supports apply", ">force", ">x, y, z", ">tangent, left, up", ">moment")
     return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')
+
+
+def _unbroken(told: str) -> str:
+    return told.replace(" ", "\u00a0")

@@ -92,7 +92,7 @@ def text(report: "Report") -> str:
     for cable in report.cables:
         heading = [f"--- {cable.name}: {_kept(cable)}"] if len(report.cables) > 1 else []
         parts.append("\n".join([*heading, cable.outcome]))
-        parts += [part for part in (_limits(cable), _facts(cable), _reactions(cable), _gradients(cable)) if part]
+        parts += [part for part in (_limits(cable), _facts(cable), _reactions(cable), gradients(cable)) if part]
     return "\n\n".join(["\n".join(parts[:2]), *parts[2:]])
 
 
@@ -152,15 +152,14 @@ def _vector(load: np.ndarray) -> list[str]:
     return [f"{x:.4g}" if abs(x) > least else "0" for x in load]
 
 
-def _gradients(cable: Cable) -> str:
+def gradients(cable: Cable) -> str:
+    """A table of the derivatives of margins by design variables, where there are some."""
     if cable.gradients is None:
         return ""
-    gradients = cable.gradients
+    found = cable.gradients
     told = "Change of each margin by the design variables:"
-    parts = [
-        _columns(gradients, list(range(k, min(k + COLUMNS, len(gradients.variables)))))
-        for k in range(0, len(gradients.variables), COLUMNS)
-    ]
+    count = len(found.variables)
+    parts = [_columns(found, range(k, min(k + COLUMNS, count))) for k in range(0, count, COLUMNS)]
     return "\n".join([told, *parts])
 
 

@@ -47,10 +47,14 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.objective import Objective
+    from rodjax.routing.route import Route, route
+    from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Between",
     "Box",
     "Branch",
     "BranchEnd",
@@ -83,12 +87,17 @@ __all__ = [
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Objective",
     "Obstacle",
+    "OnLine",
+    "OnPatch",
+    "OnSurface",
     "Pin",
     "Plane",
     "PointForce",
     "Reading",
     "Rod",
+    "Route",
     "Scene",
     "SceneFileError",
     "Smooth",
@@ -96,6 +105,7 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Turned",
     "Union",
     "Unknown",
     "clearance",
@@ -116,6 +126,7 @@ __all__ = [
     "problems",
     "read_scene",
     "rotate",
+    "route",
     "save",
     "sensitivities",
     "solve",
@@ -153,6 +164,10 @@ _LATER = {
     "Limits": "routing.limits",
     "Margins": "routing.margins",
     "margins": "routing.margins",
+    "Objective": "routing.objective",
+    "Route": "routing.route",
+    "route": "routing.route",
+    **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 
 

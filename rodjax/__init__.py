@@ -47,11 +47,15 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.objective import Objective
     from rodjax.routing.report import Report, report
+    from rodjax.routing.route import Route, route
+    from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Between",
     "Box",
     "Branch",
     "BranchEnd",
@@ -84,13 +88,18 @@ __all__ = [
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Objective",
     "Obstacle",
+    "OnLine",
+    "OnPatch",
+    "OnSurface",
     "Pin",
     "Plane",
     "PointForce",
     "Reading",
     "Report",
     "Rod",
+    "Route",
     "Scene",
     "SceneFileError",
     "Smooth",
@@ -98,6 +107,7 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Turned",
     "Union",
     "Unknown",
     "clearance",
@@ -119,6 +129,7 @@ __all__ = [
     "read_scene",
     "report",
     "rotate",
+    "route",
     "save",
     "sensitivities",
     "solve",
@@ -158,6 +169,10 @@ _LATER = {
     "margins": "routing.margins",
     "Report": "routing.report",
     "report": "routing.report",
+    "Objective": "routing.objective",
+    "Route": "routing.route",
+    "route": "routing.route",
+    **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 
 

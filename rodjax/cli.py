@@ -1,7 +1,7 @@
 """The command `rodjax`.
 
-Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, which stderr names. A report
-of limits that are not kept is a report, and exits with 0.
+Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, or no route was found within
+limits, which stderr names. A report of limits that are not kept is a report, and exits with 0.
 """
 
 import argparse
@@ -128,6 +128,11 @@ def _add_report(commands: Any) -> None:
     )
     report.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-report"), help="folder for the report")
     report.set_defaults(run=_report)
+    route = commands.add_parser("route", help="find the best place of clips, ends and cable within limits")
+    route.add_argument("file", metavar="ROUTE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
+    route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
+    route.add_argument("--starts", metavar="N", type=_chunk, help="designs from which the search begins; 16")
+    route.set_defaults(run=_route)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -305,6 +310,44 @@ def _report(arguments: argparse.Namespace) -> int:
     if not lost:
         return 0
     print(f"rodjax: {arguments.file}: {'; '.join(lost)}", file=sys.stderr)
+    return 3
+
+
+def _route(arguments: argparse.Namespace) -> int:
+    from rodjax.routing.files import read_route_file
+    from rodjax.routing.outcome import starts_table, written_route
+
+    _check_folder(arguments.out, "--out")
+    file = read_route_file(arguments.file, for_route=True)
+    (scene,) = file.cables.values()
+    starts = arguments.starts or file.starts
+    options: dict[str, Any] = {} if starts is None else {"starts": starts}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
+        try:
+            route = rodjax.route(
+                scene.scenes[0],
+                file.variables,
+                limits=file.limits,
+                objective=file.objective,
+                obstacles=file.obstacles,
+                names=file.names,
+                segments=scene.segments,
+                progress=sys.stderr.isatty(),
+                **options,
+            )
+        except ValueError as error:
+            raise CommandError(f"{arguments.file}: {error}") from None
+    title = file.title or str(arguments.file)
+    report = rodjax.report(
+        route.verified, limits=file.limits, obstacles=file.obstacles, names=file.names, gradients=route, title=title
+    )
+    print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
+    written = [*report.save(arguments.out), *written_route(route, arguments.out)]
+    print(f"\nwritten: {', '.join(map(str, written))}")
+    if route.feasible:
+        return 0
+    print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
     return 3
 
 

@@ -133,8 +133,10 @@ class RouteFile(NamedTuple):
     starts: int | None
 
 
-def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True) -> RouteFile:
+def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, for_route: bool = False) -> RouteFile:
     """What the TOML file says; see this module for the format. Without its scene where that is not needed.
+
+    `for_route`: it must have one scene, and variables.
 
     Raises `SceneFileError` with one line that names the file and the key.
     """
@@ -150,6 +152,8 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True) ->
     cables = _cables(content, path) if with_scene else {}
     with in_file(path):
         variables = _variables(content.get("variables", []))
+        if for_route:
+            _check_for_route(content, cables, variables)
         if len(cables) == 1 and variables:
             _check_variables(variables, next(iter(cables.values())))
     return RouteFile(cables, title, obstacles, names, limits, variables, objective, starts)
@@ -330,6 +334,19 @@ def _number_or_list(value: Any, key: str, where: str, unit: str, example: str) -
             return si_value(value, key, unit, (None,) if is_list else (), example)
         except ValueError as error:
             raise SceneFileError(f"{where}.{error}") from None
+
+
+def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], variables: tuple[Variable, ...]) -> None:
+    if "cables" in content:
+        raise SceneFileError('cables is not allowed where a route is sought, which is of one: scene = "scene.toml"')
+    if not variables:
+        raise SceneFileError("variables is missing: one or more tables [[variables]], which say what may vary")
+    (scene,) = cables.values()
+    if scene.rtol is not None or scene.discretization == "finite_difference":
+        raise SceneFileError(
+            "solve.rtol and finite differences are not allowed where a route is sought, which is on one mesh of "
+            "elements: solve.segments"
+        )
 
 
 def _check_variables(variables: tuple[Variable, ...], file: SceneFile) -> None:

@@ -13,6 +13,7 @@ from rodjax.result import Equilibrium, describe
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.reactions import Reaction, reactions
+from rodjax.routing.route import Route
 from rodjax.scene import has_potential, slides
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
@@ -34,6 +35,14 @@ class Gradients(NamedTuple):
     values: Float[np.ndarray, "v"]
     margins: tuple[str, ...]
     derivatives: Float[np.ndarray, "m v"]
+
+    @staticmethod
+    def of(route: Route) -> "Gradients":
+        """Those of the best route that was found."""
+        margins = tuple(name for name in route.gradients if name != "objective")
+        rows = [np.asarray(route.gradients[name]) for name in margins]
+        derivatives = np.reshape(rows, (len(rows), len(route.names)))
+        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives)
 
 
 class Fact(NamedTuple):

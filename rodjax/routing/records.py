@@ -18,7 +18,7 @@ HEADER = ("cable", "kind", "name", "value", "unit", "asked", "limit", "margin", 
 
 def plain(value: Any) -> Any:
     """Numbers as JSON knows them, which has none that is no number."""
-    if isinstance(value, np.ndarray | list | tuple):
+    if np.ndim(value):
         return [plain(x) for x in value]
     if value is None:
         return None

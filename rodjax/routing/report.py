@@ -18,6 +18,7 @@ from rodjax.result import Equilibrium
 from rodjax.routing import records, words
 from rodjax.routing.findings import Cable, Gradients, cable
 from rodjax.routing.limits import Limits
+from rodjax.routing.route import Route
 from rodjax.status import Status
 
 if TYPE_CHECKING:
@@ -130,15 +131,15 @@ def report(
     - `limits`: `Limits` of all cables, or a list of `Limits` or `None`, one for each cable; `None`: none.
     - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
-    - `gradients`: `Gradients` of the margins by design variables, or a list, one for each cable; `None`: none.
+    - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
     - `title`: `None`: "Route".
 
     Raises `ValueError` or `TypeError` for other arguments, for a stack of equilibria or one without a finite shape, and
     as `rodjax.margins` does.
     """
     cables = _cables(equilibrium)
-    each_limits = _each(limits, "limits", Limits, len(cables))
-    each_gradients = _each(gradients, "gradients", Gradients, len(cables))
+    each_limits = _each(limits, "limits", (Limits,), len(cables))
+    each_gradients = _each(gradients, "gradients", (Gradients, Route), len(cables))
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if obstacles:
         obstacles = checked_obstacles(obstacles)
@@ -151,7 +152,7 @@ def report(
     if title is not None:
         instance(title, "title", str)
     found = tuple(
-        cable(name, one, limit, obstacles, names, gradient)
+        cable(name, one, limit, obstacles, names, Gradients.of(gradient) if isinstance(gradient, Route) else gradient)
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
     )
     return Report("Route" if title is None else title, found, obstacles, names)
@@ -182,15 +183,15 @@ def _cables(equilibrium: Any) -> dict[str, Equilibrium]:
     return dict(equilibrium)
 
 
-def _each(value: Any, name: str, kind: type, count: int) -> tuple[Any, ...]:
+def _each(value: Any, name: str, kinds: tuple[type, ...], count: int) -> tuple[Any, ...]:
     """One for each cable."""
     # A tuple of numbers may be a kind itself.
-    if value is None or isinstance(value, kind):
+    if value is None or isinstance(value, kinds):
         return (value,) * count
-    each = sequence(value, name, kind.__name__)
+    each = sequence(value, name, " or ".join(kind.__name__ for kind in kinds))
     if len(each) != count:
         raise ValueError(f"{name} must be one for all cables, or one for each of {count}, got {len(each)}")
     for k, one in enumerate(each):
         if one is not None:
-            instance(one, f"{name}[{k}]", kind)
+            instance(one, f"{name}[{k}]", kinds)
     return each

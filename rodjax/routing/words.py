@@ -172,7 +172,7 @@ def _columns(gradients: Gradients, which: Sequence[int]) -> str:
     ]
     rows = [("", *(gradients.variables[k] for k in which)), ("now", *values)]
     for name, row in zip(gradients.margins, np.asarray(gradients.derivatives), strict=True):
-        cells = [f"{100 * row[k] / factor:+.3g} %/{unit}" for k, (unit, factor) in zip(which, units, strict=True)]
+        cells = [f"{100 * row[k] / factor + 0.0:+.3g} %/{unit}" for k, (unit, factor) in zip(which, units, strict=True)]
         rows.append((name, *cells))
     return table(rows, "<" + ">" * len(which))
 

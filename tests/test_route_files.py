@@ -1,6 +1,7 @@
 """Routes as files: what `rodjax report` reads, writes and refuses."""
 
 import json
+import re
 import shutil
 import textwrap
 import tomllib
@@ -16,6 +17,7 @@ from rodjax.cli import main
 from rodjax.routing import files as routing_files
 from rodjax.routing.files import read_route_file
 from rodjax.routing.report import FILES
+from rodjax.routing.route import Starts
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned
 from rodjax.scene_keys import SceneVariations
 
@@ -243,3 +245,131 @@ def test_a_limit_that_the_scene_has_no_use_for_is_told(reported, files, capsys):
     without = eqx.tree_at(lambda found: found.scene.clips, result, ())
     rj.save(without, "without.vtkhdf")
     assert "limits.clip_force is not allowed for a scene without clips" in refused(capsys, "--result", "without.vtkhdf")
+
+
+# --- rodjax route ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def found(reported, files, monkeypatch):
+    """A made-up outcome of a search in the place of one, and the arguments that it was asked with."""
+    asked = {}
+
+    def route(scene, variables, **options):
+        asked.update(options, scene=scene, variables=variables)
+        result = rj.load(reported / "result.vtkhdf")
+        margins = rj.margins(result, options["limits"], options["obstacles"], options["names"])
+        names = tuple(label for variable in variables for label in variable.labels())
+        rates = {name: np.arange(len(names), dtype=float) for name in ("objective", *margins.names)}
+        count = 2
+        return rj.Route(
+            feasible=asked.get("feasible", True),
+            scene=result.scene,
+            equilibrium=result,
+            verified=result,
+            margins=margins,
+            objective=0.62,
+            names=names,
+            units=tuple(unit for variable in variables for unit in variable.units()),
+            numbers=np.linspace(0.1, 0.2, len(names)),
+            values={"clips.0.at": np.asarray(0.2), "clips.0.position": np.zeros(3)},
+            gradients=rates,
+            starts=Starts(
+                designs=np.zeros((count, len(names))),
+                objective=np.array([0.7, np.inf]),
+                violation=np.array([0.0, 0.25]),
+                feasible=np.array([True, False]),
+                iterations=np.array([3, 4]),
+                solves=np.array([5, 6]),
+                violated=("", "bend radius by 25 %"),
+                message=("Optimization terminated successfully", "Iteration limit reached"),
+            ),
+            solves=11,
+            with_gradients=9,
+            failed=1,
+            redrawn=0,
+        )
+
+    monkeypatch.setattr(rj, "route", route)
+    return asked
+
+
+def test_route_tells_and_writes_what_was_found(found, files, capsys):
+    assert main(["route", "brake_line.toml", "--out", "out", "--starts", "3"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert found["starts"] == 3
+    assert found["names"] == ("floor", "pipe", "bracket")
+    assert found["segments"] is None
+    assert out.startswith("A route that keeps to all limits, with the objective 0.62: 1 of 2 starts came to one.")
+    assert re.search(r"clips\.0\.at +100 mm\n", out)
+    assert re.search(r"1 +inf +4 +6  fails in bend radius by 25 %; Iteration limit reached\n", out)
+    assert "Change of each margin by the design variables:" in out
+    names = [*FILES, "route.json", "result.vtkhdf", "scene.toml"]
+    assert out.endswith(f"written: {', '.join(f'out/{name}' for name in names)}\n")
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    told = json.loads((files / "out" / "route.json").read_text(), parse_constant=refuse)
+    assert told["feasible"] is True
+    assert told["values"] == {"clips.0.at": 0.2, "clips.0.position": [0, 0, 0]}
+    assert told["starts"][1]["objective"] is None
+    assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m"}
+    report = json.loads((files / "out" / "report.json").read_text())
+    assert report["margins"] == pytest.approx(told["margins"], rel=1e-9)
+    # The second variable's derivatives are all 1.
+    assert set(report["cables"][0]["gradients"]["clips.0.position.0"]["margins"].values()) == {1.0}
+    written = rj.read_scene(files / "out" / "scene.toml")
+    assert written.clips[0].at == 0.2
+    assert "Change of each margin" in (files / "out" / "report.html").read_text()
+
+
+def test_a_route_that_is_not_found_exits_with_3(found, files, capsys):
+    found["feasible"] = False
+    assert main(["route", "brake_line.toml"]) == 3
+    out, err = capsys.readouterr()
+    assert out.startswith("No route was found that keeps to all limits")
+    assert err.startswith("rodjax: brake_line.toml: no route was found that keeps to all limits; ")
+    assert found["starts"] == 4  # of the file
+    assert (files / "rodjax-route" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("brake_line.toml", 'scene = "scene.toml"', 'cables = { a = "scene.toml" }', "cables is not allowed where"),
+        ("scene.toml", "[rod]", "[solve]\nrtol = 1e-3\n[rod]", "solve.rtol and finite differences are not allowed"),
+        ("brake_line.toml", 'key = "clips.0.at"', 'key = "clips.7.at"', "'clips.7.at' is no number of this scene"),
+    ],
+)
+def test_mistakes_of_a_route(files, capsys, name, old, new, said):
+    changed(name, old, new)
+    assert main(["route", "brake_line.toml"]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.startswith("rodjax: brake_line.toml: ")
+
+
+def test_a_route_needs_variables(files, capsys):
+    Path("a.toml").write_text('scene = "scene.toml"\n')
+    assert main(["route", "a.toml"]) == 2
+    assert "a.toml: variables is missing" in capsys.readouterr().err
+    changed("brake_line.toml", "[limits]", "[other]")
+    assert main(["route", "brake_line.toml"]) == 2
+    assert "other is not allowed here" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_route_is_found(files, monkeypatch, capsys):
+    monkeypatch.undo()
+    monkeypatch.chdir(files)
+    changed("scene.toml", "[rod]", "[solve]\nsegments = 8\n[rod]")
+    Path("brake_line.toml").write_text(
+        'scene = "scene.toml"\nstarts = 1\n[limits]\nbend_radius = 4\n[[variables]]\nkind = "between"\n'
+        'key = "rod.length"\nlower = "600 mm"\nupper = "680 mm"\n'
+    )
+    assert main(["route", "brake_line.toml", "--out", "out"]) == 0
+    told = json.loads(Path("out/route.json").read_text())
+    assert told["margins"]["bend radius"] >= 0
+    assert 0.6 <= told["numbers"]["rod.length"]["value"] < 0.62

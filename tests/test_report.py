@@ -163,6 +163,7 @@ def test_verdicts(report):
     infinite = with_margins(report, [np.inf])
     assert infinite.verdict.startswith("kept: the one limit; tightest: bend radius")
     assert "unlimited" in str(infinite)
+    assert " infinite " in words.table([("", words.amount(np.inf, "m"), "")], "<><")
     assert json.loads(json.dumps(infinite.as_dict(), allow_nan=False))["margins"] == {"bend radius": None}
     many = with_margins(report, [-0.5, -0.4, -0.3, -0.2, -0.1])
     assert many.verdict.endswith("and 2 more")

@@ -11,13 +11,15 @@ from rodjax.modes import lowest_mode
 from rodjax.obstacles import Obstacle
 from rodjax.result import Equilibrium, describe
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import Margins, margins
+from rodjax.routing.margins import Margins, course_of_curvature, margins
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
 from rodjax.scene import has_potential, slides
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
 WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}
+# Radians by which a rod turns along its whole length, at most, where it is straight but for rounding.
+STRAIGHT = 1e-8
 # Of which limit a margin is, by how its name begins.
 BEGINNINGS = {"bend radius": "bend_radius", "clearance to ": "clearance", "twist": "twist", "strain": "strain"}
 
@@ -146,10 +148,12 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         note = f"{radius / diameter:.3g} times the outer diameter" if np.isfinite(radius) else "straight"
         facts.append(Fact("smallest inside bend radius", *_finite(radius, "m", place), note=note))
     else:
-        node = int(np.argmax(np.asarray(equilibrium.curvature)))
-        curvature = float(equilibrium.curvature[node])
-        radius = 1 / curvature if curvature > 0 else np.inf
-        facts.append(Fact("smallest bend radius", *_finite(radius, "m", s[node]), note="of the centerline"))
+        places, curvature = (np.asarray(x) for x in course_of_curvature(equilibrium))
+        most = int(np.argmax(curvature))
+        is_straight = curvature[most] * length <= STRAIGHT
+        radius = np.inf if is_straight else 1 / float(curvature[most])
+        note = "straight" if is_straight else "of the centerline"
+        facts.append(Fact("smallest bend radius", *_finite(radius, "m", places[most]), note=note))
     clearances = {name: at for name, at in measured.items() if _limit_of(name) == "clearance"}
     if clearances:
         nearest = min(clearances, key=lambda name: clearances[name][0])

@@ -239,6 +239,12 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: 
     return Measured("bend radius", "m", True, inside, limit[at], slack[at], s[at])
 
 
+@over_leading_axes
+def course_of_curvature(equilibrium: Equilibrium) -> Curvature:
+    """The curvature at the places at which limits of it look."""
+    return curvature_along(equilibrium)
+
+
 def curvature_along(equilibrium: Equilibrium) -> Curvature:
     """At places one after another, as close as limits are looked at."""
     if not isinstance(equilibrium.state.shape, Curve):

@@ -19,6 +19,8 @@ TOLD = {"m": ("mm", 1e3), "rad/m": ("deg/m", 180 / math.pi), "rad": ("deg", 180 
 MOST_NAMED = 3
 # Design variables beside each other in the table of derivatives.
 COLUMNS = 4
+# Components of loads below this part of their size, or of EI/L^2 and EI/L, are told as 0.
+ROUNDING = 1e-9
 SIGNS = {"least": ">=", "most": "<="}
 
 
@@ -26,7 +28,7 @@ def amount(value: float | None, unit: str) -> str:
     """A number in the unit in which it is told, with that unit."""
     shown, factor = TOLD.get(unit, (unit, 1.0))
     if value is None or not math.isfinite(value):
-        return "-" if value is None or math.isnan(value) else ("none" if value > 0 else "-none")
+        return "-" if value is None or math.isnan(value) else ("infinite" if value > 0 else "-infinite")
     # Adding zero makes zeros of -0.
     return f"{factor * value + 0.0:.4g} {shown}"
 
@@ -126,17 +128,24 @@ def _where(fact: Fact) -> str:
 
 
 def _reactions(cable: Cable) -> str:
+    units = cable.equilibrium.state.units
     rows: list[tuple[str, ...]] = [
         ("what supports apply to the cable", "force [N]", "", "", "size", "moment [N m]", "", "", "size")
     ]
     for reaction in cable.reactions:
-        sizes = [f"{np.linalg.norm(load) + 0.0:.4g}" for load in (reaction.force, reaction.moment)]
-        name = f"{support(reaction)}, axes x, y, z"
-        rows.append((name, *_vector(reaction.force), sizes[0], *_vector(reaction.moment), sizes[1]))
-        own = [reaction.axes @ load for load in (reaction.force, reaction.moment)]
-        rows.append(("  tangent, left, up", *_vector(own[0]), "", *_vector(own[1]), ""))
+        cells, own = [f"{support(reaction)}, axes x, y, z"], ["  tangent, left, up"]
+        for load, unit in ((reaction.force, units.force), (reaction.moment, units.energy)):
+            size = float(np.linalg.norm(load))
+            # Of what is smaller nothing but rounding is left.
+            least = ROUNDING * max(size, float(unit))
+            cells += [_above(x, least) for x in (*load, size)]
+            own += [*(_above(x, least) for x in reaction.axes @ load), ""]
+        rows += [tuple(cells), tuple(own)]
     axes: list[tuple[str, ...]] = [("axes of the supports", "tangent", "", "", "left", "", "", "up", "", "")]
-    axes += [(reaction.name, *(f"{x + 0.0:.4f}" for x in reaction.axes.ravel())) for reaction in cable.reactions]
+    axes += [
+        (reaction.name, *(f"{round(float(x), 4) + 0.0:.4f}" for x in reaction.axes.ravel()))
+        for reaction in cable.reactions
+    ]
     told = "Moments are about the centerline; left is level, up the normal at right angles to it and to the tangent."
     return "\n".join([table(rows, "<>>>>>>>>"), told, table(axes, "<>>>>>>>>>")])
 
@@ -146,10 +155,8 @@ def support(reaction: Reaction) -> str:
     return f"{reaction.name}{kind} at s = {amount(reaction.s, 'm')}"
 
 
-def _vector(load: np.ndarray) -> list[str]:
-    # Rounding of a component beside the others would look like a load.
-    least = 1e-9 * float(np.max(np.abs(load), initial=0.0))
-    return [f"{x:.4g}" if abs(x) > least else "0" for x in load]
+def _above(x: float, least: float) -> str:
+    return f"{x:.4g}" if abs(x) > least else "0"
 
 
 def gradients(cable: Cable) -> str:

@@ -11,6 +11,7 @@ length [m] and elastic energy [J] together. Kept: an inside bend radius of 6 dia
 import argparse
 import csv
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -251,7 +252,7 @@ def main(arguments: list[str] | None = None) -> rj.Route:
     parser.add_argument("--most", type=float, default=600.0, help="most seconds of differential evolution")
     options = parser.parse_args(arguments)
     rj.enable_compilation_cache()
-    route = found(options.starts, options.seed, progress=True)
+    route = found(options.starts, options.seed, progress=sys.stderr.isatty())
     print(route)
     print(route.margins)
     save(route, options.out)

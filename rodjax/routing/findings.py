@@ -11,7 +11,7 @@ from rodjax.modes import lowest_mode
 from rodjax.obstacles import Obstacle
 from rodjax.result import Equilibrium, describe
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import Margins, course_of_curvature, margins
+from rodjax.routing.margins import Margins, curvature_along, margins
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
 from rodjax.scene import has_potential, slides
@@ -148,7 +148,7 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         note = f"{radius / diameter:.3g} times the outer diameter" if np.isfinite(radius) else "straight"
         facts.append(Fact("smallest inside bend radius", *_finite(radius, "m", place), note=note))
     else:
-        places, curvature = (np.asarray(x) for x in course_of_curvature(equilibrium))
+        places, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
         most = int(np.argmax(curvature))
         is_straight = curvature[most] * length <= STRAIGHT
         radius = np.inf if is_straight else 1 / float(curvature[most])

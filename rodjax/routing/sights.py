@@ -12,7 +12,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from rodjax.plot import COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along
 from rodjax.result import Equilibrium
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import course_of_curvature
+from rodjax.routing.margins import curvature_along
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.surfaces import Faces, round_faces, surfaces
 
@@ -86,7 +86,7 @@ def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: fl
     true = equilibrium.scene.rod.radius
     s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS + 1)
     along, nodes = np.asarray(s), np.asarray(equilibrium.s)
-    places, curvatures = (np.asarray(x) for x in course_of_curvature(equilibrium))
+    places, curvatures = (np.asarray(x) for x in curvature_along(equilibrium))
     curvature = np.asarray(np.interp(along, places, curvatures))
     radii = np.zeros(len(s)) if true is None else radius_along(true, s)
     with np.errstate(divide="ignore"):

@@ -96,8 +96,9 @@ def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
     )
     clearance = rj.clearance(equilibrium, OBSTACLES)
     nearest = int(np.argmin(clearance.distance))
-    assert told["smallest clearance"].value == pytest.approx(float(clearance.distance[nearest]), rel=1e-12)
-    assert told["smallest clearance"].s == float(clearance.s[nearest])
+    # Margins look between places too, which are 10 mm apart: h^2/8 by a curvature of 20 1/m.
+    assert told["smallest clearance"].value == pytest.approx(float(clearance.distance[nearest]), abs=2.5e-4)
+    assert told["smallest clearance"].s == pytest.approx(float(clearance.s[nearest]), abs=0.01)
     assert told["smallest clearance"].note == f"to {NAMES[nearest]}"
     assert told["largest twist rate"].value == float(np.max(np.abs(equilibrium.twist)))
     assert told["largest strain"].value == np.max(np.abs(strain))
@@ -163,7 +164,7 @@ def test_verdicts(report):
     infinite = with_margins(report, [np.inf])
     assert infinite.verdict.startswith("kept: the one limit; tightest: bend radius")
     assert "unlimited" in str(infinite)
-    assert " infinite " in words.table([("", words.amount(np.inf, "m"), "")], "<><")
+    assert words.amount(np.inf, "m") == "infinite"
     assert json.loads(json.dumps(infinite.as_dict(), allow_nan=False))["margins"] == {"bend radius": None}
     many = with_margins(report, [-0.5, -0.4, -0.3, -0.2, -0.1])
     assert many.verdict.endswith("and 2 more")

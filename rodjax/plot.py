@@ -38,9 +38,8 @@ LEAST_DEPTH = 0.3
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
 HALO = withStroke(linewidth=2, foreground="white")
-# The view [degrees], and what is right and up in it.
+# The view [degrees].
 ELEVATION, AZIMUTH = 22, -62
-RIGHT, UP = np.array((0.88, 0.47, 0.0)), np.array((-0.18, 0.33, 0.93))
 
 
 def plot_rod(
@@ -222,9 +221,11 @@ def quads(grid: Float[np.ndarray, "p q 3"]) -> Float[np.ndarray, "f 4 3"]:
     return np.stack(corners, axis=2).reshape(-1, 4, 3)
 
 
-def draw_faces(axes: Axes3D, faces: Float[np.ndarray, "f 4 3"], colors: Float[np.ndarray, "f c"]) -> None:
+def draw_faces(
+    axes: Axes3D, faces: Float[np.ndarray, "f 4 3"], colors: Float[np.ndarray, "f c"], azimuth: float = AZIMUTH
+) -> None:
     """Draws shaded faces, each in front of those that are further away."""
-    light = LightSource(azdeg=AZIMUTH - 20, altdeg=55)
+    light = LightSource(azdeg=azimuth - 20, altdeg=55)
     drawn = Poly3DCollection(
         list(faces), facecolors=colors, shade=True, lightsource=light, linewidths=0, antialiased=False
     )
@@ -256,9 +257,11 @@ def draw_arrows(
     length: float,
     color: str,
     heads: Sequence[float] = (1.0,),
+    azimuth: float = AZIMUTH,
 ) -> Float[np.ndarray, "p 3"]:
     """Arrows with their sizes for loads not smaller than `least`, the largest `length` [m] long; returns their tips."""
     sizes = np.linalg.norm(loads, axis=1)
+    right, up, _ = seen_axes(azimuth)
     tips = []
     for foot, load, size in zip(feet, loads, sizes, strict=True):
         if size < least:
@@ -269,13 +272,27 @@ def draw_arrows(
             ratio = 0.2 * length / (head * reach)
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
         x, y, z = foot + (reach + 0.05 * length) * along
-        ha, va = "left" if along @ RIGHT > 0 else "right", "bottom" if along @ UP > 0 else "top"
+        ha, va = "left" if along @ right > 0 else "right", "bottom" if along @ up > 0 else "top"
         axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
         tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))
 
 
-def set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True, zoom: float = 0.85) -> float:
+def seen_axes(azimuth: float) -> Float[np.ndarray, "3 3"]:
+    """Rows: what is right, up and towards the viewer in a picture."""
+    a, e = np.radians(azimuth), np.radians(ELEVATION)
+    right = (-np.sin(a), np.cos(a), 0.0)
+    up = (-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e))
+    return np.array([right, up, (np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))])
+
+
+def set_view(
+    axes: Axes3D,
+    points: Float[np.ndarray, "p 3"],
+    labels: bool = True,
+    zoom: float = 0.85,
+    azimuth: float = AZIMUTH,
+) -> float:
     """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
     low, high = points.min(axis=0), points.max(axis=0)
     spans = 1.04 * np.maximum(high - low, LEAST_DEPTH * np.max(high - low))
@@ -291,7 +308,7 @@ def set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True
             axis.set_major_formatter(NullFormatter())
     axes.set_box_aspect(tuple(spans), zoom=zoom)  # pyright: ignore[reportArgumentType]
     axes.set_proj_type("ortho")
-    axes.view_init(ELEVATION, AZIMUTH)
+    axes.view_init(ELEVATION, azimuth)
     return grid
 
 

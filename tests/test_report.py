@@ -14,12 +14,13 @@ import trimesh
 from matplotlib.image import imread
 
 import rodjax as rj
+from rodjax.plot import AZIMUTH, seen_axes
 from rodjax.routing import surfaces as routing_surfaces
 from rodjax.routing import web_page, words
 from rodjax.routing.findings import Gradients
 from rodjax.routing.reactions import axes_of
 from rodjax.routing.report import FILES
-from rodjax.routing.sights import coloring, extent, sight
+from rodjax.routing.sights import azimuth, coloring, extent, sight
 from rodjax.routing.surfaces import MOST_TRIANGLES, surfaces
 
 RADIUS = 0.006
@@ -82,7 +83,8 @@ def with_margins(report, margins, **changed):
 def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
     told = facts(report)
     margins = rj.margins(equilibrium, LIMITS, OBSTACLES, NAMES)
-    assert report.margins == dict(zip(margins.names, np.asarray(margins.margin).tolist(), strict=True))
+    expected = dict(zip(margins.names, np.asarray(margins.margin).tolist(), strict=True))
+    assert report.margins == pytest.approx(expected, rel=1e-9)
     assert told["free length"].value == 0.62
     strain = np.asarray(equilibrium.axial_strain)
     # By the positions of a fine polyline, 240 edges of radius of curvature 0.05 m: 1e-6.
@@ -330,6 +332,15 @@ def test_places_that_bend_too_much_are_red(report, equilibrium):
     without = coloring([sight("a", equilibrium, None, extent([equilibrium]))])
     assert without.label == "curvature [1/m]"
     assert not without.is_margin
+
+
+def test_no_wall_stands_before_the_picture(report):
+    assert azimuth(report._sights, OBSTACLES) == AZIMUTH
+    for normal in ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0)):
+        view = azimuth(report._sights, [*OBSTACLES, rj.Plane((0, 0, 0), normal)])
+        right, up, near = seen_axes(view)
+        assert near @ np.array(normal) > 0
+        np.testing.assert_allclose(np.cross(right, up), near, atol=1e-15)
 
 
 POINTS = np.array([[-0.5, -0.5, -0.5], [0.9, 0.6, 0.6]])

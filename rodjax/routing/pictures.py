@@ -4,19 +4,22 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
+from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import line
 from rodjax.obstacles import Obstacle
-from rodjax.plot import ARROW_LENGTH, HALO, RIGHT, UP, draw_arrows, draw_faces, set_view, tube_faces
+from rodjax.plot import ARROW_LENGTH, HALO, draw_arrows, draw_faces, seen_axes, set_view, tube_faces
 from rodjax.routing.sights import (
     CLIP_COLOR,
     PALETTE,
     Sight,
+    azimuth,
     clip_faces,
     coloring,
     extent,
@@ -27,7 +30,10 @@ from rodjax.routing.sights import (
 # How much of what is behind an obstacle it hides.
 OPACITY = 0.35
 FORCE_COLOR = "tab:red"
-ZOOM = 1.15
+# Of flat scenes, and how much less it is of those as high as they are wide.
+ZOOM, LESS = 1.2, 0.35
+# How far beside a place its name stands, by the extent of the cables.
+ASIDE = 0.04
 # Characters of a line of the title.
 WIDTH = 100
 
@@ -58,7 +64,8 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
         label = line(name) if len(surface) else f"{line(name)} (not in the picture)"
         legend.append(Patch(facecolor=to_rgba(color, 0.8), label=label))
     # All faces together: each artist by itself would be sorted in depth as a whole.
-    draw_faces(axes, np.concatenate(faces), np.concatenate(shades))
+    view = azimuth(sights, obstacles)
+    draw_faces(axes, np.concatenate(faces), np.concatenate(shades), view)
     size = extent([sight.equilibrium for sight in sights])
     acting = [reaction for sight in sights for reaction in sight.forces]
     tips = draw_arrows(
@@ -69,10 +76,14 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
         0.0,
         ARROW_LENGTH * size,
         FORCE_COLOR,
+        azimuth=view,
     )
+    right, up, _ = seen_axes(view)
     for sight in sights:
-        _name(axes, sight, size, len(sights) > 1)
-    set_view(axes, np.concatenate([np.concatenate(faces).reshape(-1, 3), tips]), zoom=ZOOM)
+        _name(axes, sight, size * (right - up), len(sights) > 1)
+    points = np.concatenate([np.concatenate(faces).reshape(-1, 3), tips])
+    width, depth, height = np.ptp(points, axis=0)
+    set_view(axes, points, zoom=ZOOM - LESS * min(height / max(width, depth), 1.0), azimuth=view)
     axes.text2D(0.0, 0.0, thickness_note(sights), transform=axes.transAxes, fontsize=8, color="0.4")
     bar = figure.colorbar(
         ScalarMappable(colors.norm, colors.color_map),
@@ -90,11 +101,11 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     return figure
 
 
-def _name(axes, sight: Sight, size: float, has_name: bool) -> None:
+def _name(axes: Axes3D, sight: Sight, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
     """Words beside the clips, and the name of one cable of several beside its middle."""
     places = [(reaction.name, reaction.position) for reaction in sight.reactions[1:-1]]
     if has_name:
         places.append((line(sight.name), sight.centerline[len(sight.centerline) // 2]))
     for name, place in places:
-        x, y, z = place + 0.04 * size * (RIGHT - UP)
+        x, y, z = place + ASIDE * aside
         axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])

@@ -9,12 +9,13 @@ from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
-from rodjax.plot import COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along
+from rodjax.obstacles import Obstacle, Plane
+from rodjax.plot import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.result import Equilibrium
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import curvature_along
 from rodjax.routing.reactions import Reaction, reactions
-from rodjax.routing.surfaces import Faces, round_faces, surfaces
+from rodjax.routing.surfaces import Faces, parts_of, round_faces, surfaces
 
 # Margins of the bend radius between which colors differ, and the colors: of none red, from none on yellow to blue.
 LEAST_MARGIN, MOST_MARGIN = -0.5, 1.0
@@ -148,7 +149,25 @@ def clip_faces(sight: Sight) -> list[Faces]:
     ]
 
 
-def seen_surfaces(sights: Sequence[Sight], obstacles: Sequence) -> list[Faces]:
+def azimuth(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> float:
+    """From where to look [degrees]: as all pictures do, or where that is from behind a wall, by right angles aside.
+
+    Of places before all walls, the one from which the cables are seen widest.
+    """
+    walls = [np.asarray(part.normal) for one in obstacles for part in parts_of(one) if isinstance(part, Plane)]
+    points = np.concatenate([sight.centerline for sight in sights])
+
+    def hidden(place: float) -> float:
+        # Rounding shall not choose.
+        return round(sum(max(0.0, -float(seen_axes(place)[2] @ wall)) for wall in walls), 6)
+
+    if hidden(AZIMUTH) == 0:
+        return AZIMUTH
+    places = [AZIMUTH + turn for turn in (0, 180, 90, -90)]
+    return min(places, key=lambda place: (hidden(place), -round(float(np.std(points @ seen_axes(place)[0])), 6)))
+
+
+def seen_surfaces(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> list[Faces]:
     """Those of obstacles near the cables."""
     points = np.concatenate([sight.centerline for sight in sights])
     thickest = max(sight.radius for sight in sights)

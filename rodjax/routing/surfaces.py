@@ -45,7 +45,7 @@ def surfaces(obstacles: Sequence[Obstacle], points: Float[np.ndarray, "p 3"]) ->
     low, high = points.min(axis=0), points.max(axis=0)
     extent = float(np.max(high - low))
     region = Region(low - AROUND * extent, high + AROUND * extent, extent)
-    parts = [list(_parts(obstacle)) for obstacle in obstacles]
+    parts = [list(parts_of(obstacle)) for obstacle in obstacles]
     near = [[_near(_faces(part, region), region) for part in own if not isinstance(part, Plane)] for own in parts]
     seen = np.concatenate([points, *(faces.reshape(-1, 3) for own in near for faces in own)])
     for own, faces in zip(parts, near, strict=True):
@@ -53,10 +53,11 @@ def surfaces(obstacles: Sequence[Obstacle], points: Float[np.ndarray, "p 3"]) ->
     return [np.concatenate([np.zeros((0, 4, 3)), *faces]) for faces in near]
 
 
-def _parts(obstacle: Obstacle) -> list[Obstacle]:
+def parts_of(obstacle: Obstacle) -> list[Obstacle]:
+    """An obstacle, or those that a union is of."""
     if not isinstance(obstacle, Union):
         return [obstacle]
-    return [part for one in obstacle.obstacles for part in _parts(one)]
+    return [part for one in obstacle.obstacles for part in parts_of(one)]
 
 
 def _faces(obstacle: Obstacle, region: Region) -> Faces:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
 
-from rodjax.plot import ARROW_LENGTH
+from rodjax.plot import ARROW_LENGTH, ELEVATION
 from rodjax.routing import words
 from rodjax.routing.findings import Cable
 from rodjax.routing.records import plain
@@ -21,6 +21,7 @@ from rodjax.routing.sights import (
     PALETTE,
     Coloring,
     Sight,
+    azimuth,
     clip_faces,
     coloring,
     extent,
@@ -73,6 +74,8 @@ def _scene(report: Any, sights: Sequence[Sight], colors: Coloring) -> dict[str, 
     everything = np.concatenate(corners)
     low, high = everything.min(axis=0), everything.max(axis=0)
     return {
+        "azimuth": azimuth(sights, report.obstacles),
+        "elevation": ELEVATION,
         "center": _rounded((low + high) / 2, decimals),
         "size": float(np.linalg.norm(high - low)),
         "colors": [to_hex(color) for color in _map(colors)(np.linspace(0.0, 1.0, COLORS))],

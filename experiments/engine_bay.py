@@ -1,9 +1,9 @@
 """Can a cable be routed through an engine bay by gradient? From connector to connector, past five parts.
 
-1.2 m of a cable of 10 mm (EI = 0.02 N m^2, 0.15 kg/m) with three clips, each within a box: over the engine block, over the
-coolant pipe and near the second connector. Sought: the places and arclengths of the clips and the length, for the least
-length [m] and elastic energy [J] together. Kept: an inside bend radius of 6 diameters, 10 mm to every part, a pull of
-5 N at the connectors.
+1.2 m of a cable of 10 mm (EI = 0.02 N m^2, 0.15 kg/m) with three clips, each within a box: over the engine block, over
+the coolant pipe and near the second connector. Sought: the places and arclengths of the clips and the length, for the
+least length [m] and elastic energy [J] together. Kept: an inside bend radius of 6 diameters, 10 mm to every part, a
+pull of 5 N at the connectors.
 
     python experiments/engine_bay.py --out build/engine_bay [--starts 64] [--compare]
 """

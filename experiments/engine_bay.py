@@ -205,13 +205,14 @@ def by_evolution(seconds: float, model: Model) -> tuple[float, int]:
         violation = [float(np.sum(np.log1p(np.maximum(-value.slacks, 0.0)))) for value in found]
         return np.array([value.objective for value in found]) + 10 * np.array(violation)
 
+    same: dict[str, Any] = {"seed": 0}
     differential_evolution(
         costs,
         [(0.0, 1.0)] * model.count,
         vectorized=True,
         updating="deferred",
         polish=False,
-        seed=0,
+        **same,
         maxiter=1_000_000,
         tol=0.0,
         callback=lambda *_: time.perf_counter() - begin > seconds,

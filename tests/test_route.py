@@ -189,7 +189,7 @@ def test_variables_are_checked(variables, message):
 
 def test_arguments_are_checked():
     length = [rj.Between("rod.length", 0.2, 0.3)]
-    with pytest.raises(ValueError, match="lower must be below upper for rod.length, got 0.3 and 0.2"):
+    with pytest.raises(ValueError, match=r"lower must be below upper for rod\.length, got 0\.3 and 0\.2"):
         rj.Between("rod.length", 0.3, 0.2)
     with pytest.raises(TypeError, match="scene must be a Scene, got 3"):
         rj.route(3, length)  # pyright: ignore[reportArgumentType]

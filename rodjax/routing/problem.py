@@ -72,7 +72,7 @@ def spans(scene: Scene, names: set[str]) -> Float[Array, "spans"]:
     found = []
     before = None
     for s, support, is_sliding in supports:
-        if not hasattr(support, "position"):
+        if not isinstance(support, Held | Clip):
             continue
         if before is not None:
             gap = support.position - before[1]

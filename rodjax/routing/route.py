@@ -37,7 +37,7 @@ from rodjax.solvers.newton import Newton
 SEGMENTS = 48
 # Of each limit so much is kept in reserve, as a part of it, for the error of the mesh.
 RESERVE = 1e-3
-TOLERANCE = 1e-7
+TOLERANCE = 1e-6
 ITERATIONS = 100
 # A start is drawn so many times, of which the first counts whose clips leave the rod long enough between them; where
 # it has no equilibrium it is drawn again, so often.

@@ -45,10 +45,17 @@ if TYPE_CHECKING:
     )
     from rodjax.identification.result import Fit, NotIdentifiableError
     from rodjax.identification.unknowns import Unknown
+    from rodjax.routing.limits import Limits
+    from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.objective import Objective
+    from rodjax.routing.report import Report, report
+    from rodjax.routing.route import Route, route
+    from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Between",
     "Box",
     "Branch",
     "BranchEnd",
@@ -72,19 +79,27 @@ __all__ = [
     "Free",
     "Guess",
     "Law",
+    "Limits",
     "LineSearch",
+    "Margins",
     "Mesh",
     "Mode",
     "Newton",
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Objective",
     "Obstacle",
+    "OnLine",
+    "OnPatch",
+    "OnSurface",
     "Pin",
     "Plane",
     "PointForce",
     "Reading",
+    "Report",
     "Rod",
+    "Route",
     "Scene",
     "SceneFileError",
     "Smooth",
@@ -92,6 +107,7 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Turned",
     "Union",
     "Unknown",
     "clearance",
@@ -106,11 +122,14 @@ __all__ = [
     "frame",
     "load",
     "lowest_mode",
+    "margins",
     "orthographic",
     "pinhole",
     "problems",
     "read_scene",
+    "report",
     "rotate",
+    "route",
     "save",
     "sensitivities",
     "solve",
@@ -145,6 +164,15 @@ _LATER = {
         ),
         "identification.measurements",
     ),
+    "Limits": "routing.limits",
+    "Margins": "routing.margins",
+    "margins": "routing.margins",
+    "Report": "routing.report",
+    "report": "routing.report",
+    "Objective": "routing.objective",
+    "Route": "routing.route",
+    "route": "routing.route",
+    **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 
 

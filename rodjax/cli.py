@@ -1,6 +1,7 @@
 """The command `rodjax`.
 
-Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, which stderr names.
+Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, or no route was found within
+limits, which stderr names. A report of limits that are not kept is a report, and exits with 0.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import numpy as np
 import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
-from rodjax.files import SUFFIX, save
+from rodjax.files import SUFFIX, load, save
 from rodjax.result import Equilibrium, NotConvergedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
@@ -81,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     solve.set_defaults(run=_solve)
     _add_sweep(commands)
     _add_fit(commands)
+    _add_report(commands)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
     demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
@@ -113,6 +115,24 @@ def _add_fit(commands: Any) -> None:
     fit.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-fit"), help="folder for the results")
     fit.add_argument("--profiles", action="store_true", help="draw likelihoods too, which takes as long again")
     fit.set_defaults(run=_fit)
+
+
+def _add_report(commands: Any) -> None:
+    report = commands.add_parser("report", help="tell whether a cable keeps to limits, with pictures and a web page")
+    report.add_argument("file", metavar="FILE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
+    report.add_argument(
+        "--result",
+        metavar=f"RESULT{SUFFIX}",
+        type=Path,
+        help="of `rodjax solve`, instead of solving the scene in the file; of a path its last step",
+    )
+    report.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-report"), help="folder for the report")
+    report.set_defaults(run=_report)
+    route = commands.add_parser("route", help="find the best place of clips, ends and cable within limits")
+    route.add_argument("file", metavar="ROUTE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
+    route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
+    route.add_argument("--starts", metavar="N", type=_chunk, help="designs from which the search begins; 16")
+    route.set_defaults(run=_route)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -258,6 +278,94 @@ def _profiles(fit: "rodjax.Fit") -> "list[Profile]":
         except ValueError as error:  # three standard errors reach beyond the bounds
             print(f"rodjax: the profile of {label} is not drawn: {error}", file=sys.stderr)
     return found
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from rodjax.routing.files import read_route_file
+
+    _check_folder(arguments.out, "--out")
+    file = read_route_file(arguments.file, with_scene=arguments.result is None)
+    if arguments.result is None:
+        cables = {name: _solved(scene) for name, scene in file.cables.items()}
+    else:
+        cables = {"cable": _last(arguments.result)}
+    try:
+        report = rodjax.report(
+            cables,
+            limits=file.limits,
+            obstacles=file.obstacles,
+            names=file.names,
+            title=file.title or str(arguments.file),
+        )
+    except ValueError as error:
+        if all(np.all(cable.converged) for cable in cables.values()):
+            message = str(error).replace("must be None for", "is not allowed for")
+            raise CommandError(f"{arguments.file}: {message}") from None
+        # A shape that is not finite leaves nothing to tell.
+        print(f"rodjax: {arguments.file}: {error}", file=sys.stderr)
+        return 3
+    print(report, flush=True)
+    print(f"\nwritten: {', '.join(map(str, report.save(arguments.out)))}")
+    lost = [f"{cable.name}: {cable.outcome}" for cable in report.cables if not cable.converged]
+    if not lost:
+        return 0
+    print(f"rodjax: {arguments.file}: {'; '.join(lost)}", file=sys.stderr)
+    return 3
+
+
+def _route(arguments: argparse.Namespace) -> int:
+    from rodjax.routing.files import read_route_file
+    from rodjax.routing.outcome import starts_table, written_route
+
+    _check_folder(arguments.out, "--out")
+    file = read_route_file(arguments.file, for_route=True)
+    (scene,) = file.cables.values()
+    starts = arguments.starts or file.starts
+    options: dict[str, Any] = {} if starts is None else {"starts": starts}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
+        try:
+            route = rodjax.route(
+                scene.scenes[0],
+                file.variables,
+                limits=file.limits,
+                objective=file.objective,
+                obstacles=file.obstacles,
+                names=file.names,
+                segments=scene.segments,
+                progress=sys.stderr.isatty(),
+                **options,
+            )
+        except ValueError as error:
+            raise CommandError(f"{arguments.file}: {error}") from None
+    title = file.title or str(arguments.file)
+    report = rodjax.report(
+        route.verified, limits=file.limits, obstacles=file.obstacles, names=file.names, gradients=route, title=title
+    )
+    print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
+    written = [*report.save(arguments.out), *written_route(route, arguments.out)]
+    print(f"\nwritten: {', '.join(map(str, written))}")
+    if route.feasible:
+        return 0
+    print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
+    return 3
+
+
+def _solved(file: SceneFile) -> Equilibrium:
+    with warnings.catch_warnings():
+        # Said in the report.
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
+        return rodjax.solve(file.scenes[0], **settings)
+
+
+def _last(path: Path) -> Equilibrium:
+    """The equilibrium in a file, or the last of a path."""
+    try:
+        result = load(path)
+    except ValueError as error:
+        raise CommandError(f"--result: {error}") from None
+    return jax.tree.map(lambda leaf: leaf[-1], result) if result.s.ndim > 1 else result
 
 
 def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:

@@ -1,6 +1,6 @@
 """Pictures of equilibria, as matplotlib figures without pyplot: save them with `figure.savefig("rod.png")`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, cast
 
 import jax
@@ -10,14 +10,15 @@ from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rodjax.along import Along
+from rodjax.along import Along, Value, value_at
 from rodjax.checks import instance, positive
 from rodjax.discretization.twist import angle_about, transport
 from rodjax.result import Equilibrium
-from rodjax.rod import Rod
 
 Field = Literal["curvature", "twist", "tension"]
 LABELS = {"curvature": "curvature [1/m]", "twist": "twist rate [rad/m]", "tension": "tension [N]"}
@@ -36,9 +37,9 @@ ARROW_LENGTH = 0.22
 LEAST_DEPTH = 0.3
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
-# The view [degrees], and what is right and up in it.
+HALO = withStroke(linewidth=2, foreground="white")
+# The view [degrees].
 ELEVATION, AZIMUTH = 22, -62
-RIGHT, UP = np.array((0.88, 0.47, 0.0)), np.array((-0.18, 0.33, 0.93))
 
 
 def plot_rod(
@@ -67,12 +68,12 @@ def plot_rod(
     if axes is None:
         axes = Figure(figsize=(7, 5), layout="constrained").add_subplot(projection="3d")
     instance(axes, "axes", Axes3D)
-    radius, note = _thickness([equilibrium], None if radius is None else float(positive(radius, "radius")))
+    radius, note = thickness([equilibrium], None if radius is None else float(positive(radius, "radius")))
     norm = Normalize(*_limits(getattr(equilibrium, color_by)))
     points = [_draw_tube(axes, equilibrium, radius, color_by, norm)]
     if loads:
         points.append(_draw_loads(axes, equilibrium))
-    _set_view(axes, np.concatenate(points))
+    set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     figure = cast(Figure, axes.get_figure(root=True))
     figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)
@@ -118,10 +119,10 @@ def plot_figure_1(
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(4 * columns + 1, 3.7 * rows), layout="constrained")
     panels = [figure.add_subplot(rows, columns, k + 1, projection="3d") for k in range(len(shown))]
-    radius, note = _thickness(shown)
+    radius, note = thickness(shown)
     norm = Normalize(*_limits(np.concatenate([getattr(equilibrium, color_by) for equilibrium in shown])))
     points = [_draw_tube(axes, rod, radius, color_by, norm) for axes, rod in zip(panels, shown, strict=True)]
-    grids = [_set_view(axes, np.concatenate(points), labels=False) for axes in panels]
+    grids = [set_view(axes, np.concatenate(points), labels=False, zoom=1.1) for axes in panels]
     for axes, stage, equilibrium in zip(panels, stages, shown, strict=True):
         twist = f"{round(np.degrees(float(equilibrium.total_twist)))}°"
         axes.set_title(f"({'abcdef'[stage]}) {STAGES[stage]}\ntotal twist {twist}", fontsize=10, y=0.95)
@@ -147,17 +148,22 @@ def tube(
     angle = 2 * np.pi / FACES_AROUND * (np.arange(FACES_AROUND + 1) - STRIP_FACES / 2)
     around = np.cos(angle)[:, None] * d1[:, None] + np.sin(angle)[:, None] * d2[:, None]
     centerline = np.asarray(centerline)
-    rings = radius * np.asarray(_relative_thickness(equilibrium.scene.rod, s))
+    true = equilibrium.scene.rod.radius
+    rings = np.full(len(s), radius)
+    if isinstance(true, Along):
+        rings *= radius_along(true, s) / largest_radius(true)
     return np.asarray(s), centerline, centerline[:, None] + rings[:, None, None] * around
 
 
-def _relative_thickness(rod: Rod, s: Float[jax.Array, "k"]) -> Float[jax.Array, "k"]:
-    """The radius at equally spaced arclengths, as part of the largest; a jump takes the space from one to the next."""
-    if not isinstance(rod.radius, Along):
-        return jnp.ones_like(s)
+def radius_along(radius: Value, s: Float[jax.Array, "k"]) -> Float[np.ndarray, "k"]:
+    """[m] At equally spaced arclengths; a jump takes the space from one to the next."""
     half = (s[1] - s[0]) / 2
-    before, beyond = jnp.maximum(s - half, s[0]), jnp.minimum(s + half, s[-1])
-    return rod.radius.at(s, before, beyond) / jnp.max(rod.radius.samples)
+    return np.asarray(value_at(radius, s, jnp.maximum(s - half, s[0]), jnp.minimum(s + half, s[-1])))
+
+
+def largest_radius(radius: Value) -> float:
+    """[m] Along the rod."""
+    return float(jnp.max(radius.samples) if isinstance(radius, Along) else radius)
 
 
 def _directors(
@@ -182,21 +188,48 @@ def _draw_tube(
     axes: Axes3D, equilibrium: Equilibrium, radius: float, color_by: Field, norm: Normalize
 ) -> Float[np.ndarray, "p 3"]:
     """Draw one rod; returns points of its surface."""
+    scale = ScalarMappable(norm, COLOR_MAP)
+    nodes, values = np.asarray(equilibrium.s), np.asarray(getattr(equilibrium, color_by))
+    faces, colors = tube_faces(equilibrium, radius, lambda s: scale.to_rgba(np.interp(s, nodes, values)))
+    draw_faces(axes, faces, colors)
+    return faces.reshape(-1, 3)
+
+
+def tube_faces(
+    equilibrium: Equilibrium,
+    radius: float,
+    color_at: Callable[[Float[np.ndarray, "k"]], Float[np.ndarray, "k 4"]],
+    strips: Sequence[tuple[int, tuple[float, float, float]]] = STRIPS,
+) -> tuple[Float[np.ndarray, "f 4 3"], Float[np.ndarray, "f 3"]]:
+    """The faces of one rod with its caps, and their colors: those at arclengths [m], and the strips."""
     s, centerline, points = tube(equilibrium, radius)
-    values = np.interp((s[:-1] + s[1:]) / 2, np.asarray(equilibrium.s), getattr(equilibrium, color_by))
-    rings = ScalarMappable(norm, COLOR_MAP).to_rgba(values)[:, :3]
+    rings = color_at((s[:-1] + s[1:]) / 2)[:, :3]
     colors = np.repeat(rings[:, None], FACES_AROUND, axis=1)
     # The strip is faces of the tube: a line of its own would be sorted in depth as a whole, in front or behind.
-    for first, color in STRIPS:
+    for first, color in strips:
         colors[:, first : first + STRIP_FACES] = color
     # Caps, with a hole too small to see: faces without an area have no normal for the shading.
     hole = 1e-3
     caps = [centerline[k] + hole * (points[k] - centerline[k]) for k in (0, -1)]
-    x, y, z = np.moveaxis(np.concatenate([caps[:1], points, caps[1:]]), -1, 0)
     colors = np.pad(colors, ((1, 1), (0, 0), (0, 0)), mode="edge")
-    light = LightSource(azdeg=AZIMUTH - 20, altdeg=55)
-    axes.plot_surface(x, y, z, facecolors=colors, lightsource=light, rstride=1, cstride=1, lw=0, antialiased=False)
-    return points.reshape(-1, 3)
+    return quads(np.concatenate([caps[:1], points, caps[1:]])), colors.reshape(-1, 3)
+
+
+def quads(grid: Float[np.ndarray, "p q 3"]) -> Float[np.ndarray, "f 4 3"]:
+    """The faces between neighbours in a grid of points, row by row."""
+    corners = (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1])
+    return np.stack(corners, axis=2).reshape(-1, 4, 3)
+
+
+def draw_faces(
+    axes: Axes3D, faces: Float[np.ndarray, "f 4 3"], colors: Float[np.ndarray, "f c"], azimuth: float = AZIMUTH
+) -> None:
+    """Draws shaded faces, each in front of those that are further away."""
+    light = LightSource(azdeg=azimuth - 20, altdeg=55)
+    drawn = Poly3DCollection(
+        list(faces), facecolors=colors, shade=True, lightsource=light, linewidths=0, antialiased=False
+    )
+    axes.add_collection3d(drawn)
 
 
 def _draw_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, "p 3"]:
@@ -207,26 +240,59 @@ def _draw_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, "p 
     # At s = 0 what the support applies is the reverse of the section force.
     forces = np.stack([-equilibrium.start_force, equilibrium.end_force])
     moments = np.stack([-equilibrium.start_moment, equilibrium.end_moment])
-    kinds = ((forces, "N", units.force, "tab:red", [1.0]), (moments, "N m", units.energy, "tab:purple", [1.0, 0.8]))
+    feet = nodes[[0, -1]]
+    tips = [
+        draw_arrows(axes, feet, forces, "N", LEAST_LOAD * float(units.force), length, "tab:red"),
+        draw_arrows(axes, feet, moments, "N m", LEAST_LOAD * float(units.energy), length, "tab:purple", (1.0, 0.8)),
+    ]
+    return np.concatenate(tips)
+
+
+def draw_arrows(
+    axes: Axes3D,
+    feet: Float[np.ndarray, "k 3"],
+    loads: Float[np.ndarray, "k 3"],
+    unit: str,
+    least: float,
+    length: float,
+    color: str,
+    heads: Sequence[float] = (1.0,),
+    azimuth: float = AZIMUTH,
+) -> Float[np.ndarray, "p 3"]:
+    """Arrows with their sizes for loads not smaller than `least`, the largest `length` [m] long; returns their tips."""
+    sizes = np.linalg.norm(loads, axis=1)
+    right, up, _ = seen_axes(azimuth)
     tips = []
-    for loads, unit, scale, color, heads in kinds:
-        sizes = np.linalg.norm(loads, axis=1)
-        for foot, load, size in zip(nodes[[0, -1]], loads, sizes, strict=True):
-            if size < LEAST_LOAD * float(scale):
-                continue
-            along, reach = load / size, length * size / max(sizes)
-            for head in heads:
-                (fx, fy, fz), (x, y, z) = foot, head * reach * along
-                ratio = 0.2 * length / (head * reach)
-                axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
-            x, y, z = foot + (reach + 0.05 * length) * along
-            ha, va = "left" if along @ RIGHT > 0 else "right", "bottom" if along @ UP > 0 else "top"
-            axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va)
-            tips.append((x, y, z))
+    for foot, load, size in zip(feet, loads, sizes, strict=True):
+        if size < least:
+            continue
+        along, reach = load / size, length * size / max(sizes)
+        for head in heads:
+            (fx, fy, fz), (x, y, z) = foot, head * reach * along
+            ratio = 0.2 * length / (head * reach)
+            axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
+        x, y, z = foot + (reach + 0.05 * length) * along
+        ha, va = "left" if along @ right > 0 else "right", "bottom" if along @ up > 0 else "top"
+        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
+        tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))
 
 
-def _set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = True) -> float:
+def seen_axes(azimuth: float) -> Float[np.ndarray, "3 3"]:
+    """Rows: what is right, up and towards the viewer in a picture."""
+    a, e = np.radians(azimuth), np.radians(ELEVATION)
+    right = (-np.sin(a), np.cos(a), 0.0)
+    up = (-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e))
+    return np.array([right, up, (np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))])
+
+
+def set_view(
+    axes: Axes3D,
+    points: Float[np.ndarray, "p 3"],
+    labels: bool = True,
+    zoom: float = 0.85,
+    azimuth: float = AZIMUTH,
+) -> float:
     """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
     low, high = points.min(axis=0), points.max(axis=0)
     spans = 1.04 * np.maximum(high - low, LEAST_DEPTH * np.max(high - low))
@@ -240,9 +306,9 @@ def _set_view(axes: Axes3D, points: Float[np.ndarray, "p 3"], labels: bool = Tru
             axis.labelpad = 12  # clear of the tick labels
         else:
             axis.set_major_formatter(NullFormatter())
-    axes.set_box_aspect(tuple(spans), zoom=0.85 if labels else 1.1)  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(tuple(spans), zoom=zoom)  # pyright: ignore[reportArgumentType]
     axes.set_proj_type("ortho")
-    axes.view_init(ELEVATION, AZIMUTH)
+    axes.view_init(ELEVATION, azimuth)
     return grid
 
 
@@ -256,10 +322,10 @@ def _limits(values: Float[np.ndarray, "p"]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _thickness(equilibria: Sequence[Equilibrium], radius: float | None = None) -> tuple[float, str]:
+def thickness(equilibria: Sequence[Equilibrium], radius: float | None = None) -> tuple[float, str]:
     """Radius of the tubes where thickest [m], as asked for or to be seen, and what to say of it in the picture."""
     given = equilibria[0].scene.rod.radius
-    true = 0.0 if given is None else float(jnp.max(given.samples) if isinstance(given, Along) else given)
+    true = 0.0 if given is None else largest_radius(given)
     if radius is None:
         nodes = np.concatenate([equilibrium.nodes for equilibrium in equilibria])
         radius = max(LEAST_RADIUS * float(np.max(np.ptp(nodes, axis=0))), true)

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -59,6 +60,43 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
 # The same of keys that mean something else in one table, by the name of that table.
 OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
     "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"')},
+    "obstacles": {
+        "point": ("m", (3,), '"[0, 0, -0.1] m"'),
+        "normal": ("", (3,), "[0, 0, 1]"),
+        "center": ("m", (3,), '"[0.2, 0, 0] m"'),
+        "start": ("m", (3,), '"[0, 0, 0] m"'),
+        "end": ("m", (3,), '"[0.3, 0, 0] m"'),
+        "size": ("m", (3,), '"[100, 50, 20] mm"'),
+        "unit": ("m", (), '"1 mm"'),
+    },
+    "limits": {
+        "bend_radius": ("", (), "6"),
+        "clip_force": ("N", (), '"20 N"'),
+        "clip_moment": ("N m", (), '"0.5 N m"'),
+        "end_force": ("N", (), '"20 N"'),
+        "end_moment": ("N m", (), '"0.5 N m"'),
+        "twist": ("rad/m", (), '"90 deg/m"'),
+        "strain": ("", (), "0.01"),
+        "stability": ("N", (), '"0.1 N"'),
+        "mass": ("kg", (), '"0.2 kg"'),
+        "energy": ("J", (), '"1 J"'),
+    },
+    "objective": {
+        "length": ("", (), "1"),
+        "mass": ("", (), "1"),
+        "energy": ("", (), "1"),
+        "end_force": ("", (), "0.1"),
+        "clips": ("", (), "0.5"),
+        "clip_scale": ("N", (), '"0.1 N"'),
+    },
+    "variables": {
+        "start": ("m", (3,), '"[0, 0, 0] m"'),
+        "end": ("m", (3,), '"[0.3, 0, 0] m"'),
+        "corner": ("m", (3,), '"[0, 0, 0] m"'),
+        "edge1": ("m", (3,), '"[100, 0, 0] mm"'),
+        "edge2": ("m", (3,), '"[0, 100, 0] mm"'),
+        "angle": ("rad", (), '"30 deg"'),
+    },
 }
 # The same of keys that hold lists, of any length where the shape has `None`.
 LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
@@ -90,8 +128,17 @@ def named(where: str) -> Iterator[None]:
     except SceneFileError:
         raise
     except (TypeError, ValueError) as error:
-        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*QUANTITIES, *LISTS, "values")
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*QUANTITIES, *LISTS, *_of_table(where), "values")
         raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
+
+
+@contextmanager
+def in_file(path: Path) -> Iterator[None]:
+    """Puts the name of the file before mistakes in it."""
+    try:
+        yield
+    except SceneFileError as mistake:
+        raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
 
 
 def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequence[str]) -> dict[str, Any]:
@@ -106,7 +153,7 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
             )
     for key in required:
         if key not in table:
-            is_table = key not in QUANTITIES and key not in LISTS
+            is_table = not any(key in keys for keys in (_of_table(where), QUANTITIES, LISTS))
             example = f"a table [{key}]" if is_table else f"{key} = {quantity(key, where)[2]}"
             raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
     return table
@@ -128,8 +175,11 @@ def choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
 
 def quantity(key: str, where: str = "") -> tuple[str, tuple[int | None, ...], str]:
     """SI unit, shape and an example of a key in the table at that place."""
-    of_table = next((keys for table, keys in OF_TABLES.items() if table in where), {})
-    return of_table.get(key) or QUANTITIES.get(key) or LISTS[key]
+    return _of_table(where).get(key) or QUANTITIES.get(key) or LISTS[key]
+
+
+def _of_table(where: str) -> dict[str, tuple[str, tuple[int, ...], str]]:
+    return next((keys for table, keys in OF_TABLES.items() if table in where), {})
 
 
 def si_values(

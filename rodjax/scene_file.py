@@ -100,6 +100,7 @@ from rodjax.quantities import (
     check_keys,
     choice,
     flag,
+    in_file,
     named,
     quantity,
     si_value,
@@ -147,6 +148,8 @@ _SCENE_KEYS = {
     "": "start.support, end.support: ",
 }
 
+# Those that a file must have, and may have.
+SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "solve", "path")
 # What is read of so many tables a reader keeps at most, about 10 MB.
 MAX_KEPT = 10_000
 
@@ -177,11 +180,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     """As `read_scene`, with the settings of the solve."""
     path = file_path(path, "path")
-    try:
+    with in_file(path):
         return SceneReader().read(toml_tables(read_text(path)))
-    except SceneFileError as mistake:
-        # Up to here the message is without the file.
-        raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
 
 
 def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None = None) -> None:
@@ -312,7 +312,7 @@ def _si_value(reader: SceneReader, where: str, key: str, value: Any) -> Float[np
 
 
 def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
-    check_keys(content, "", ("rod", "start", "end"), ("loads", "clips", "solve", "path"))
+    check_keys(content, "", *SCENE_TABLES)
     part = reader.part
     rod = part(_rod, content["rod"])
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}

@@ -73,10 +73,10 @@ def _target(key: str) -> tuple[Place, tuple[int, ...]]:
     names = key.split(".")
     numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
     end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
-    if names[0] not in ("rod", "start", "end", "loads") or names[end - 1] not in QUANTITIES:
+    if names[0] not in ("rod", "start", "end", "loads", "clips") or names[end - 1] not in QUANTITIES:
         raise SceneFileError(
-            f"{line(key)} cannot vary; allowed are the keys of rod, start, end and loads that hold numbers, "
-            "such as rod.EI, end.position.2, loads.point_force.0.at"
+            f"{line(key)} cannot vary; allowed are the keys of rod, start, end, loads and clips that hold "
+            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position"
         )
     place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
     component = tuple(number for number in numbers[end:] if number is not None)

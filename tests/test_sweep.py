@@ -166,7 +166,7 @@ MISTAKES = [
     ("", "holds no keys", "rod.EI"),
     ("rod.EI = 5", "rod.EI must be a list of values", "from = 1"),
     ("rod.EI = []", "rod.EI must be a list of values", "from = 1"),
-    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end and loads"),
+    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end, loads and clips"),
     ('"end.support" = ["pin", "clamp"]', "end.support cannot vary", "that hold numbers"),
     ('"rod.color" = [1]', "rod.color cannot vary", "that hold numbers"),
     ('"1" = [1]', "1 cannot vary", "that hold numbers"),

@@ -58,8 +58,7 @@ a point have empty cells there. Beside the example above:
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -72,7 +71,7 @@ from rodjax.identification.loss import Loss
 from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
 from rodjax.identification.measurements import Centerline, EndForce, EndMoment, Experiment, Measurement, orthographic
 from rodjax.identification.unknowns import Per, Scale, Unknown, known_names, target
-from rodjax.quantities import SceneFileError, check_keys, choice, flag, si_value, table_list
+from rodjax.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
 from rodjax.scene_file import SceneFile, read_text, toml_tables
 from rodjax.scene_keys import SceneVariations
 from rodjax.scene_keys import check_keys as check_scene_keys
@@ -97,7 +96,7 @@ def read_fit_files(fit: str | os.PathLike[str], data: str | os.PathLike[str]) ->
     Raises `SceneFileError` with one line that names the file and the key, column or row.
     """
     fit, data = file_path(fit, "fit"), file_path(data, "data")
-    with _in_file(fit):
+    with in_file(fit):
         content = check_keys(
             toml_tables(read_text(fit)), "", (), ("scene", "unknown", "measured", "fit", "experiments")
         )
@@ -106,26 +105,17 @@ def read_fit_files(fit: str | os.PathLike[str], data: str | os.PathLike[str]) ->
         names = _column_names(content.get("experiments", {}))
         settings = _settings(content.get("fit", {}))
         tables = _unknown_tables(content.get("unknown", []))
-    with _in_file(data):
+    with in_file(data):
         table = read_table(read_text(data), names)
-    with _in_file(fit):
+    with in_file(fit):
         _check_deviations(deviations, table)
     experiments, file = _experiments(table, scene, data, deviations)
-    with _in_file(fit):
+    with in_file(fit):
         _check_names(tables, experiments)
         unknowns = [_unknown(one, where) for where, one in tables.items()]
     if "rtol" not in settings and "segments" not in settings:
         settings |= {"rtol": file.rtol, "segments": file.segments}
     return FitFiles(experiments, unknowns, {"discretization": file.discretization} | settings)
-
-
-@contextmanager
-def _in_file(path: Path) -> Iterator[None]:
-    """Puts the name of the file before mistakes in it."""
-    try:
-        yield
-    except SceneFileError as mistake:
-        raise SceneFileError(f"{path}: {' '.join(str(mistake).split())}") from None
 
 
 # --- what is sought --------------------------------------------------------------------------------------------------
@@ -288,7 +278,7 @@ def _experiments(
     table: MeasuredTable, path: Path, data: Path, deviations: Mapping[str, float]
 ) -> tuple[list[Experiment], SceneFile]:
     """The experiments, and the scene file of the first."""
-    with _in_file(path):
+    with in_file(path):
         content = toml_tables(read_text(path))
         if "path" in content:
             raise SceneFileError("path is not allowed in a fit, which is of single scenes; leave [[path]] out")

@@ -1,0 +1,357 @@
+"""Routes as files: a scene, obstacles and limits for `rodjax report`; and what may vary for `rodjax route`.
+
+A complete example; quantities are as in scene files, a number and any unit of the right dimension:
+
+    scene = "scene.toml"           # in a folder as seen from this file, without [[path]]; or the tables of a scene,
+                                   # [rod], [start], [end] and others, in this file; or of several cables, for a report:
+                                   # cables = { "brake line" = "brake.toml", "sensor" = "sensor.toml" }
+    title = "Brake line"           # optional
+    starts = 8                     # optional, for `rodjax route`: from how many designs the search begins
+
+    [[obstacles]]                  # any number of these
+    kind = "plane"
+    name = "floor"                 # optional
+    point = "[0, 0, -20] mm"
+    normal = [0, 0, 1]
+
+    [[obstacles]]
+    kind = "capsule"
+    name = "pipe"
+    start = "[100, -100, 20] mm"
+    end = "[160, 200, 0] mm"
+    radius = "20 mm"
+
+    [limits]                       # optional for a report, as all in it
+    bend_radius = 6                # least inside bend radius, by the outer diameter
+    clearance = "10 mm"            # least; or one for each obstacle, "[10, 5] mm"
+    clip_force = "20 N"            # most, as the others but the last
+    clip_moment = "0.5 N m"
+    end_force = "20 N"
+    end_moment = "0.5 N m"
+    twist = "90 deg/m"
+    strain = 0.01
+    length = "1.2 m"
+    mass = "0.2 kg"
+    energy = "1 J"
+    stability = "0.1 N"            # least stiffness of the softest motion
+
+The keys of an obstacle, besides its kind and name:
+
+- "plane": point, normal; "sphere": center, radius; "capsule" and "cylinder": start, end, radius
+- "box": center, size [frame = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], its columns along the edges]
+- "mesh": file = "engine.stl", in a folder as seen from this file [unit = "1 mm", that of the file; without it metres]
+- "union": parts, a list of obstacles without names
+
+What `rodjax route` varies, and a report of the scene as it is leaves aside:
+
+    [[variables]]                  # one or more of these; names as in `rodjax.route`
+    kind = "between"               # a number, or each component of a vector
+    key = "clips.0.at"
+    lower = "200 mm"
+    upper = "300 mm"
+
+    [[variables]]
+    kind = "line"                  # a position on a straight line
+    key = "clips.0.position"
+    start = "[100, 0, 0] mm"
+    end = "[300, 0, 0] mm"
+
+    [[variables]]
+    kind = "patch"                 # a position corner + u edge1 + v edge2, u and v from 0 to 1
+    key = "clips.1.position"
+    corner = "[300, 0, 0] mm"
+    edge1 = "[100, 0, 0] mm"
+    edge2 = "[0, 50, 0] mm"
+
+    [[variables]]
+    kind = "turned"                # a tangent, or the frame of a clamp
+    key = "end.frame"
+    angle = "30 deg"               # at most, away from that of the scene
+
+    [objective]                    # weights of what shall be little, of length [m], mass [kg], energy [J],
+    length = 1                     # end_force [N] and clips, how many of them carry a force above about clip_scale
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rodjax.checks import file_path, shown, whole_number
+from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Plane, Sphere, Union
+from rodjax.quantities import (
+    OF_TABLES,
+    QUANTITIES,
+    SceneFileError,
+    check_keys,
+    choice,
+    in_file,
+    named,
+    si_value,
+    si_values,
+    table_list,
+)
+from rodjax.routing.limits import Limits
+from rodjax.routing.objective import Objective
+from rodjax.routing.variables import Between, OnLine, OnPatch, Turned, Variable, checked_variables
+from rodjax.scene_file import SCENE_TABLES, SceneFile, SceneReader, read_scene_file, read_text, toml_tables
+from rodjax.triangle_mesh import Mesh
+
+# What makes an obstacle, and the keys that it must and may have.
+OBSTACLES: dict[str, tuple[Callable[..., Obstacle], tuple[str, ...], tuple[str, ...]]] = {
+    "plane": (Plane, ("point", "normal"), ()),
+    "sphere": (Sphere, ("center", "radius"), ()),
+    "capsule": (Capsule, ("start", "end", "radius"), ()),
+    "cylinder": (Cylinder, ("start", "end", "radius"), ()),
+    "box": (Box, ("center", "size"), ("frame",)),
+}
+KINDS = [*OBSTACLES, "mesh", "union"]
+VARIABLES: dict[str, tuple[Callable[..., Variable], tuple[str, ...]]] = {
+    "between": (Between, ("lower", "upper")),
+    "line": (OnLine, ("start", "end")),
+    "patch": (OnPatch, ("corner", "edge1", "edge2")),
+    "turned": (Turned, ("angle",)),
+}
+LIMITS = (*OF_TABLES["limits"], "length")
+OF_A_ROUTE = ("title", "obstacles", "limits", "variables", "objective", "starts")
+MOST_STARTS = 10_000
+
+
+class RouteFile(NamedTuple):
+    """What a file holds: a scene file for each cable by its name, what it shall keep to, and what may vary."""
+
+    cables: dict[str, SceneFile]
+    title: str | None
+    obstacles: tuple[Obstacle, ...]
+    names: tuple[str, ...]
+    limits: Limits | None
+    variables: tuple[Variable, ...]
+    objective: Objective | None
+    starts: int | None
+
+
+def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, for_route: bool = False) -> RouteFile:
+    """What the TOML file says; see this module for the format. Without its scene where that is not needed.
+
+    `for_route`: it must have one scene, and variables.
+
+    Raises `SceneFileError` with one line that names the file and the key.
+    """
+    path = file_path(path, "path")
+    with in_file(path):
+        content = toml_tables(read_text(path))
+        required, optional = SCENE_TABLES
+        check_keys(content, "", (), (*required, *optional, "scene", "cables", *OF_A_ROUTE))
+        names, obstacles = _obstacles(content.get("obstacles", []), path.parent)
+        limits = _limits(content["limits"], obstacles) if "limits" in content else None
+        objective = _objective(content["objective"]) if "objective" in content else None
+        title, starts = _title(content), _starts(content)
+    cables = _cables(content, path) if with_scene else {}
+    with in_file(path):
+        variables = _variables(content.get("variables", []))
+        if for_route:
+            _check_for_route(content, cables, variables)
+        if len(cables) == 1 and variables:
+            _check_variables(variables, next(iter(cables.values())))
+    return RouteFile(cables, title, obstacles, names, limits, variables, objective, starts)
+
+
+def _title(content: dict[str, Any]) -> str | None:
+    if not isinstance(content.get("title", ""), str):
+        raise SceneFileError(f"title must be a text, got {shown(content['title'])}")
+    return content.get("title")
+
+
+def _starts(content: dict[str, Any]) -> int | None:
+    if "starts" not in content:
+        return None
+    try:
+        return whole_number(content["starts"], "starts", 1, MOST_STARTS)
+    except (TypeError, ValueError) as error:
+        raise SceneFileError(str(error)) from None
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def _cables(content: dict[str, Any], path: Path) -> dict[str, SceneFile]:
+    tables = {key: content[key] for keys in SCENE_TABLES for key in keys if key in content}
+    with in_file(path):
+        given = [key for key in ("scene", "cables") if key in content] + [", ".join(tables)] * bool(tables)
+        if len(given) != 1:
+            raise SceneFileError(
+                'scene is needed, for example scene = "scene.toml", or cables, or the tables rod, start and end, one '
+                f"of the three, got {' and '.join(given) or 'none'}"
+            )
+        files = content.get("cables", {"cable": content.get("scene")})
+        if not isinstance(files, dict) or not files:
+            raise SceneFileError(f'cables must be a table such as {{ "brake line" = "a.toml" }}, got {shown(files)}')
+        if tables:
+            return {"cable": _single(SceneReader().read(tables))}
+        for name, file in files.items():
+            key = "scene" if "scene" in content else f"cables.{name}"
+            if not isinstance(file, str) or not file or "\0" in file:
+                raise SceneFileError(f'{key} must be the name of a scene file, such as "scene.toml", got {shown(file)}')
+    found = {name: read_scene_file(path.parent / file) for name, file in files.items()}
+    for name, file in files.items():
+        with in_file(path.parent / file):
+            _single(found[name])
+    return found
+
+
+def _single(file: SceneFile) -> SceneFile:
+    if file.is_path:
+        raise SceneFileError("path is not allowed in a route, which is of one scene; leave [[path]] out")
+    return file
+
+
+# --- what a route keeps to -------------------------------------------------------------------------------------------
+
+
+def _obstacles(tables: Any, folder: Path) -> tuple[tuple[str, ...], tuple[Obstacle, ...]]:
+    names, obstacles = [], []
+    for k, table in enumerate(table_list(tables, "obstacles")):
+        where = f"obstacles[{k}]"
+        obstacles.append(_obstacle(table, where, folder, ("name",)))
+        name = table.get("name", f"obstacle {k}")
+        if not isinstance(name, str) or not name:
+            raise SceneFileError(f"{where}.name must be a text, got {shown(name)}")
+        if name in names:
+            raise SceneFileError(f"{where}.name must differ from those of other obstacles, got {shown(name)} again")
+        names.append(name)
+    return tuple(names), tuple(obstacles)
+
+
+def _obstacle(table: Any, where: str, folder: Path, other: tuple[str, ...]) -> Obstacle:
+    kind = _kind(table, where, KINDS)
+    if kind == "mesh":
+        return _mesh(table, where, folder, other)
+    if kind == "union":
+        check_keys(table, where, (), ("kind", "parts", *other))
+        parts = table_list(table.get("parts", []), f"{where}.parts")
+        if not parts:
+            raise SceneFileError(f'{where}.parts must be a list of obstacles, such as {{ kind = "sphere", ... }}')
+        return Union(*(_obstacle(part, f"{where}.parts[{k}]", folder, ()) for k, part in enumerate(parts)))
+    make, required, optional = OBSTACLES[kind]
+    values = si_values(table, where, required, optional, other=("kind", *other))
+    with named(where):
+        return make(**values)
+
+
+def _kind(table: Any, where: str, allowed: list[str]) -> str:
+    kind = choice(table, where, "kind", allowed)
+    if kind is None:
+        raise SceneFileError(f"{where}.kind is missing; allowed are {', '.join(allowed)}")
+    return kind
+
+
+def _mesh(table: dict[str, Any], where: str, folder: Path, other: tuple[str, ...]) -> Obstacle:
+    values = si_values(table, where, (), ("unit",), other=("kind", "file", *other))
+    file = table.get("file")
+    if not isinstance(file, str) or not file or "\0" in file:
+        got = shown(file) if "file" in table else "none"
+        raise SceneFileError(f'{where}.file must be the name of an STL file, such as "engine.stl", got {got}')
+    unit = float(values.get("unit", np.ones(())))
+    if not unit > 0:
+        raise SceneFileError(f"{where}.unit must be positive, got {shown(table['unit'])}")
+    try:
+        return Mesh.from_stl(folder / file, unit)
+    except OSError as error:
+        raise SceneFileError(f"{where}.file: {shown(str(folder / file))} cannot be read: {error.strerror}") from None
+    except (ValueError, ImportError) as error:
+        raise SceneFileError(f"{where}.file: {str(error).removeprefix('path ')}") from None
+
+
+def _limits(table: Any, obstacles: tuple[Obstacle, ...]) -> Limits:
+    values: dict[str, Any] = si_values(table, "limits", (), LIMITS, other=("clearance",))
+    if "clearance" in table:
+        values["clearance"] = _number_or_list(table["clearance"], "clearance", "limits", "m", '"10 mm"')
+        if not obstacles:
+            raise SceneFileError("limits.clearance is not allowed without [[obstacles]]")
+        if values["clearance"].shape not in ((), (len(obstacles),)):
+            count = len(values["clearance"])
+            raise SceneFileError(
+                f"limits.clearance must be one number, or one for each of {len(obstacles)} obstacles, got {count}"
+            )
+    if not values:
+        raise SceneFileError(f"limits must hold at least one of {', '.join((*LIMITS, 'clearance'))}")
+    return _made(Limits, values, "limits")
+
+
+def _objective(table: Any) -> Objective:
+    keys = tuple(OF_TABLES["objective"])
+    return _made(Objective, si_values(table, "objective", (), keys), "objective")
+
+
+def _made(make: Callable[..., Any], values: Mapping[str, Any], where: str) -> Any:
+    try:
+        return make(**values)
+    except (TypeError, ValueError) as error:
+        is_key = str(error).split(maxsplit=1)[0] in values
+        raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
+
+
+# --- what may vary ---------------------------------------------------------------------------------------------------
+
+
+def _variables(tables: Any) -> tuple[Variable, ...]:
+    return tuple(_variable(table, f"variables[{k}]") for k, table in enumerate(table_list(tables, "variables")))
+
+
+def _variable(table: Any, where: str) -> Variable:
+    kind = _kind(table, where, list(VARIABLES))
+    make, required = VARIABLES[kind]
+    for key in ("key", *required):
+        if isinstance(table, dict) and key not in table:
+            raise SceneFileError(f"{where}.{key} is missing")
+    if not isinstance(table["key"], str):
+        raise SceneFileError(
+            f'{where}.key must be the name of a number, such as "clips.0.at", got {shown(table["key"])}'
+        )
+    if kind == "between":
+        check_keys(table, where, (), ("kind", "key", *required))
+        unit = _unit_of(table["key"])
+        example = f'"0.1 {unit}"' if unit else "0.1"
+        values = {key: _number_or_list(table[key], key, where, unit, example) for key in required}
+    else:
+        values = si_values(table, where, required, (), other=("kind", "key"))
+    return _made(make, {"key": table["key"], **values}, where)
+
+
+def _unit_of(key: str) -> str:
+    """That of the last name in a dotted key; of what no scene file has none."""
+    name = next((name for name in reversed(key.split(".")) if not name.isdigit()), "")
+    return QUANTITIES[name][0] if name in QUANTITIES else ""
+
+
+def _number_or_list(value: Any, key: str, where: str, unit: str, example: str) -> Float[np.ndarray, "..."]:
+    is_list = value.lstrip().startswith("[") if isinstance(value, str) else isinstance(value, list)
+    with named(where):
+        try:
+            return si_value(value, key, unit, (None,) if is_list else (), example)
+        except ValueError as error:
+            raise SceneFileError(f"{where}.{error}") from None
+
+
+def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], variables: tuple[Variable, ...]) -> None:
+    if "cables" in content:
+        raise SceneFileError('cables is not allowed where a route is sought, which is of one: scene = "scene.toml"')
+    if not variables:
+        raise SceneFileError("variables is missing: one or more tables [[variables]], which say what may vary")
+    (scene,) = cables.values()
+    if scene.rtol is not None or scene.discretization == "finite_difference":
+        raise SceneFileError(
+            "solve.rtol and finite differences are not allowed where a route is sought, which is on one mesh of "
+            "elements: solve.segments"
+        )
+
+
+def _check_variables(variables: tuple[Variable, ...], file: SceneFile) -> None:
+    try:
+        checked_variables(variables, file.scenes[0])
+    except (TypeError, ValueError) as error:
+        told = str(error)
+        raise SceneFileError(told if told.startswith("variables") else f"variables: {told}") from None

@@ -1,0 +1,208 @@
+"""What there is to say of one cable of a route, in numbers."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from rodjax.modes import lowest_mode
+from rodjax.obstacles import Obstacle
+from rodjax.result import Equilibrium, describe
+from rodjax.routing.limits import Limits
+from rodjax.routing.margins import Margins, curvature_along, margins
+from rodjax.routing.reactions import Reaction, reactions
+from rodjax.routing.route import Route
+from rodjax.scene import has_potential, slides
+
+# Limits that are put where none are asked for, so that what they limit is measured too.
+WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}
+# Radians by which a rod turns along its whole length, at most, where it is straight but for rounding.
+STRAIGHT = 1e-8
+# Of which limit a margin is, by how its name begins.
+BEGINNINGS = {"bend radius": "bend_radius", "clearance to ": "clearance", "twist": "twist", "strain": "strain"}
+
+
+class Gradients(NamedTuple):
+    """Derivatives of margins by design variables.
+
+    - `variables`: names, `units`: of their values (v,)
+    - `margins`: names, as of `rodjax.Margins`
+    - `derivatives` (m, v): of each relative margin by each variable, by its unit
+    """
+
+    variables: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Float[np.ndarray, "v"]
+    margins: tuple[str, ...]
+    derivatives: Float[np.ndarray, "m v"]
+
+    @staticmethod
+    def of(route: Route) -> "Gradients":
+        """Those of the best route that was found."""
+        margins = tuple(name for name in route.gradients if name != "objective")
+        rows = [np.asarray(route.gradients[name]) for name in margins]
+        derivatives = np.reshape(rows, (len(rows), len(route.names)))
+        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives)
+
+
+class Fact(NamedTuple):
+    """A number of a cable in SI units, `None` where there is none; `s` [m]: where that is, `note`: what is special."""
+
+    name: str
+    value: float | None
+    unit: str
+    s: float | None = None
+    note: str = ""
+
+
+class Cable(NamedTuple):
+    """One cable of a report: what it keeps to, what was found of it, and what its supports apply to it."""
+
+    name: str
+    equilibrium: Equilibrium
+    limits: Limits | None
+    margins: Margins | None
+    facts: list[Fact]
+    reactions: list[Reaction]
+    gradients: Gradients | None
+    outcome: str
+
+    @property
+    def converged(self) -> bool:
+        return bool(self.equilibrium.converged)
+
+    @property
+    def kept(self) -> bool | None:
+        """Whether it is an equilibrium that keeps to all limits; `None` where there are no limits."""
+        if not self.converged:
+            return False
+        return None if self.margins is None else bool(np.all(np.asarray(self.margins.margin) >= 0))
+
+
+def cable(
+    name: str,
+    equilibrium: Equilibrium,
+    limits: Limits | None,
+    obstacles: tuple[Obstacle, ...],
+    names: Sequence[str],
+    gradients: Gradients | None,
+) -> Cable:
+    """All there is to say of one equilibrium. Raises as `rodjax.margins` does."""
+    everything = _filled(limits, equilibrium, obstacles)
+    has_clearance = everything.clearance is not None
+    found = margins(equilibrium, everything, obstacles if has_clearance else (), names if has_clearance else None)
+    found = jax.tree.map(np.asarray, found)
+    multiple = 1.0 if everything.bend_radius is None else float(everything.bend_radius)
+    return Cable(
+        name,
+        equilibrium,
+        limits,
+        None if limits is None else _asked(found, limits),
+        _facts(equilibrium, found, multiple),
+        reactions(equilibrium),
+        gradients,
+        describe(equilibrium),
+    )
+
+
+def _filled(limits: Limits | None, equilibrium: Equilibrium, obstacles: Sequence[Obstacle]) -> Limits:
+    given = {} if limits is None else {name: getattr(limits, name) for name in limits.__dataclass_fields__}
+    without = dict(WITHOUT)
+    has_radius = equilibrium.scene.rod.radius is not None
+    if not has_radius:
+        del without["bend_radius"]
+    if not (has_radius and obstacles):
+        del without["clearance"]
+    return Limits(**(without | {name: value for name, value in given.items() if value is not None}))
+
+
+def _limit_of(name: str) -> str | None:
+    return next((limit for begin, limit in BEGINNINGS.items() if name.startswith(begin)), None)
+
+
+def _asked(found: Margins, limits: Limits) -> Margins:
+    """Those of limits that were given."""
+    limit_of = [_limit_of(name) for name in found.names]
+    kept = [k for k, limit in enumerate(limit_of) if limit is None or getattr(limits, limit) is not None]
+    chosen: dict[str, Any] = {
+        name: tuple(getattr(found, name)[k] for k in kept) for name in ("names", "units", "kinds")
+    }
+    chosen |= {name: getattr(found, name)[np.array(kept)] for name in ("value", "limit", "margin", "s")}
+    return Margins(**chosen)
+
+
+def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fact]:
+    rod = equilibrium.scene.rod
+    s, strain, tension = (np.asarray(x) for x in (equilibrium.s, equilibrium.axial_strain, equilibrium.tension))
+    length = float(rod.length)
+    measured = {name: (float(found.value[k]), float(found.s[k])) for k, name in enumerate(found.names)}
+    facts = [
+        Fact("free length", length, "m", note="unstretched"),
+        Fact("stretched length", float(np.trapezoid(1 + strain, s)), "m"),
+    ]
+    if "bend radius" in measured:
+        radius, place = measured["bend radius"]
+        diameter = float(found.limit[found.names.index("bend radius")]) / multiple
+        note = f"{radius / diameter:.3g} times the outer diameter" if np.isfinite(radius) else "straight"
+        facts.append(Fact("smallest inside bend radius", *_finite(radius, "m", place), note=note))
+    else:
+        places, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
+        most = int(np.argmax(curvature))
+        is_straight = curvature[most] * length <= STRAIGHT
+        radius = np.inf if is_straight else 1 / float(curvature[most])
+        note = "straight" if is_straight else "of the centerline"
+        facts.append(Fact("smallest bend radius", *_finite(radius, "m", places[most]), note=note))
+    clearances = {name: at for name, at in measured.items() if _limit_of(name) == "clearance"}
+    if clearances:
+        nearest = min(clearances, key=lambda name: clearances[name][0])
+        facts.append(
+            Fact(
+                "smallest clearance",
+                *_finite(clearances[nearest][0], "m", clearances[nearest][1]),
+                note=nearest.removeprefix("clearance "),
+            )
+        )
+    most, least = int(np.argmax(tension)), int(np.argmin(tension))
+    facts += [
+        Fact("largest twist rate", *_finite(measured["twist"][0], "rad/m", measured["twist"][1])),
+        Fact("total twist", float(equilibrium.total_twist), "rad"),
+        Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="either way"),
+        Fact("largest tension", float(tension[most]), "N", float(s[most])),
+        Fact("least tension", float(tension[least]), "N", float(s[least])),
+        Fact("elastic energy", float(equilibrium.elastic_energy), "J"),
+        Fact("mass", float(rod.mean_mass_per_length) * length, "kg"),
+        _stiffness(equilibrium),
+        _error(equilibrium),
+    ]
+    return facts
+
+
+def _finite(value: float, unit: str, s: float) -> tuple[float | None, str, float | None]:
+    return value if np.isfinite(value) else None, unit, float(s) if np.isfinite(value) else None
+
+
+def _stiffness(equilibrium: Equilibrium) -> Fact:
+    name = "lowest eigenvalue"
+    reasons = {
+        "not of a rod that slides through clips": slides(equilibrium.scene),
+        "not under loads without a potential": not has_potential(equilibrium.scene),
+        "not of the continuum": equilibrium.discretization == "continuum",
+        "not of what is no equilibrium": not bool(equilibrium.converged),
+    }
+    reason = next((reason for reason, holds in reasons.items() if holds), None)
+    if reason is not None:
+        return Fact(name, None, "N", note=reason)
+    note = "stiffness of the softest motion" + ("" if bool(equilibrium.stable) else ": NOT stable")
+    return Fact(name, float(lowest_mode(equilibrium).stiffness), "N", note=note)
+
+
+def _error(equilibrium: Equilibrium) -> Fact:
+    error = float(equilibrium.error_estimate)
+    if not np.isfinite(error):
+        return Fact("estimated error of the shape", None, "m")
+    segments = equilibrium.s.shape[-1] - 1
+    length = float(equilibrium.scene.rod.length)
+    note = f"{error:.0e} of the length, on {segments} segments"
+    return Fact("estimated error of the shape", error * length, "m", note=note)

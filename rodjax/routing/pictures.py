@@ -1,0 +1,111 @@
+"""Pictures of routes, as matplotlib figures without pyplot: save them with `figure.savefig("route.png")`."""
+
+import textwrap
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import PercentFormatter
+from mpl_toolkits.mplot3d import Axes3D
+
+from rodjax.checks import line
+from rodjax.obstacles import Obstacle
+from rodjax.plot import ARROW_LENGTH, HALO, draw_arrows, draw_faces, seen_axes, set_view, tube_faces
+from rodjax.routing.sights import (
+    CLIP_COLOR,
+    PALETTE,
+    Sight,
+    azimuth,
+    clip_faces,
+    coloring,
+    extent,
+    seen_surfaces,
+    thickness_note,
+)
+
+# How much of what is behind an obstacle it hides.
+OPACITY = 0.35
+FORCE_COLOR = "tab:red"
+# Of flat scenes, and how much less it is of those as high as they are wide.
+ZOOM, LESS = 1.2, 0.35
+# How far beside a place its name stands, by the extent of the cables.
+ASIDE = 0.04
+# Characters of a line of the title.
+WIDTH = 100
+
+
+def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Sequence[str], title: str) -> Figure:
+    """Cables as tubes colored by the margin of their bend radius, between translucent obstacles.
+
+    Clips are collars, forces that supports apply to the cables arrows with their sizes. Each obstacle has its name in
+    the legend.
+    """
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    axes.computed_zorder = False  # arrows and words in front of all faces
+    colors = coloring(sights)
+    faces, shades = [], []
+    for sight in sights:
+        tube, shade = tube_faces(sight.equilibrium, sight.radius, lambda s, sight=sight: colors.of(sight, s), ())
+        faces.append(tube)
+        shades.append(np.pad(shade, ((0, 0), (0, 1)), constant_values=1.0))
+        for collar in clip_faces(sight):
+            faces.append(collar)
+            shades.append(np.tile(to_rgba(CLIP_COLOR), (len(collar), 1)))
+    legend = []
+    for k, (surface, name) in enumerate(zip(seen_surfaces(sights, obstacles), names, strict=True)):
+        color = to_rgba(PALETTE[k % len(PALETTE)], OPACITY)
+        faces.append(surface)
+        shades.append(np.tile(color, (len(surface), 1)))
+        label = line(name) if len(surface) else f"{line(name)} (not in the picture)"
+        legend.append(Patch(facecolor=to_rgba(color, 0.8), label=label))
+    # All faces together: each artist by itself would be sorted in depth as a whole.
+    view = azimuth(sights, obstacles)
+    draw_faces(axes, np.concatenate(faces), np.concatenate(shades), view)
+    size = extent([sight.equilibrium for sight in sights])
+    acting = [reaction for sight in sights for reaction in sight.forces]
+    tips = draw_arrows(
+        axes,
+        np.reshape([reaction.position for reaction in acting], (-1, 3)),
+        np.reshape([reaction.force for reaction in acting], (-1, 3)),
+        "N",
+        0.0,
+        ARROW_LENGTH * size,
+        FORCE_COLOR,
+        azimuth=view,
+    )
+    right, up, _ = seen_axes(view)
+    for sight in sights:
+        _name(axes, sight, size * (right - up), len(sights) > 1)
+    points = np.concatenate([np.concatenate(faces).reshape(-1, 3), tips])
+    width, depth, height = np.ptp(points, axis=0)
+    set_view(axes, points, zoom=ZOOM - LESS * min(height / max(width, depth), 1.0), azimuth=view)
+    axes.text2D(0.0, 0.0, thickness_note(sights), transform=axes.transAxes, fontsize=8, color="0.4")
+    bar = figure.colorbar(
+        ScalarMappable(colors.norm, colors.color_map),
+        ax=axes,
+        label=colors.label,
+        shrink=0.6,
+        pad=0.08,
+        extend="both" if colors.is_margin else "neither",
+        format=PercentFormatter(1.0) if colors.is_margin else None,
+    )
+    bar.ax.tick_params(labelsize=9)
+    if legend:
+        figure.legend(handles=legend, loc="outside lower center", ncols=min(len(legend), 4), frameon=False, fontsize=9)
+    figure.suptitle("\n".join(textwrap.wrap(title.replace(" %", "\u00a0%"), WIDTH)), fontsize=10)
+    return figure
+
+
+def _name(axes: Axes3D, sight: Sight, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
+    """Words beside the clips, and the name of one cable of several beside its middle."""
+    places = [(reaction.name, reaction.position) for reaction in sight.reactions[1:-1]]
+    if has_name:
+        places.append((line(sight.name), sight.centerline[len(sight.centerline) // 2]))
+    for name, place in places:
+        x, y, z = place + ASIDE * aside
+        axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])

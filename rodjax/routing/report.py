@@ -1,0 +1,197 @@
+"""What an engineer wants to know of routes of cables, as text, tables and pictures."""
+
+import dataclasses
+import io
+import json
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rodjax.atomic_write import replace_file
+from rodjax.checks import file_path, instance, is_known, sequence, shown
+from rodjax.obstacles import Obstacle, checked_obstacles
+from rodjax.result import Equilibrium
+from rodjax.routing import records, words
+from rodjax.routing.findings import Cable, Gradients, cable
+from rodjax.routing.limits import Limits
+from rodjax.routing.route import Route
+from rodjax.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# What a report writes.
+FILES = ("report.txt", "report.csv", "report.json", "report.png", "report.html")
+DPI = 130
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """A report of one cable, or of several in one scene; `str` of it is its text.
+
+    - `title`, and `verdict`: a sentence
+    - `kept`: whether all of them are equilibria that keep to all limits; `None` where there are no limits
+    - `cables`: for each its name, equilibrium, margins, facts, what supports apply to it, and gradients
+    - `obstacles`, and their `names`
+    """
+
+    title: str
+    cables: tuple[Cable, ...]
+    obstacles: tuple[Obstacle, ...]
+    names: tuple[str, ...]
+
+    @cached_property
+    def verdict(self) -> str:
+        return words.verdict(self)
+
+    @property
+    def kept(self) -> bool | None:
+        each = [cable.kept for cable in self.cables]
+        return False if False in each else (True if True in each else None)
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """The relative margin of each limit by its name; of several cables "cable: name"."""
+        return {
+            f"{cable.name}: {name}" if len(self.cables) > 1 else name: float(margin)
+            for cable in self.cables
+            if cable.margins is not None
+            for name, margin in zip(cable.margins.names, cable.margins.margin, strict=True)
+        }
+
+    def __str__(self) -> str:
+        return words.text(self)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All numbers in SI units, as JSON knows them: `None` for what is infinite or not a number."""
+        return records.as_dict(self)
+
+    def figure(self) -> "Figure":
+        """The cables, colored by the margin of their bend radius, between the obstacles."""
+        from rodjax.routing.pictures import plot_route
+
+        return plot_route(self._sights, self.obstacles, self.names, self._heading)
+
+    def html(self) -> str:
+        """The same as a page that turns with the mouse and needs nothing but a browser."""
+        from rodjax.routing.web_page import web_page
+
+        return web_page(self, self._sights)
+
+    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Writes report.txt, report.csv, report.json, report.png and report.html; returns their names.
+
+        The folder is made where it is not there. Raises `OSError` where they cannot be written.
+        """
+        folder = file_path(folder, "folder")
+        image = io.BytesIO()
+        self.figure().savefig(image, format="png", dpi=DPI)
+        contents = (
+            f"{self}\n".encode(),
+            records.csv_text(self).encode(),
+            f"{json.dumps(self.as_dict(), indent=1, allow_nan=False)}\n".encode(),
+            image.getvalue(),
+            self.html().encode(),
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in zip(FILES, contents, strict=True):
+            replace_file(folder / name, content)
+        return [folder / name for name in FILES]
+
+    @property
+    def _heading(self) -> str:
+        return f"{self.title}: {self.verdict}"
+
+    @cached_property
+    def _sights(self) -> list[Any]:
+        from rodjax.routing.sights import extent, sight
+
+        size = extent([cable.equilibrium for cable in self.cables])
+        return [sight(cable.name, cable.equilibrium, cable.limits, size) for cable in self.cables]
+
+
+def report(
+    equilibrium: Any,
+    *,
+    limits: Any = None,
+    obstacles: Any = (),
+    names: Any = None,
+    gradients: Any = None,
+    title: str | None = None,
+) -> Report:
+    """What there is to say of a cable at rest, or of several in one scene.
+
+    **Arguments:**
+
+    - `equilibrium`: one `Equilibrium`, a list of them, or a dictionary of them by the names of the cables.
+    - `limits`: `Limits` of all cables, or a list of `Limits` or `None`, one for each cable; `None`: none.
+    - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
+    - `names`: of the obstacles; `None`: "obstacle 0" and so on.
+    - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
+    - `title`: `None`: "Route".
+
+    Raises `ValueError` or `TypeError` for other arguments, for a stack of equilibria or one without a finite shape, and
+    as `rodjax.margins` does.
+    """
+    cables = _cables(equilibrium)
+    each_limits = _each(limits, "limits", (Limits,), len(cables))
+    each_gradients = _each(gradients, "gradients", (Gradients, Route), len(cables))
+    obstacles = sequence(obstacles, "obstacles", "Obstacle")
+    if obstacles:
+        obstacles = checked_obstacles(obstacles)
+    names = [f"obstacle {k}" for k in range(len(obstacles))] if names is None else names
+    names = sequence(names, "names", "names of obstacles")
+    if len(names) != len(obstacles) or not all(isinstance(name, str) for name in names) or len({*names}) < len(names):
+        raise ValueError(
+            f"names must be {len(obstacles)} different ones, one for each obstacle, got {shown(list(names))}"
+        )
+    if title is not None:
+        instance(title, "title", str)
+    found = tuple(
+        cable(name, one, limit, obstacles, names, Gradients.of(gradient) if isinstance(gradient, Route) else gradient)
+        for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
+    )
+    return Report("Route" if title is None else title, found, obstacles, names)
+
+
+def _cables(equilibrium: Any) -> dict[str, Equilibrium]:
+    if isinstance(equilibrium, Equilibrium):
+        equilibrium = {"cable": equilibrium}
+    elif not isinstance(equilibrium, Mapping):
+        given = sequence(equilibrium, "equilibrium", "Equilibrium")
+        equilibrium = {f"cable {k}": one for k, one in enumerate(given)}
+    if not equilibrium:
+        raise ValueError("equilibrium must be at least one Equilibrium, got none")
+    for name, one in equilibrium.items():
+        instance(name, "the name of a cable", str)
+        instance(one, f"equilibrium[{name!r}]" if len(equilibrium) > 1 else "equilibrium", Equilibrium)
+        if not is_known(one):
+            raise ValueError(
+                "equilibrium must hold numbers, got a traced one: call report outside jax.jit, vmap and grad"
+            )
+        if one.s.ndim != 1:
+            raise ValueError(
+                f"equilibrium must be single ones, got a stack of shape {one.s.shape[:-1]}; "
+                "jax.tree.map(lambda leaf: leaf[-1], path) takes the last one"
+            )
+        if not all(bool(np.all(np.isfinite(x))) for x in (one.nodes, one.curvature, one.tension)):
+            raise ValueError(f"equilibrium must have a finite shape: {Status(int(one.status)).message}")
+    return dict(equilibrium)
+
+
+def _each(value: Any, name: str, kinds: tuple[type, ...], count: int) -> tuple[Any, ...]:
+    """One for each cable."""
+    # A tuple of numbers may be a kind itself.
+    if value is None or isinstance(value, kinds):
+        return (value,) * count
+    each = sequence(value, name, " or ".join(kind.__name__ for kind in kinds))
+    if len(each) != count:
+        raise ValueError(f"{name} must be one for all cables, or one for each of {count}, got {len(each)}")
+    for k, one in enumerate(each):
+        if one is not None:
+            instance(one, f"{name}[{k}]", kinds)
+    return each

@@ -1,0 +1,242 @@
+"""A report of routes as one page that turns with the mouse and loads nothing."""
+
+import importlib.resources
+import json
+import math
+import re
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Colormap, to_hex
+
+from rodjax.plot import ARROW_LENGTH, ELEVATION
+from rodjax.routing import words
+from rodjax.routing.findings import Cable
+from rodjax.routing.records import plain
+from rodjax.routing.sights import (
+    CLIP_COLOR,
+    PALETTE,
+    Coloring,
+    Sight,
+    azimuth,
+    clip_faces,
+    coloring,
+    extent,
+    seen_surfaces,
+    thickness_note,
+)
+from rodjax.routing.surfaces import Faces
+
+TEMPLATE = "page.html"
+OPACITY = 0.3
+# Colors of the legend, and digits of lengths by the extent of the scene.
+COLORS, DIGITS = 61, 1e-5
+TICKS = 4
+
+
+def web_page(report: Any, sights: Sequence[Sight]) -> str:
+    """The page. Names in it are escaped, the scene is JSON in it."""
+    colors = coloring(sights)
+    scene = _scene(report, sights, colors)
+    # In a script nothing but the end of it is looked for.
+    data = json.dumps(scene, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    parts = {
+        "TITLE": escape(report.title),
+        "LABEL": escape(colors.label),
+        "TICKS": _ticks(colors),
+        "NOTE": escape(thickness_note(sights)),
+        "PANEL": _panel(report),
+        "DATA": data,
+    }
+    page = importlib.resources.files("rodjax.routing").joinpath(TEMPLATE).read_text(encoding="utf-8")
+    # What is put in is not looked through again: a name may be "@DATA@".
+    return re.sub("@([A-Z]+)@", lambda match: parts[match[1]], page)
+
+
+# --- the scene -------------------------------------------------------------------------------------------------------
+
+
+def _scene(report: Any, sights: Sequence[Sight], colors: Coloring) -> dict[str, Any]:
+    size = extent([sight.equilibrium for sight in sights])
+    decimals = max(0, -math.floor(math.log10(DIGITS * size)))
+    obstacles = [
+        _surface(faces, PALETTE[k % len(PALETTE)], OPACITY, decimals)
+        for k, faces in enumerate(seen_surfaces(sights, report.obstacles))
+    ]
+    clips = [_surface(faces, CLIP_COLOR, 1.0, decimals) for sight in sights for faces in clip_faces(sight)]
+    forces = _forces(sights, ARROW_LENGTH * size, decimals)
+    corners = [sight.centerline for sight in sights]
+    corners += [np.reshape(surface["vertices"], (-1, 3)) for surface in obstacles]
+    corners += [np.reshape([force["tip"] for force in forces], (-1, 3))]
+    everything = np.concatenate(corners)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    return {
+        "azimuth": azimuth(sights, report.obstacles),
+        "elevation": ELEVATION,
+        "center": _rounded((low + high) / 2, decimals),
+        "size": float(np.linalg.norm(high - low)),
+        "colors": [to_hex(color) for color in _map(colors)(np.linspace(0.0, 1.0, COLORS))],
+        "cables": [_cable(sight, colors, decimals) for sight in sights],
+        "obstacles": obstacles,
+        "clips": clips,
+        "forces": forces,
+        "labels": _labels(sights, decimals),
+    }
+
+
+def _map(colors: Coloring) -> Colormap:
+    return colormaps[colors.color_map] if isinstance(colors.color_map, str) else colors.color_map
+
+
+def _rounded(values: np.ndarray, decimals: int) -> Any:
+    # Adding zero makes zeros of -0.
+    return (np.round(np.asarray(values, float), decimals) + 0.0).tolist()
+
+
+def _significant(values: np.ndarray) -> list[float | None]:
+    return [None if x is None else float(f"{x:.5g}") for x in plain(values)]
+
+
+def _cable(sight: Sight, colors: Coloring, decimals: int) -> dict[str, Any]:
+    return {
+        "name": sight.name,
+        "points": _rounded(sight.centerline, decimals),
+        "radii": _rounded(sight.radii, decimals + 1),
+        "colors": [to_hex(color) for color in colors.of(sight, (sight.s[:-1] + sight.s[1:]) / 2)],
+        "s": _significant(sight.s),
+        "bend": _significant(sight.bend),
+        "inside": sight.equilibrium.scene.rod.radius is not None,
+        "margins": None if sight.margin is None else _significant(sight.margin),
+        "tension": _significant(sight.tension),
+    }
+
+
+def _surface(faces: Faces, color: str, opacity: float, decimals: int) -> dict[str, Any]:
+    corners, index = np.unique(np.round(faces.reshape(-1, 3), decimals) + 0.0, axis=0, return_inverse=True)
+    rows = [list(dict.fromkeys(row)) for row in index.reshape(-1, 4).tolist()]
+    return {
+        "color": color,
+        "opacity": opacity,
+        "vertices": _rounded(corners, decimals),
+        "faces": [row for row in rows if len(row) > 2],
+    }
+
+
+def _forces(sights: Sequence[Sight], length: float, decimals: int) -> list[dict[str, Any]]:
+    acting = [reaction for sight in sights for reaction in sight.forces]
+    sizes = [float(np.linalg.norm(reaction.force)) for reaction in acting]
+    return [
+        {
+            "foot": _rounded(reaction.position, decimals),
+            "tip": _rounded(reaction.position + length / max(sizes) * reaction.force, decimals),
+            "label": f"{size:.3g} N",
+        }
+        for reaction, size in zip(acting, sizes, strict=True)
+    ]
+
+
+def _labels(sights: Sequence[Sight], decimals: int) -> list[dict[str, Any]]:
+    labels = []
+    for sight in sights:
+        labels += [(reaction.name, reaction.position) for reaction in sight.reactions[1:-1]]
+        if len(sights) > 1:
+            labels.append((sight.name, sight.centerline[len(sight.centerline) // 2]))
+    return [{"text": text, "at": _rounded(at, decimals)} for text, at in labels]
+
+
+# --- what stands beside it -------------------------------------------------------------------------------------------
+
+
+def _ticks(colors: Coloring) -> str:
+    low, high = float(colors.norm.vmin or 0.0), float(colors.norm.vmax or 1.0)
+    values = [low, 0.0, 0.5 * high, high] if colors.is_margin else np.linspace(low, high, TICKS).tolist()
+    told = [f"{100 * x:.0f} %" if colors.is_margin else f"{x:.3g}" for x in values]
+    if colors.is_margin:
+        told[0], told[-1] = f"≤ {told[0]}", f"≥ {told[-1]}"
+    places = [100 * (x - low) / (high - low) for x in values]
+    return "".join(f'<span style="left:{place:.4g}%">{text}</span>' for place, text in zip(places, told, strict=True))
+
+
+def _panel(report: Any) -> str:
+    kind = {None: "", True: ' class="kept"', False: ' class="broken"'}[report.kept]
+    parts = [f"<h1>{escape(report.title)}</h1>", f'<p id="verdict"{kind}>{escape(report.verdict)}</p>']
+    for k, cable in enumerate(report.cables):
+        if len(report.cables) > 1:
+            parts.append(f"<h2>{escape(cable.name)}</h2>")
+        parts += [_limits(cable, k), _facts(cable, k), _supports(cable, k)]
+        if cable.gradients is not None:
+            parts.append(f"<h2>derivatives</h2><pre>{escape(words.gradients(cable))}</pre>")
+        parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
+    if report.obstacles:
+        boxes = "".join(
+            f'<li><label><input type="checkbox" checked data-obstacle="{k}">'
+            f'<span class="swatch" style="background:{PALETTE[k % len(PALETTE)]}"></span>{escape(name)}</label></li>'
+            for k, name in enumerate(report.names)
+        )
+        parts.append(f"<h2>obstacles</h2><ul>{boxes}</ul>")
+    return "\n".join(part for part in parts if part)
+
+
+def _table(heads: Sequence[str], rows: Sequence[str], kind: str = "") -> str:
+    head = "".join(f'<th class="number">{h[1:]}</th>' if h.startswith(">") else f"<th>{h}</th>" for h in heads)
+    return f"<table{kind}><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _row(cells: Sequence[str], number: int, s: float | None, kind: str = "") -> str:
+    """Cells after the first are numbers; where there is an arclength, the place can be looked at."""
+    has_place = s is not None and math.isfinite(s)
+    kinds = " ".join(name for name in (kind, "place" if has_place else "") if name)
+    place = f' data-cable="{number}" data-s="{s:.6g}"' if has_place else ""
+    told = f"<td>{escape(cells[0])}</td>" + "".join(f'<td class="number">{escape(cell)}</td>' for cell in cells[1:])
+    return f'<tr class="{kinds}"{place}>{told}</tr>'
+
+
+def _limits(cable: Cable, number: int) -> str:
+    found = cable.margins
+    if found is None:
+        return ""
+    rows = []
+    for k, name in enumerate(found.names):
+        value, limit, margin, s = (float(getattr(found, field)[k]) for field in ("value", "limit", "margin", "s"))
+        sign = {"least": "≥", "most": "≤"}[found.kinds[k]]
+        cells = [
+            name,
+            words.amount(value, found.units[k]),
+            f"{sign} {words.amount(limit, found.units[k])}",
+            words.percent(margin, limit, found.units[k]),
+            words.amount(s, "m"),
+        ]
+        rows.append(_row(cells, number, s, "" if margin >= 0 else "broken"))
+    return _table(("limit", ">value", ">asked", ">margin", ">at s"), rows)
+
+
+def _facts(cable: Cable, number: int) -> str:
+    rows = []
+    for fact in cable.facts:
+        name = f"{fact.name}, {fact.note}" if fact.note else fact.name
+        place = "" if fact.s is None else words.amount(fact.s, "m")
+        rows.append(_row([name, words.amount(fact.value, fact.unit), place], number, fact.s))
+    return "<h2>shape</h2>" + _table(("", ">value", ">at s"), rows)
+
+
+def _supports(cable: Cable, number: int) -> str:
+    rows = []
+    for reaction in cable.reactions:
+        own = reaction.axes @ reaction.force
+        cells = [
+            words.support(reaction),
+            _unbroken(words.amount(float(np.linalg.norm(reaction.force)), "N")),
+            ", ".join(f"{x:.3g}" for x in reaction.force),
+            ", ".join(f"{x:.3g}" for x in own),
+            _unbroken(words.amount(float(np.linalg.norm(reaction.moment)), "N m")),
+        ]
+        rows.append(_row(cells, number, reaction.s))
+    heads = ("what supports apply", ">force", ">x, y, z", ">tangent, left, up", ">moment")
+    return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')
+
+
+def _unbroken(told: str) -> str:
+    return told.replace(" ", "\u00a0")

@@ -1,0 +1,421 @@
+"""Reports of routes: their numbers beside the equilibrium's, verdicts, and what they write."""
+
+import csv
+import io
+import json
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from matplotlib.image import imread
+
+import rodjax as rj
+from rodjax.plot import AZIMUTH, seen_axes
+from rodjax.routing import surfaces as routing_surfaces
+from rodjax.routing import web_page, words
+from rodjax.routing.findings import Gradients
+from rodjax.routing.reactions import axes_of
+from rodjax.routing.report import FILES
+from rodjax.routing.sights import azimuth, coloring, extent, sight
+from rodjax.routing.surfaces import MOST_TRIANGLES, surfaces
+
+RADIUS = 0.006
+GRAVITY = (0.0, 0.0, -9.81)
+NAMES = ["floor", "</script><b>pipe & 'co'"]
+OBSTACLES = [
+    rj.Plane((0, 0, -0.02), (0, 0, 1)),
+    rj.Capsule((0.1, -0.1, 0.02), (0.16, 0.2, 0.0), 0.02),
+]
+LIMITS = rj.Limits(bend_radius=5, clearance=0.008, clip_force=20, end_moment=1, length=0.7)
+GRADIENTS = Gradients(
+    ("clips.0.at", "weight"),
+    ("m", ""),
+    np.array([0.2, 2.0]),
+    ("bend radius", "length"),
+    np.array([[3.0, 0.1], [0.0, -0.5]]),
+)
+
+
+@pytest.fixture(scope="module")
+def equilibrium():
+    rod = rj.Rod.circular(0.62, RADIUS, 2e7, poisson_ratio=0.45, density=1300.0)
+    start = rj.Clamp((0, 0, 0.1), rj.frame((1, 0, 0.3)))
+    end = rj.Clamp((0.42, 0.12, 0.02), rj.frame((0.3, 1, 0)))
+    clips = [rj.Clip(0.2, (0.18, 0.02, 0.09), (1, 0, -0.2)), rj.Clip(0.42, (0.37, -0.03, 0.04))]
+    return rj.solve(rj.Scene(rod, start, end, GRAVITY, clips=clips), segments=12)
+
+
+@pytest.fixture(scope="module")
+def report(equilibrium):
+    return rj.report(
+        equilibrium, limits=LIMITS, obstacles=OBSTACLES, names=NAMES, gradients=GRADIENTS, title="Line <1>"
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(report, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "new"
+    assert report.save(folder) == [folder / name for name in FILES]
+    return folder
+
+
+def facts(report) -> dict:
+    return {fact.name: fact for fact in report.cables[0].facts}
+
+
+def with_margins(report, margins, **changed):
+    """The report with other margins, or other facts, of its one cable."""
+    old, count = report.cables[0].margins, len(margins)
+    static = {name: getattr(old, name)[:count] for name in ("names", "units", "kinds")}
+    found = rj.Margins(
+        **static, value=old.value[:count], limit=old.limit[:count], margin=np.array(margins), s=old.s[:count]
+    )
+    return type(report)(report.title, (report.cables[0]._replace(margins=found, **changed),), (), ())
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
+    told = facts(report)
+    margins = rj.margins(equilibrium, LIMITS, OBSTACLES, NAMES)
+    expected = dict(zip(margins.names, np.asarray(margins.margin).tolist(), strict=True))
+    assert report.margins == pytest.approx(expected, rel=1e-9)
+    assert told["free length"].value == 0.62
+    strain = np.asarray(equilibrium.axial_strain)
+    # By the positions of a fine polyline, 240 edges of radius of curvature 0.05 m: 1e-6.
+    way = np.diff(np.asarray(equilibrium.position_at(np.linspace(0, 0.62, 241))), axis=0)
+    assert told["stretched length"].value == pytest.approx(np.sum(np.linalg.norm(way, axis=1)), rel=1e-4)
+    # Looked for between the nodes too, it is at most that at the nodes, and not much less on this mesh.
+    at_nodes = 1 / np.max(np.asarray(equilibrium.curvature)) - RADIUS
+    assert 0.9 * at_nodes < told["smallest inside bend radius"].value <= at_nodes * (1 + 1e-9)
+    assert f"{told['smallest inside bend radius'].value / (2 * RADIUS):.3g} times" in (
+        told["smallest inside bend radius"].note
+    )
+    clearance = rj.clearance(equilibrium, OBSTACLES)
+    nearest = int(np.argmin(clearance.distance))
+    # Margins look between places too, which are 10 mm apart: h^2/8 by a curvature of 20 1/m.
+    assert told["smallest clearance"].value == pytest.approx(float(clearance.distance[nearest]), abs=2.5e-4)
+    assert told["smallest clearance"].s == pytest.approx(float(clearance.s[nearest]), abs=0.01)
+    assert told["smallest clearance"].note == f"to {NAMES[nearest]}"
+    assert told["largest twist rate"].value == float(np.max(np.abs(equilibrium.twist)))
+    assert told["largest strain"].value == np.max(np.abs(strain))
+    assert told["largest tension"].value == float(np.max(equilibrium.tension))
+    assert told["elastic energy"].value == float(equilibrium.elastic_energy)
+    assert told["mass"].value == pytest.approx(1300 * np.pi * RADIUS**2 * 0.62, rel=1e-12)
+    assert told["lowest eigenvalue"].value == float(rj.lowest_mode(equilibrium).stiffness)
+    assert told["estimated error of the shape"].value == pytest.approx(0.62 * float(equilibrium.error_estimate))
+
+
+def test_supports_carry_the_weight_in_any_axes(report, equilibrium):
+    found = report.cables[0].reactions
+    assert [reaction.name for reaction in found] == ["start", "clip 0", "clip 1", "end"]
+    assert [reaction.kind for reaction in found] == ["clamp", "clip", "clip", "clamp"]
+    weight = 1300 * np.pi * RADIUS**2 * 0.62 * 9.81
+    np.testing.assert_allclose(sum(reaction.force for reaction in found), [0, 0, weight], atol=1e-12 * weight * 100)
+    np.testing.assert_array_equal(found[1].moment, equilibrium.clip_moments[0])
+    np.testing.assert_array_equal(found[0].moment, -equilibrium.start_moment)
+    for reaction in found:
+        tangent, left, up = reaction.axes
+        np.testing.assert_allclose(reaction.axes @ reaction.axes.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(np.cross(tangent, left), up, atol=1e-14)
+        assert left[2] == pytest.approx(0, abs=1e-15)  # level
+        assert up[2] > 0
+        node = int(np.argmin(np.abs(equilibrium.s - reaction.s)))
+        np.testing.assert_array_equal(tangent, equilibrium.tangents[node])
+        np.testing.assert_array_equal(reaction.position, equilibrium.nodes[node])
+    # A clip that leaves the rod free to spin bears no moment along it, one that holds no direction none.
+    assert abs(found[1].axes[0] @ found[1].moment) < 1e-12
+    np.testing.assert_array_equal(found[2].moment, 0)
+
+
+def test_upright_supports_have_axes_too():
+    axes = np.stack(axes_of(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])))
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(axes) == pytest.approx(1)
+
+
+# --- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_verdict_comes_first(report):
+    title, verdict = str(report).splitlines()[:2]
+    assert title == "Line <1>"
+    broken = [name for name, margin in report.margins.items() if margin < 0]
+    assert broken == ["bend radius", "clearance to floor"]
+    assert verdict.startswith("NOT kept: 2 of 8 limits: clearance to floor, ")
+    radius = facts(report)["smallest inside bend radius"]
+    told = f"bend radius, {1e3 * radius.value:.4g} mm of at least 60 mm ({100 * report.margins['bend radius']:.1f} %)"
+    assert f"; {told} at s = {1e3 * radius.s:.4g} mm" in verdict
+    assert report.kept is False
+    assert str(report).count("NOT KEPT") == 2
+
+
+def test_verdicts(report):
+    kept = with_margins(report, [0.5, 0.2, 0.0])
+    assert kept.kept is True
+    assert kept.verdict.startswith("kept: all 3 limits; tightest: clearance to </script>")
+    unknown = with_margins(report, [0.5, np.nan])
+    assert unknown.kept is False
+    assert unknown.verdict.startswith("NOT kept: 1 of 2 limits: clearance to floor")
+    assert "not a number" in unknown.verdict
+    infinite = with_margins(report, [np.inf])
+    assert infinite.verdict.startswith("kept: the one limit; tightest: bend radius")
+    assert "unlimited" in str(infinite)
+    assert words.amount(np.inf, "m") == "infinite"
+    assert json.loads(json.dumps(infinite.as_dict(), allow_nan=False))["margins"] == {"bend radius": None}
+    many = with_margins(report, [-0.5, -0.4, -0.3, -0.2, -0.1])
+    assert many.verdict.endswith("and 2 more")
+
+
+def test_what_did_not_converge_or_is_not_stable_is_told(report, equilibrium, monkeypatch):
+    monkeypatch.setattr(words, "is_unstable", lambda found: True)
+    assert with_margins(report, [0.5]).verdict.endswith("; but the equilibrium is NOT stable")
+    lost = eqx.tree_at(lambda found: found.converged, equilibrium, jnp.array(False))
+    told = rj.report(lost, limits=LIMITS, obstacles=OBSTACLES, names=NAMES)
+    assert told.kept is False
+    assert told.verdict == "NOT converged: the numbers below are not those of an equilibrium"
+    assert told.as_dict()["converged"] is False
+    assert facts(told)["lowest eigenvalue"].value is None
+    infinite = eqx.tree_at(lambda found: found.nodes, equilibrium, equilibrium.nodes * jnp.inf)
+    with pytest.raises(ValueError, match="equilibrium must have a finite shape: converged"):
+        rj.report(infinite)
+
+
+def test_a_limit_of_zero_has_a_margin_in_its_unit():
+    assert words.percent(0.0123, 0.0, "m") == "+12.3 mm"
+    assert words.percent(-0.0123, 0.0, "m") == "-12.3 mm"
+    assert words.percent(0.25, 4.0, "N") == "+25.0 %"
+
+
+def test_without_limits_it_describes(equilibrium):
+    told = rj.report(equilibrium)
+    assert told.kept is None
+    assert told.verdict == "no limits given"
+    assert told.margins == {}
+    assert "smallest inside bend radius" in str(told)
+    assert "smallest clearance" not in str(told)
+
+
+def test_several_cables_are_told_one_by_one(report, equilibrium):
+    loose = rj.Limits(length=0.7)
+    told = rj.report({"a": equilibrium, "b": equilibrium}, limits=[loose, rj.Limits(length=0.5)])
+    assert told.margins == {"a: length": pytest.approx(0.08 / 0.7), "b: length": pytest.approx(-0.12 / 0.5)}
+    assert told.kept is False
+    assert told.verdict.startswith("NOT kept: 1 of 2 limits: b: length, 620 mm of at most 500 mm (-24.0 %)")
+    assert "--- a: kept" in str(told)
+    assert "--- b: NOT kept" in str(told)
+    assert rj.report([equilibrium, equilibrium], limits=[loose, None]).kept is True
+
+
+def test_derivatives_are_told_by_the_units_of_engineers(report):
+    lines = str(report).splitlines()
+    rows = {
+        line.split("  ")[0]: line.split()
+        for line in lines[lines.index(next(line for line in lines if line.startswith("Change of each margin"))) :]
+    }
+    assert rows["now"][1:] == ["200", "mm", "2"]
+    # 3 a metre are 0.3 % a millimetre.
+    assert rows["bend radius"][2:] == ["+0.3", "%/mm", "+10", "%/1"]
+    assert report.as_dict()["cables"][0]["gradients"]["clips.0.at"] == {
+        "unit": "m",
+        "value": 0.2,
+        "margins": {"bend radius": 3.0, "length": 0.0},
+    }
+
+
+@pytest.mark.slow
+def test_a_sliding_clip_leaves_no_eigenvalue(equilibrium):
+    scene = equilibrium.scene
+    clips = [scene.clips[0], rj.Clip(0.42, scene.clips[1].position, sliding=True)]
+    slides = rj.solve(rj.Scene(scene.rod, scene.start, scene.end, GRAVITY, clips=clips), segments=12)
+    told = rj.report(slides, limits=LIMITS, obstacles=OBSTACLES)
+    fact = facts(told)["lowest eigenvalue"]
+    assert fact.value is None
+    assert "slides" in fact.note
+    assert told.cables[0].reactions[2].kind == "sliding clip"
+    assert told.cables[0].reactions[2].s == pytest.approx(float(slides.scene.clips[1].at))
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def refuse(constant):
+    raise AssertionError(f"{constant} is not JSON")
+
+
+def test_json_is_strict_and_holds_the_margins(saved, report):
+    told = json.loads((saved / "report.json").read_text(), parse_constant=refuse)
+    assert told["margins"] == report.margins
+    assert told["kept"] is False
+    assert told["verdict"] == report.verdict
+    (cable,) = told["cables"]
+    assert cable["status"] == "converged"
+    assert cable["facts"]["free length"] == {"value": 0.62, "unit": "m", "s": None, "note": "unstretched"}
+    assert [support["name"] for support in cable["supports"]] == ["start", "clip 0", "clip 1", "end"]
+    assert cable["limits"][0]["kept"] is False
+
+
+def test_csv_holds_all_numbers(saved, report):
+    rows = list(csv.DictReader(io.StringIO((saved / "report.csv").read_text())))
+    assert all(len(row) == 10 and None not in row for row in rows)
+    limits = {row["name"]: float(row["margin"]) for row in rows if row["kind"] == "limit"}
+    assert limits == report.margins
+    forces = {row["name"]: float(row["value"]) for row in rows if row["kind"] == "force"}
+    assert forces["end x"] == report.cables[0].reactions[-1].force[0]
+    assert forces["clip 0 size"] == pytest.approx(np.linalg.norm(report.cables[0].reactions[1].force))
+    assert float(next(r for r in rows if r["name"] == "bend radius by clips.0.at")["value"]) == 3.0
+
+
+def test_the_text_and_the_picture_are_written(saved, report):
+    assert (saved / "report.txt").read_text() == f"{report}\n"
+    image = imread(saved / "report.png")[..., :3]
+    assert np.mean(np.any(image < 0.9, axis=-1)) > 0.05
+
+
+def test_the_page_loads_nothing_and_hides_no_tags_in_names(saved, report):
+    page = (saved / "report.html").read_text()
+    assert len(page) < 1e6
+    assert not re.search(r"https?:|//cdn|src=|@import|url\(", page)
+    assert "default-src 'none'" in page
+    assert page.count("</script>") == 2
+    assert "&lt;/script&gt;&lt;b&gt;pipe &amp; &#x27;co&#x27;" in page
+    assert "<b>" not in page
+    assert "<title>Line &lt;1&gt;</title>" in page
+    assert page.index("NOT kept") < page.index("<table")
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1], parse_constant=refuse)
+    (cable,) = data["cables"]
+    assert len(cable["points"]) == len(cable["s"]) == len(cable["tension"]) == len(cable["margins"])
+    worst = int(np.argmin(cable["margins"]))
+    # The worst of 241 places beside the worst of those of the mesh.
+    assert cable["margins"][worst] == pytest.approx(report.margins["bend radius"], abs=2e-3)
+    assert cable["s"][worst] == pytest.approx(facts(report)["smallest inside bend radius"].s, abs=0.01)
+    assert len(data["obstacles"]) == 2
+    assert len(data["clips"]) == 2
+    size = np.linalg.norm(report.cables[0].reactions[0].force)
+    assert data["forces"][0]["label"] == f"{size:.3g} N"
+    for surface in data["obstacles"]:
+        assert max(max(face) for face in surface["faces"]) == len(surface["vertices"]) - 1
+
+
+def test_a_name_like_a_place_in_the_template_is_a_name(report):
+    strange = type(report)("@DATA@", report.cables, (), ())
+    assert "<title>@DATA@</title>" in web_page.web_page(strange, strange._sights)
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_names_what_it_shows(report):
+    figure = report.figure()
+    axes, bar = figure.axes
+    assert bar.get_ylabel() == "margin of the inside bend radius"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == NAMES
+    written = [text.get_text() for text in axes.texts]
+    sizes = [f"{np.linalg.norm(reaction.force):.3g} N" for reaction in report.cables[0].reactions]
+    assert written[:4] == sizes
+    assert written[4:6] == ["clip 0", "clip 1"]
+
+
+def test_places_that_bend_too_much_are_red(report, equilibrium):
+    (seen,) = report._sights
+    colors = coloring([seen])
+    red, _, blue, _ = colors.of(seen, seen.s).T
+    assert np.all((red > blue) | (seen.margin >= 0))
+    assert np.all(blue[seen.margin > 0.8] > red[seen.margin > 0.8])
+    assert np.any(seen.margin < 0)
+    without = coloring([sight("a", equilibrium, None, extent([equilibrium]))])
+    assert without.label == "curvature [1/m]"
+    assert not without.is_margin
+
+
+def test_no_wall_stands_before_the_picture(report):
+    assert azimuth(report._sights, OBSTACLES) == AZIMUTH
+    for normal in ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0)):
+        view = azimuth(report._sights, [*OBSTACLES, rj.Plane((0, 0, 0), normal)])
+        right, up, near = seen_axes(view)
+        assert near @ np.array(normal) > 0
+        np.testing.assert_allclose(np.cross(right, up), near, atol=1e-15)
+
+
+POINTS = np.array([[-0.5, -0.5, -0.5], [0.9, 0.6, 0.6]])
+FRAME = np.asarray(rj.frame((1, 2, 3), (0, 1, 1)))
+TORUS = trimesh.creation.torus(0.4, 0.15, major_sections=24, minor_sections=12)
+SHAPES = {
+    "plane": rj.Plane((0, 0, -0.2), (1, 2, 2)),
+    "sphere": rj.Sphere((0.3, -0.2, 0.1), 0.4),
+    "capsule": rj.Capsule((0, 0, 0), (1, 0, 0), 0.2),
+    "cylinder": rj.Cylinder((0, 0, 0), (0, 0.6, 0.8), 0.3),
+    "box": rj.Box((0.3, -0.2, 0.1), (0.8, 0.5, 0.3), FRAME),
+    "union": rj.Union(rj.Sphere((0, 0, 0), 0.4), rj.Box((1, 0, 0), (0.5, 0.5, 0.5))),
+    "mesh": rj.Mesh(TORUS.vertices, TORUS.faces),
+    "function": rj.Distance(lambda p: 3 * (jnp.sqrt(p[0] ** 2 + 2 * p[1] ** 2 + p[2] ** 2 + 1e-9) - 0.3)),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_surfaces_lie_on_obstacles_and_are_seen_from_outside(kind):
+    obstacle = SHAPES[kind]
+    (faces,) = surfaces([obstacle], POINTS)
+    assert 10 < len(faces) <= MOST_TRIANGLES
+    distance = np.asarray(obstacle.distance(faces.reshape(-1, 3)))
+    if kind == "union":  # a part may lie in another
+        assert np.max(distance) < 1e-12
+    else:
+        # Those of what has only a distance come onto it by two steps of Newton from a tenth of a cell, 5 mm.
+        np.testing.assert_allclose(distance, 0, atol=1e-5 if kind == "function" else 1e-12)
+    normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    normals += np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 0])
+    out = 1e-4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    middles = faces.mean(axis=1)
+    rises = np.asarray(obstacle.distance(middles + out)) - np.asarray(obstacle.distance(middles - out))
+    assert np.all(rises > 0) or kind == "union"
+
+
+def test_large_meshes_are_drawn_by_fewer_triangles_and_long_ones_by_more():
+    fine = trimesh.creation.icosphere(5, 0.3)
+    (faces,) = surfaces([rj.Mesh(fine.vertices, fine.faces)], POINTS)
+    assert len(fine.faces) > MOST_TRIANGLES >= len(faces) > MOST_TRIANGLES / 4
+    # Corners move by half a cell of the grid at most.
+    np.testing.assert_allclose(np.linalg.norm(faces, axis=-1), 0.3, atol=0.02)
+    box = trimesh.creation.box((1, 1, 1))
+    (faces,) = surfaces([rj.Mesh(box.vertices, box.faces)], POINTS)
+    assert len(faces) > 100
+    area = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(6)
+
+
+def test_only_what_is_near_is_drawn():
+    far = [rj.Sphere((9, 0, 0), 0.5), rj.Plane((0, 0, -9), (0, 0, 1)), rj.Distance(lambda p: p[0] + 9)]
+    assert [len(faces) for faces in surfaces(far, POINTS)] == [0, 0, 0]
+    (pipe,) = surfaces([rj.Cylinder((-9, 0, 0), (9, 0, 0), 0.1)], POINTS)
+    assert np.ptp(pipe[..., 0]) < 4
+    floor, ball = surfaces([rj.Plane((0, 0, -0.6), (0, 0, 1)), rj.Sphere((1.5, 0, 0), 0.2)], POINTS)
+    assert np.max(floor[..., 0]) > np.max(ball[..., 0])
+    np.testing.assert_allclose(floor[..., 2], -0.6)
+    assert len(floor) > routing_surfaces.FACES_ALONG**2 / 2
+
+
+# --- mistakes --------------------------------------------------------------------------------------------------------
+
+
+def test_mistakes_are_told(equilibrium):
+    def told(*arguments, **options):
+        with pytest.raises((ValueError, TypeError)) as found:
+            rj.report(*arguments, **options)
+        return str(found.value)
+
+    assert told([]) == "equilibrium must be at least one Equilibrium, got none"
+    assert told(3).startswith("equilibrium must be a list of Equilibrium, got 3")
+    assert "limits must be one for all cables, or one for each of 1, got 2" in told(equilibrium, limits=[None, None])
+    assert "limits[0] must be a Limits, got 3" in told(equilibrium, limits=[3])
+    assert "names must be 1 different ones" in told(equilibrium, obstacles=OBSTACLES[:1], names=["a", "b"])
+    assert "obstacles[0] must be an Obstacle" in told(equilibrium, obstacles=[3])
+    assert "title must be a str" in told(equilibrium, title=3)
+    stack = jax.tree.map(lambda x: jnp.stack([x, x]), equilibrium)
+    assert "got a stack of shape (2,)" in told(stack)

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     )
     from rodjax.identification.result import Fit, NotIdentifiableError
     from rodjax.identification.unknowns import Unknown
+    from rodjax.routing.limits import Limits
+    from rodjax.routing.margins import Margins, margins
 
 __version__ = "0.1.0"
 
@@ -72,7 +74,9 @@ __all__ = [
     "Free",
     "Guess",
     "Law",
+    "Limits",
     "LineSearch",
+    "Margins",
     "Mesh",
     "Mode",
     "Newton",
@@ -106,6 +110,7 @@ __all__ = [
     "frame",
     "load",
     "lowest_mode",
+    "margins",
     "orthographic",
     "pinhole",
     "problems",
@@ -145,6 +150,9 @@ _LATER = {
         ),
         "identification.measurements",
     ),
+    "Limits": "routing.limits",
+    "Margins": "routing.margins",
+    "margins": "routing.margins",
 }
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.along import value_at
-from rodjax.checks import instance, whole_number
+from rodjax.checks import Numbers, instance, whole_number
 from rodjax.obstacles import Obstacle, checked_obstacles, least
 from rodjax.result import Equilibrium, over_leading_axes
+from rodjax.rod import Rod
 
 # Places between two nodes, where none are asked for, and at most.
 POINTS = 4
@@ -59,14 +60,24 @@ def clearance(equilibrium: Equilibrium, obstacles: Any, points: Any = None) -> C
 
 @over_leading_axes
 def _clearance(equilibrium: Equilibrium, obstacles: tuple[Obstacle, ...], fractions: Float[Array, "p"]) -> Clearance:
-    nodes = equilibrium.s
-    between = nodes[:-1, None] + fractions.astype(nodes.dtype)[None] * jnp.diff(nodes)[:, None]
-    s = jnp.append(between.reshape(-1), nodes[-1])
+    s = places(equilibrium, fractions)
     positions = equilibrium.position_at(s)
-    before, beyond = (value_at(equilibrium.scene.rod.radius, side, s[:-1], s[1:]) for side in (s[1:], s[:-1]))
-    radius = -least(-jnp.append(beyond, before[-1]), -jnp.append(beyond[0], before))
+    radius = radius_at(equilibrium.scene.rod, s)
     each = [_nearest(obstacle, s, positions, radius) for obstacle in obstacles]
     return jax.tree.map(lambda *values: jnp.stack(values), *each)
+
+
+def places(equilibrium: Equilibrium, fractions: Float[Numbers, "p"]) -> Float[Array, "k"]:
+    """The arclengths of the nodes, and of places at these fractions of the way between them, 0 the first."""
+    nodes = equilibrium.s
+    between = nodes[:-1, None] + jnp.asarray(fractions, nodes.dtype)[None] * jnp.diff(nodes)[:, None]
+    return jnp.append(between.reshape(-1), nodes[-1])
+
+
+def radius_at(rod: Rod, s: Float[Array, "k"]) -> Float[Array, "k"]:
+    """The radius at arclengths one after another; of one that jumps, the larger one beside the place."""
+    before, beyond = (value_at(rod.radius, side, s[:-1], s[1:]) for side in (s[1:], s[:-1]))
+    return -least(-jnp.append(beyond, before[-1]), -jnp.append(beyond[0], before))
 
 
 def _nearest(

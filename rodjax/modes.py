@@ -25,8 +25,8 @@ class Mode(eqx.Module):
 
     - `stiffness` [...] N: the second variation of the energy in this motion, by the integral along the rod of the
       squared change of the tangent. Negative where the energy falls, zero for a neutral motion. A straight strut
-      loses as much of it as it is pressed
-    - `displacement` [..., n+1, 3] of the nodes, the largest 1
+      loses as much of it as it is pressed. Derivatives by the scene are exact, of two motions equally soft those of one
+    - `displacement` [..., n+1, 3] of the nodes, the largest 1; taken as fixed by derivatives
     """
 
     stiffness: Float[Array, "..."]
@@ -112,7 +112,8 @@ def _lowest_mode(equilibrium: Equilibrium) -> Mode:
             "have none"
         )
     here = form.linearized(point)
-    return mode_of(form, point, here, *softest(form, point, here), nondimensional(equilibrium.scene)[1])
+    mode = mode_of(form, point, here, *softest(form, point, here), nondimensional(equilibrium.scene)[1])
+    return eqx.tree_at(lambda mode: mode.displacement, mode, replace_fn=jax.lax.stop_gradient)
 
 
 def mode_of(

@@ -125,10 +125,24 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
 def softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
     """The lowest eigenvalue [EI/L^2] of the Hessian under the constraints, by the length of rod, and its motion.
 
-    The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion.
+    The derivative of the eigenvalue is that of Rayleigh's quotient of its motion, which is stationary at it; of two
+    equal eigenvalues that of one motion. The motion has none.
     """
-    # None where a support holds the tangent.
-    mass = form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+    stiffness, motion = _softest(*jax.lax.stop_gradient((form, point, here)))
+    moments, gaps = here.system.times(motion.rotation, motion.multipliers)
+    work = jnp.sum(motion.rotation * moments) + jnp.sum(motion.multipliers * gaps)
+    quotient = work / jnp.sum(_inertia(form, here)[None] * motion.rotation**2)
+    return stiffness + quotient - jax.lax.stop_gradient(quotient), motion
+
+
+def _inertia(form: Form, here: Linearization) -> Float[Array, "m"]:
+    """By the length of rod; none where a support holds the tangent."""
+    return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+
+
+def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
+    """The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion."""
+    mass = _inertia(form, here)
     one = jnp.ones((), mass.dtype)
 
     def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:

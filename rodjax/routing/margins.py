@@ -1,0 +1,283 @@
+"""By how much a rod at rest keeps to limits: of each limit the value that decides, where it is, and its margin."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rodjax.checks import instance, sequence
+from rodjax.clearance import POINTS, places, radius_at
+from rodjax.discretization.hermite import Curve
+from rodjax.modes import lowest_mode
+from rodjax.obstacles import Obstacle, checked_obstacles
+from rodjax.result import Equilibrium, over_leading_axes
+from rodjax.routing.limits import Limits
+from rodjax.vectors import dot, root
+
+
+class Margins(eqx.Module):
+    """By how much limits are kept, one entry for each of the m things they limit; of several rods along `...`.
+
+    - `names`: such as "bend radius", "clearance to obstacle 0", "force of clip 0", "moment of start"
+    - `units` of value and limit; `kinds`: "least" or "most"
+    - `value` [..., m], `limit` [..., m], in SI units; the bend radius is the inside one [m], infinite of a straight rod
+    - `margin` [..., m]: the part of the limit that is left, (value - limit)/limit of a least one and the reverse of a
+      largest one; of a limit of 0 the difference itself. Not negative where the limit is kept
+    - `s` [..., m] m, arclength of the place that decides; not a number where there is none
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    value: Float[Array, "... m"]
+    limit: Float[Array, "... m"]
+    margin: Float[Array, "... m"]
+    s: Float[Array, "... m"]
+
+    def __str__(self) -> str:
+        """One line for each: name, value, limit, margin, place."""
+        if self.value.ndim > 1:
+            return f"Margins of {', '.join(self.names)} for {np.prod(self.value.shape[:-1])} rods"
+        rows = zip(self.names, self.units, self.kinds, self.value, self.limit, self.margin, self.s, strict=True)
+        return "\n".join(
+            f"{name}: {float(value):.4g} {unit} ({kind} {float(limit):.4g}), margin {100 * float(margin):.1f} %"
+            + (f" at s = {float(s):.4g} m" if np.isfinite(s) else "")
+            for name, unit, kind, value, limit, margin, s in rows
+        )
+
+
+class Measured(eqx.Module):
+    """What a limit is compared with, where it decides in each of w parts of the rod, or at w = 1 place.
+
+    `slack`: smooth, of order 1 and not negative where the limit is kept, for optimisers. `obstacle`: the number of
+    the one whose clearance it is.
+    """
+
+    name: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    is_least: bool = eqx.field(static=True)
+    value: Float[Array, "w"]
+    limit: Float[Array, "w"]
+    slack: Float[Array, "w"]
+    s: Float[Array, "w"]
+    obstacle: int | None = eqx.field(static=True, default=None)
+
+    @property
+    def margin(self) -> Float[Array, "w"]:
+        is_finite = jnp.isfinite(self.value)  # not so the radius of a straight rod, whose derivatives are 0
+        value = jnp.where(is_finite, self.value, self.limit)
+        gap = value - self.limit if self.is_least else self.limit - value
+        return jnp.where(is_finite, gap / jnp.where(self.limit == 0, 1.0, self.limit), self.value)
+
+
+def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names: Any = None) -> Margins:
+    """By how much an equilibrium keeps to limits.
+
+    **Arguments:**
+
+    - `equilibrium`: of one scene or of many.
+    - `limits`: `Limits`.
+    - `obstacles`: a list of `Obstacle`, from which `limits.clearance` is kept.
+    - `names`: of the obstacles; `None`: "obstacle 0" and so on.
+
+    Each is that of the worst place. Clearance is looked for as by `rodjax.clearance`; curvature at the nodes, on both
+    sides of them and between them where the mesh is of elements whose tangents are the unknowns, else at the nodes;
+    twist and strain at the nodes, the strain at a clip the mean of both sides.
+
+    Derivatives are those of the worst place, which stays at the same part of the mesh, by numbers of the scene, the
+    limits and the obstacles; of a straight rod, that of the bend radius is 0.
+
+    Raises `ValueError` or `TypeError` for a limit that asks for what the scene has not: a radius, clips, obstacles, for
+    obstacles without a limit of clearance, and for a stability that `rodjax.lowest_mode` refuses.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    obstacles, names = checked(equilibrium, limits, obstacles, names)
+    found = _margins(equilibrium, limits, obstacles)
+    labels = [each.name if each.obstacle is None else f"clearance to {names[each.obstacle]}" for each in found]
+    value, limit, margin, s = (
+        jnp.concatenate(rows, axis=-1)
+        for rows in zip(*((each.value, each.limit, each.margin, each.s) for each in found), strict=True)
+    )
+    return Margins(
+        names=tuple(labels),
+        units=tuple(each.unit for each in found),
+        kinds=tuple("least" if each.is_least else "most" for each in found),
+        value=value,
+        limit=limit,
+        margin=margin,
+        s=s,
+    )
+
+
+def checked(subject: Any, limits: Limits, obstacles: Any, names: Any) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
+    """The obstacles and their names, where the limits suit them and the rod of an equilibrium, or of a `Scene`."""
+    instance(limits, "limits", Limits)
+    scene = subject.scene if isinstance(subject, Equilibrium) else subject
+    obstacles = sequence(obstacles, "obstacles", "Obstacle")
+    if obstacles:
+        obstacles = checked_obstacles(obstacles)
+    if (limits.clearance is not None) != bool(obstacles):
+        given = f"got clearance = {limits.clearance} and {len(obstacles)} obstacles"
+        raise ValueError(f"limits.clearance must be given where there are obstacles, and only there; {given}")
+    if limits.clearance is not None and limits.clearance.ndim and limits.clearance.shape != (len(obstacles),):
+        raise ValueError(
+            f"limits.clearance must be one number, or one for each of {len(obstacles)} obstacles, "
+            f"got {limits.clearance.shape[0]}"
+        )
+    names = tuple(f"obstacle {k}" for k in range(len(obstacles))) if names is None else names
+    names = sequence(names, "names", "names of obstacles")
+    if len(names) != len(obstacles) or not all(isinstance(name, str) for name in names) or len({*names}) < len(names):
+        raise ValueError(f"names must be {len(obstacles)} different ones, one for each obstacle, got {list(names)}")
+    for field in ("bend_radius", "clearance"):
+        if getattr(limits, field) is not None and scene.rod.radius is None:
+            raise ValueError(f"limits.{field} must be None for a rod without a radius; rodjax.Rod takes one")
+    for field in ("clip_force", "clip_moment"):
+        if getattr(limits, field) is not None and not scene.clips:
+            raise ValueError(f"limits.{field} must be None for a scene without clips")
+    return obstacles, names
+
+
+@over_leading_axes
+def _margins(equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...]) -> list[Measured]:
+    return measured(equilibrium, limits, obstacles)
+
+
+def measured(
+    equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...], windows: int = 1
+) -> list[Measured]:
+    """What the limits of an equilibrium are compared with; what is so all along it, in equal parts of its mesh."""
+    scene = equilibrium.scene
+    found = []
+    if limits.bend_radius is not None:
+        found.append(_bend_radius(equilibrium, limits.bend_radius, windows))
+    if limits.clearance is not None:
+        found += _clearances(equilibrium, limits.clearance, obstacles, windows)
+    for unit, limit, of_clips in (
+        ("N", limits.clip_force, "clip_forces"),
+        ("N m", limits.clip_moment, "clip_moments"),
+    ):
+        if limit is not None:
+            kind = of_clips.removeprefix("clip_").removesuffix("s")
+            sizes = getattr(equilibrium, of_clips)
+            found += [
+                _size(f"{kind} of clip {k}", unit, vector, limit, clip.at)
+                for k, (clip, vector) in enumerate(zip(scene.clips, sizes, strict=True))
+            ]
+    for unit, limit, kind in (("N", limits.end_force, "force"), ("N m", limits.end_moment, "moment")):
+        if limit is not None:
+            for end, s in (("start", equilibrium.s[0]), ("end", equilibrium.s[-1])):
+                vector = getattr(equilibrium, f"{end}_{kind}")
+                found.append(_size(f"{kind} of {end}", unit, vector, limit, s))
+    for name, unit, limit, values in (
+        ("twist", "rad/m", limits.twist, equilibrium.twist),
+        ("strain", "", limits.strain, equilibrium.axial_strain),
+    ):
+        if limit is not None:
+            found.append(_largest(name, unit, values, limit, equilibrium.s, windows))
+    if limits.stability is not None:
+        stiffness = lowest_mode(equilibrium).stiffness
+        unit = limits.stability + scene.rod.bending_scale / scene.rod.length**2
+        slack = (stiffness - limits.stability) / unit
+        found.append(_single("stability", "N", True, stiffness, limits.stability, slack))
+    for name, unit, limit, value in (
+        ("length", "m", limits.length, scene.rod.length),
+        ("mass", "kg", limits.mass, scene.rod.mean_mass_per_length * scene.rod.length),
+        ("energy", "J", limits.energy, equilibrium.elastic_energy),
+    ):
+        if limit is not None:
+            found.append(_single(name, unit, False, value, limit, 1 - value / limit))
+    return found
+
+
+def _single(
+    name: str,
+    unit: str,
+    is_least: bool,
+    value: Float[Array, ""],
+    limit: Float[Array, ""],
+    slack: Float[Array, ""],
+    s: Float[Array, ""] | None = None,
+) -> Measured:
+    s = jnp.full_like(value, jnp.nan) if s is None else s
+    value, limit, slack, s = (x.astype(value.dtype).reshape(1) for x in (value, limit, slack, s))
+    return Measured(name, unit, is_least, value, limit, slack, s)
+
+
+def _size(name: str, unit: str, vector: Float[Array, "3"], limit: Float[Array, ""], s: Float[Array, ""]) -> Measured:
+    squared = dot(vector, vector)
+    slack = 1 - squared / limit**2
+    return _single(name, unit, False, root(squared), limit, slack, s)
+
+
+def _largest(
+    name: str, unit: str, values: Float[Array, "k"], limit: Float[Array, ""], s: Float[Array, "k"], windows: int
+) -> Measured:
+    at = _least_in(windows, -jax.lax.stop_gradient(jnp.abs(values)))
+    chosen = values[at]
+    limits = jnp.broadcast_to(limit.astype(chosen.dtype), chosen.shape)
+    return Measured(name, unit, False, jnp.abs(chosen), limits, 1 - (chosen / limits) ** 2, s[at])
+
+
+class _Curvature(NamedTuple):
+    s: Float[Array, "k"]
+    value: Float[Array, "k"]
+
+
+def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
+    s, curvature = _curvature(equilibrium)
+    radius = radius_at(equilibrium.scene.rod, s)
+    limit = 2 * multiple.astype(radius.dtype) * radius
+    slack = 1 - curvature * (limit + radius)
+    at = _least_in(windows, jax.lax.stop_gradient(slack))
+    curvature, radius = curvature[at], radius[at]
+    # What is left of its curvature is rounding, or what the solver left.
+    is_straight = curvature * equilibrium.scene.rod.length <= float(jnp.finfo(curvature.dtype).eps) ** 0.5
+    inside = jnp.where(is_straight, jnp.inf, 1 / jnp.where(is_straight, 1.0, curvature) - radius)
+    return Measured("bend radius", "m", True, inside, limit[at], slack[at], s[at])
+
+
+def _curvature(equilibrium: Equilibrium) -> _Curvature:
+    """At places one after another, as close as limits are looked at."""
+    if not isinstance(equilibrium.state.shape, Curve):
+        return _Curvature(equilibrium.s, equilibrium.curvature)
+    # It jumps at a clip that holds a direction, and so is looked at on both sides of the nodes.
+    inset = float(jnp.finfo(equilibrium.s.dtype).eps) ** 0.5
+    fractions = np.array([inset, *(np.arange(1, POINTS + 1) / (POINTS + 1)), 1 - inset])
+    s = places(equilibrium, fractions)[:-1]
+
+    def slope(s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+        return jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))[1]
+
+    first, second = jax.jvp(slope, (s,), (jnp.ones_like(s),))
+    across = jnp.cross(first, second)
+    squared = jnp.sum(first**2, axis=1)
+    return _Curvature(s, root(jnp.sum(across**2, axis=1)) / squared**1.5)
+
+
+def _clearances(
+    equilibrium: Equilibrium, limit: Float[Array, "..."], obstacles: tuple[Obstacle, ...], windows: int
+) -> list[Measured]:
+    s = places(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
+    positions = equilibrium.position_at(s)
+    radius = radius_at(equilibrium.scene.rod, s)
+    limits = jnp.broadcast_to(limit.astype(radius.dtype), (len(obstacles),))
+
+    def to(number: int, obstacle: Obstacle) -> Measured:
+        fixed, *where = jax.lax.stop_gradient((obstacle, positions, radius))
+        at = _least_in(windows, fixed.distance(where[0]) - where[1])
+        distance = jax.vmap(obstacle.at)(positions[at]) - radius[at]
+        least = jnp.broadcast_to(limits[number], distance.shape)
+        slack = (distance - least) / (2 * radius[at])
+        return Measured(f"clearance to obstacle {number}", "m", True, distance, least, slack, s[at], number)
+
+    return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
+
+
+def _least_in(windows: int, values: Float[Array, "k"]) -> Int[Array, "w"]:
+    """Where the values are least in each of so many equal parts of them."""
+    count = -(-len(values) // windows)
+    numbers = jnp.minimum(jnp.arange(windows * count), len(values) - 1).reshape(windows, count)
+    return numbers[jnp.arange(windows), jnp.argmin(values[numbers], axis=1)]

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
 
 __version__ = "0.1.0"
 
@@ -67,6 +68,7 @@ __all__ = [
     "DistributedForce",
     "EndForce",
     "EndMoment",
+    "Envelope",
     "Equilibrium",
     "Experiment",
     "Fit",
@@ -96,6 +98,7 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Tolerance",
     "Union",
     "Unknown",
     "clearance",
@@ -124,6 +127,7 @@ __all__ = [
     "solve_path",
     "squared_frequencies",
     "switch_branch",
+    "tolerances",
     "write_scene",
 ]
 
@@ -152,6 +156,9 @@ _LATER = {
     ),
     "Limits": "routing.limits",
     "Margins": "routing.margins",
+    "Envelope": "routing.tolerances",
+    "Tolerance": "routing.tolerances",
+    "tolerances": "routing.tolerances",
     "margins": "routing.margins",
 }
 

@@ -173,17 +173,23 @@ def by_samples(
 
 def by_few(scattering: Scattering, slopes: Slopes) -> tuple[Moments, Moments, int]:
     """By the three-point rule along each of the p normal numbers, as if each acted alone; of the values also along the
-    direction in which each grows most; and how many of the rods are not at rest.
+    direction in which each grows most; and how many of the rods are not at rest, in whose stead is the first order.
     """
     p, m = len(scattering.root), len(slopes.here.values)
     steepest = np.nan_to_num(slopes.by.values.T, posinf=0.0, neginf=0.0)
     sizes = np.linalg.norm(steepest, axis=1, keepdims=True)
     ways = np.concatenate([np.eye(p), steepest / np.where(sizes > 0, sizes, 1.0)])
-    chunks = list(scattering.solved(np.concatenate([STEP * ways, -STEP * ways])))
-    missing = sum(int(np.sum(~converged)) for _, converged in chunks)
+    signed = np.concatenate([STEP * ways, -STEP * ways])
+    chunks = list(scattering.solved(signed))
+    converged = np.concatenate([converged for _, converged in chunks])
     rods = Quantities(*(np.concatenate(x) for x in zip(*(found for found, _ in chunks), strict=True)))
-    pairs = zip(rods, slopes.here, strict=True)
-    changes = Quantities(*((x - x0[None]).reshape(2, p + m, *x0.shape) for x, x0 in pairs))
+    # Without rods at rest on both sides nothing is known beyond the first order.
+    is_known = np.all(converged.reshape(2, -1), axis=0)
+    changes = []
+    for x, x0, by in zip(rods, slopes.here, slopes.by, strict=True):
+        change = (x - x0[None]).reshape(2, p + m, *x0.shape)
+        linear = np.tensordot(signed, by, 1).reshape(change.shape)
+        changes.append(np.where(is_known.reshape(1, -1, *[1] * x0.ndim), change, linear))
     slope = Quantities(*((x[0] - x[1]) / (2 * STEP) for x in changes))
     bend = Quantities(*((x[0] + x[1]) / STEP**2 for x in changes))
 
@@ -196,4 +202,4 @@ def by_few(scattering: Scattering, slopes: Slopes) -> tuple[Moments, Moments, in
     own = range(m), range(p, p + m)
     steep_slope, steep_bend = (of.values[own[1], own[0]] for of in (slope, bend))
     steep = each._replace(shift=each.shift._replace(values=steep_bend / 2), values=steep_slope**2 + steep_bend**2 / 2)
-    return each, steep, missing
+    return each, steep, int(np.sum(~converged))

@@ -95,7 +95,8 @@ class Scatter:
 
     @staticmethod
     def of(moments: Moments, probability: Float[np.ndarray, "m"], any_broken: float) -> "Scatter":
-        start, end = (np.sqrt(np.diag(covariance)) for covariance in moments.forces)
+        # Of what does not scatter, roundings may be left of either sign.
+        start, end = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) for covariance in moments.forces)
         return Scatter(np.sqrt(moments.values), probability, any_broken, _largest(moments.nodes), start, end)
 
 
@@ -323,7 +324,7 @@ def _flags_of_rod(stiffness: float, deviation: float, unsolved: int, first: Mome
     elif stiffness - NEAR * deviation <= 0:
         told.append(f"near instability: the softest motion has a stiffness of {stiffness:.3g} +- {deviation:.2g} N")
     if unsolved:
-        told.append(f"{unsolved} rods with other numbers did not come to rest and are left out")
+        told.append(f"{unsolved} of the rods with other numbers did not come to rest and are left out")
     return {"rod": "; ".join(told)} if told else {}
 
 

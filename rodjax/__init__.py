@@ -47,11 +47,15 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
+    from rodjax.routing.objective import Objective
+    from rodjax.routing.route import Route, route
     from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
+    from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Between",
     "Box",
     "Branch",
     "BranchEnd",
@@ -85,12 +89,17 @@ __all__ = [
     "NonlinearCG",
     "NotConvergedWarning",
     "NotIdentifiableError",
+    "Objective",
     "Obstacle",
+    "OnLine",
+    "OnPatch",
+    "OnSurface",
     "Pin",
     "Plane",
     "PointForce",
     "Reading",
     "Rod",
+    "Route",
     "Scene",
     "SceneFileError",
     "Smooth",
@@ -99,6 +108,7 @@ __all__ = [
     "Steps",
     "Swivel",
     "Tolerance",
+    "Turned",
     "Union",
     "Unknown",
     "clearance",
@@ -119,6 +129,7 @@ __all__ = [
     "problems",
     "read_scene",
     "rotate",
+    "route",
     "save",
     "sensitivities",
     "solve",
@@ -160,6 +171,10 @@ _LATER = {
     "Tolerance": "routing.tolerances",
     "tolerances": "routing.tolerances",
     "margins": "routing.margins",
+    "Objective": "routing.objective",
+    "Route": "routing.route",
+    "route": "routing.route",
+    **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 
 

@@ -157,6 +157,11 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
     return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
 
 
+def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
+    """The first `count` of stacked scenes, each from its guess, without derivatives; of the others nothing of use."""
+    return _solve_many(scenes, guesses, np.array([count]), options, None)
+
+
 @functools.partial(compiled, static_argnames=("options", "mesh"))
 def _solve_many(
     scenes: Scene,

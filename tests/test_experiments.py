@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import json
 import sys
 from pathlib import Path
 
@@ -385,3 +386,16 @@ def test_contact_free_force(tmp_path, capsys):
     assert error < 0.05
     assert float(both.stiffness_by_truth) == pytest.approx(1, abs=4 * error)
     assert "best first" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_engine_bay(tmp_path):
+    route = script("engine_bay").main(["--starts", "4", "--out", str(tmp_path)])
+    assert route.feasible
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert min(report["margins"].values()) >= 0
+    assert set(report["margins"]) == set(route.margins.names)
+    # Of 64 starts the best came to 1.2565, by longer searches.
+    assert route.objective < 1.35
+    with open(tmp_path / "starts.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 4

@@ -1,6 +1,6 @@
 """By how much a rod at rest keeps to limits: of each limit the value that decides, where it is, and its margin."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from rodjax.checks import instance, sequence
 from rodjax.clearance import POINTS, places, radius_at
 from rodjax.discretization.hermite import Curve
 from rodjax.modes import lowest_mode
-from rodjax.obstacles import Obstacle, checked_obstacles
+from rodjax.obstacles import Obstacle, checked_obstacles, least
 from rodjax.result import Equilibrium, over_leading_axes
 from rodjax.routing.limits import Limits
 from rodjax.vectors import dot, root
@@ -83,7 +83,8 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     - `obstacles`: a list of `Obstacle`, from which `limits.clearance` is kept.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
 
-    Each is that of the worst place. Clearance is looked for as by `rodjax.clearance`; curvature at the nodes, on both
+    Each is that of the worst place. Clearance is looked for at the nodes and four places between two of them, and where
+    a parabola through the worst of these and those beside it is lowest; curvature at the nodes, on both
     sides of them and between them where the mesh is of elements whose tangents are the unknowns, else at the nodes;
     twist and strain at the nodes, the strain at a clip the mean of both sides.
 
@@ -221,63 +222,97 @@ def _largest(
     return Measured(name, unit, False, jnp.abs(chosen), limits, 1 - (chosen / limits) ** 2, s[at])
 
 
-class _Curvature(NamedTuple):
-    s: Float[Array, "k"]
-    value: Float[Array, "k"]
-
-
 def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
-    s, curvature = _curvature(equilibrium)
+    is_of_elements = isinstance(equilibrium.state.shape, Curve)
+    s = _both_sides(equilibrium) if is_of_elements else equilibrium.s
     radius = radius_at(equilibrium.scene.rod, s)
     limit = 2 * multiple.astype(radius.dtype) * radius
-    slack = 1 - curvature * (limit + radius)
-    at = _least_in(windows, jax.lax.stop_gradient(slack))
-    curvature, radius = curvature[at], radius[at]
+
+    def curvature_at(equilibrium: Equilibrium, at: Int[Array, "w"]) -> Float[Array, "w"]:
+        return _curvature(equilibrium, s[at]) if is_of_elements else equilibrium.curvature[at]
+
+    # The search needs no derivatives.
+    curvature = curvature_at(jax.lax.stop_gradient(equilibrium), jnp.arange(len(s)))
+    at = _least_in(windows, jax.lax.stop_gradient(1 - curvature * (limit + radius)))
+    curvature, radius, limit = curvature_at(equilibrium, at), radius[at], limit[at]
     # What is left of its curvature is rounding, or what the solver left.
     is_straight = curvature * equilibrium.scene.rod.length <= float(jnp.finfo(curvature.dtype).eps) ** 0.5
     inside = jnp.where(is_straight, jnp.inf, 1 / jnp.where(is_straight, 1.0, curvature) - radius)
-    return Measured("bend radius", "m", True, inside, limit[at], slack[at], s[at])
+    slack = 1 - curvature * (limit + radius)
+    return Measured("bend radius", "m", True, inside, limit, slack, s[at])
 
 
-def _curvature(equilibrium: Equilibrium) -> _Curvature:
-    """At places one after another, as close as limits are looked at."""
-    if not isinstance(equilibrium.state.shape, Curve):
-        return _Curvature(equilibrium.s, equilibrium.curvature)
-    # It jumps at a clip that holds a direction, and so is looked at on both sides of the nodes.
+def _both_sides(equilibrium: Equilibrium) -> Float[Array, "k"]:
+    """Places of elements, just beside the nodes too: at a clip that holds a direction the curvature jumps."""
     inset = float(jnp.finfo(equilibrium.s.dtype).eps) ** 0.5
     fractions = np.array([inset, *(np.arange(1, POINTS + 1) / (POINTS + 1)), 1 - inset])
-    s = places(equilibrium, fractions)[:-1]
+    return places(equilibrium, fractions)[:-1]
 
+
+def _curvature(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k"]:
     def slope(s: Float[Array, "k"]) -> Float[Array, "k 3"]:
         return jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))[1]
 
     first, second = jax.jvp(slope, (s,), (jnp.ones_like(s),))
     across = jnp.cross(first, second)
     squared = jnp.sum(first**2, axis=1)
-    return _Curvature(s, root(jnp.sum(across**2, axis=1)) / squared**1.5)
+    return root(jnp.sum(across**2, axis=1)) / squared**1.5
 
 
 def _clearances(
     equilibrium: Equilibrium, limit: Float[Array, "..."], obstacles: tuple[Obstacle, ...], windows: int
 ) -> list[Measured]:
     s = places(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
-    positions = equilibrium.position_at(s)
     radius = radius_at(equilibrium.scene.rod, s)
     limits = jnp.broadcast_to(limit.astype(radius.dtype), (len(obstacles),))
+    # The search needs no derivatives.
+    fixed, fixed_s, fixed_radius, bodies = jax.lax.stop_gradient((equilibrium, s, radius, obstacles))
+    positions = fixed.position_at(fixed_s)
+    distances = [body.distance(positions) - fixed_radius for body in bodies]
+    at = jnp.stack([_least_in(windows, distance) for distance in distances])
+    beside, shifts = zip(
+        *(_shift(fixed_s, distance, of_one, windows) for distance, of_one in zip(distances, at, strict=True)),
+        strict=True,
+    )
+    before, beyond = jnp.stack(beside, axis=1)
+    # The worst of the places looked at, and the lowest place of the parabola through it and those beside it.
+    chosen = jnp.stack([s[at], s[at] + jnp.stack(shifts) * (s[beyond] - s[before])], axis=-1)
+    points = equilibrium.position_at(chosen.reshape(-1)).reshape(*chosen.shape, 3)
 
     def to(number: int, obstacle: Obstacle) -> Measured:
-        fixed, *where = jax.lax.stop_gradient((obstacle, positions, radius))
-        at = _least_in(windows, fixed.distance(where[0]) - where[1])
-        distance = jax.vmap(obstacle.at)(positions[at]) - radius[at]
-        least = jnp.broadcast_to(limits[number], distance.shape)
-        slack = (distance - least) / (2 * radius[at])
-        return Measured(f"clearance to obstacle {number}", "m", True, distance, least, slack, s[at], number)
+        both = jax.vmap(jax.vmap(obstacle.at))(points[number]) - radius[at[number]][:, None]
+        distance = least(both[:, 0], both[:, 1])
+        place = jnp.where(both[:, 1] < both[:, 0], chosen[number, :, 1], chosen[number, :, 0])
+        limit = jnp.broadcast_to(limits[number], distance.shape)
+        slack = (distance - limit) / (2 * radius[at[number]])
+        return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, place, number)
 
     return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
 
 
+def _shift(
+    s: Float[Array, "k"], values: Float[Array, "k"], at: Int[Array, "w"], windows: int
+) -> tuple[Int[Array, "2 w"], Float[Array, "w"]]:
+    """The places before and beyond a least value, and the shift from it to the lowest place of the parabola through the
+    three, as a part of the way from the one to the other; none where the least value is at an end of its part.
+    """
+    parts = _parts(windows, len(values))
+    before, beyond = jnp.maximum(at - 1, parts[:, 0]), jnp.minimum(at + 1, parts[:, -1])
+    a, b = s[at] - s[before], s[beyond] - s[at]
+    rise, fall = values[before] - values[at], values[beyond] - values[at]
+    bend = a * fall + b * rise
+    is_between = (a > 0) & (b > 0) & (bend > 0)
+    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(is_between, bend, 1.0) * jnp.where(a + b > 0, a + b, 1.0))
+    return jnp.stack([before, beyond]), jnp.where(is_between, shift, 0.0)
+
+
+def _parts(windows: int, count: int) -> Int[Array, "w p"]:
+    """The numbers of so many places in equal parts, the last of them again where they do not suffice."""
+    size = -(-count // windows)
+    return jnp.minimum(jnp.arange(windows * size), count - 1).reshape(windows, size)
+
+
 def _least_in(windows: int, values: Float[Array, "k"]) -> Int[Array, "w"]:
     """Where the values are least in each of so many equal parts of them."""
-    count = -(-len(values) // windows)
-    numbers = jnp.minimum(jnp.arange(windows * count), len(values) - 1).reshape(windows, count)
-    return numbers[jnp.arange(windows), jnp.argmin(values[numbers], axis=1)]
+    parts = _parts(windows, len(values))
+    return parts[jnp.arange(windows), jnp.argmin(values[parts], axis=1)]

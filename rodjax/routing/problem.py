@@ -1,0 +1,202 @@
+"""A route as numbers: from design variables in 0 to 1 to what is least, what must not be negative, and their rates."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.compilation import compiled
+from rodjax.equilibrium import Solver
+from rodjax.implicit import differentiable
+from rodjax.obstacles import Obstacle
+from rodjax.result import Equilibrium
+from rodjax.routing.limits import Limits
+from rodjax.routing.margins import Measured, measured
+from rodjax.routing.objective import Objective
+from rodjax.routing.variables import Variable, leaf_names, with_numbers
+from rodjax.scene import Scene
+from rodjax.vectors import dot, root
+
+# Constraints along the rod are those of its worst place in each of so many equal parts.
+WINDOWS = 8
+
+
+class Problem(eqx.Module):
+    """What `route` was asked for."""
+
+    scene: Scene
+    variables: tuple[Variable, ...]
+    limits: Limits | None
+    obstacles: tuple[Obstacle, ...]
+    objective: Objective
+    segments: int = eqx.field(static=True)
+    solver: Solver = eqx.field(static=True)
+
+    def scene_at(self, u: Float[Array, "n"]) -> Scene:
+        return with_numbers(self.scene, self.variables, u)
+
+
+class Evaluation(eqx.Module):
+    """A design, or several along a leading axis. Rates are by the variables in 0 to 1.
+
+    - `objective`; `slacks` (m,): not negative where all limits are kept, the first of them `spare`, of `spans`
+    - `kept`: what the limits are compared with, at the worst place of each
+    - `rates` (1 + m + k, n): of the objective, the slacks and the margins of `kept`.
+    """
+
+    design: Float[Array, "... n"]
+    objective: Float[Array, "..."]
+    slacks: Float[Array, "... m"]
+    spare: Float[Array, "... spans"]
+    kept: list[Measured]
+    rates: Float[Array, "... r n"]
+    result: Equilibrium
+    is_valid: Bool[Array, "..."]
+
+
+def spans(scene: Scene, names: set[str]) -> Float[Array, "spans"]:
+    """By how much the rod between held places is longer than the straight way, as parts of the rod's length.
+
+    Of a rod that may become shorter or move, else nothing: a rod that is given is as it is. Sliding clips hold no place
+    of the rod.
+    """
+    length = scene.rod.length
+    supports = [(jnp.zeros_like(length), scene.start, False)]
+    supports += [(clip.at, clip, clip.sliding) for clip in scene.clips]
+    supports += [(length, scene.end, False)]
+    if not any(name == "rod.length" or name.endswith((".at", ".position")) for name in names):
+        return jnp.zeros(0, length.dtype)
+    found = []
+    before = None
+    for s, support, is_sliding in supports:
+        if not isinstance(support, Held | Clip):
+            continue
+        if before is not None:
+            gap = support.position - before[1]
+            way = before[2] + root(dot(gap, gap))
+            if is_sliding:
+                before = before[0], support.position, way
+                continue
+            found.append((s - before[0] - way) / length)
+        before = s, support.position, jnp.zeros_like(length)
+    return jnp.stack(found) if found else jnp.zeros(0, length.dtype)
+
+
+def is_ordered(scene: Scene) -> Bool[Array, ""]:
+    """Whether clips follow one another along the rod, each further on by a hundredth of a part of it."""
+    length = scene.rod.length
+    s = jnp.stack([jnp.zeros_like(length), *(clip.at for clip in scene.clips), length])
+    return jnp.all(jnp.diff(s) > 0.01 * length / len(s))
+
+
+@compiled
+def spare_lengths(problem: Problem, designs: Float[Array, "k n"]) -> Float[Array, "k"]:
+    """The least of the spans of each design, minus infinity where clips do not follow one another."""
+    names = leaf_names(problem.scene, problem.variables)
+
+    def one(u: Float[Array, "n"]) -> Float[Array, ""]:
+        scene = problem.scene_at(u)
+        least = jnp.min(spans(scene, names), initial=jnp.inf)
+        return jnp.where(is_ordered(scene), least, -jnp.inf)
+
+    return jax.vmap(one)(designs)
+
+
+@compiled
+def scenes_of(problem: Problem, designs: Float[Array, "k n"]) -> Scene:
+    return jax.vmap(problem.scene_at)(designs)
+
+
+def _kept(problem: Problem, result: Equilibrium) -> list[Measured]:
+    if problem.limits is None:
+        return []
+    return measured(result, problem.limits, problem.obstacles, WINDOWS)
+
+
+def _values(
+    problem: Problem, scene: Scene, result: Equilibrium
+) -> tuple[Float[Array, ""], Float[Array, "m"], Float[Array, "spans"], list[Measured]]:
+    """The objective, the slacks, which of them are of spans, and what they are of."""
+    spare = spans(scene, leaf_names(problem.scene, problem.variables))
+    kept = _kept(problem, result)
+    return problem.objective.of(result), jnp.concatenate([spare, *(each.slack for each in kept)]), spare, kept
+
+
+def _evaluated(problem: Problem, design: Float[Array, "n"], result: Equilibrium) -> Evaluation:
+    def outputs(u: Float[Array, "n"]) -> tuple[Float[Array, "r"], Any]:
+        scene = problem.scene_at(u)
+        objective, slacks, spare, kept = _values(problem, scene, differentiable(scene, result))
+        worst = [jnp.argmin(jax.lax.stop_gradient(each.margin)) for each in kept]
+        kept = [jax.tree.map(lambda x, k=k: x[k][None], each) for each, k in zip(kept, worst, strict=True)]
+        margins = [each.margin for each in kept]
+        return jnp.concatenate([objective[None], slacks, *margins]), (objective, slacks, spare, kept)
+
+    rates, (objective, slacks, spare, kept) = jax.jacfwd(outputs, has_aux=True)(design)
+    numbers = jnp.concatenate([objective[None], slacks])
+    is_valid = result.converged & is_ordered(problem.scene_at(design))
+    is_valid &= jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.isfinite(rates[: len(numbers)]))
+    return Evaluation(design, objective, slacks, spare, kept, rates, result, is_valid)
+
+
+@compiled
+def arranged(
+    problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium, order: Int[Array, "k"]
+) -> tuple[Float[Array, "k n"], Scene, Equilibrium]:
+    """Designs and guesses in this order, and the scenes; where clips do not follow one another, that of the guess."""
+
+    def scene(design: Float[Array, "n"], guess: Equilibrium) -> Scene:
+        scene = problem.scene_at(design)
+        is_possible = is_ordered(scene)
+        return jax.tree.map(lambda a, b: jnp.where(is_possible, a, b), scene, guess.scene)
+
+    designs, guesses = jax.tree.map(lambda leaf: leaf[order], (designs, guesses))
+    return designs, jax.vmap(scene)(designs, guesses), guesses
+
+
+@compiled
+def evaluated(
+    problem: Problem,
+    designs: Float[Array, "k n"],
+    results: Equilibrium,
+    last: Evaluation,
+    order: Int[Array, "k"],
+    count: Int[Array, ""],
+) -> Evaluation:
+    """What the first `count` of the designs give with their equilibria, put where `order` says, into the last."""
+
+    def one(k: Int[Array, ""], found: Evaluation) -> Evaluation:
+        design, result = jax.tree.map(lambda leaf: leaf[k], (designs, results))
+        new = _evaluated(problem, design, result)
+        return jax.tree.map(lambda all, one: all.at[order[k]].set(one), found, new)
+
+    return jax.lax.fori_loop(0, count, one, last)
+
+
+@compiled
+def valued(
+    problem: Problem, designs: Float[Array, "k n"], results: Equilibrium
+) -> tuple[Float[Array, "k"], Float[Array, "k m"], Bool[Array, "k"]]:
+    """The same without rates: objectives, slacks, and whether designs have an equilibrium."""
+
+    def one(design: Float[Array, "n"], result: Equilibrium):
+        scene = problem.scene_at(design)
+        objective, slacks, _, _ = _values(problem, scene, result)
+        is_valid = result.converged & is_ordered(scene) & jnp.all(jnp.isfinite(slacks)) & jnp.isfinite(objective)
+        return objective, slacks, is_valid
+
+    return jax.lax.map(lambda entry: one(*entry), (designs, results))
+
+
+def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium) -> Evaluation:
+    """What comes before the first evaluation."""
+    found = jax.eval_shape(jax.vmap(functools.partial(_evaluated, problem)), designs, guesses)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), found)
+
+
+@compiled
+def chosen(which: Bool[Array, "k"], new: Any, old: Any) -> Any:
+    """Of two stacks, entry by entry."""
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -1,0 +1,166 @@
+"""The search for the best route from one start: scipy's SLSQP, and what brings it back to where limits are kept."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+# What a design that has no equilibrium costs beyond the last, in scales of the objective: SLSQP steps back from it.
+PENALTY = 1e3
+# Slacks are by their logarithm where they are violated so much.
+MOST_VIOLATION = 1e3
+
+
+class Asked(NamedTuple):
+    """A design to evaluate; whether the search stands at the one evaluated before it, the guess for what follows."""
+
+    design: Float[np.ndarray, "n"]
+    is_accepted: bool
+
+
+class Numbers(NamedTuple):
+    """What an evaluation gives a search; `is_valid`: an equilibrium with numbers and rates."""
+
+    objective: float
+    slacks: Float[np.ndarray, "m"]
+    rates: Float[np.ndarray, "1+m n"]
+    is_valid: bool
+
+
+class Settings(NamedTuple):
+    """`scale` of the objective; `reserve`: what is asked of the slacks; `tolerance` and most iterations of SLSQP."""
+
+    scale: float
+    reserve: float
+    tolerance: float
+    iterations: int
+
+
+class Outcome(NamedTuple):
+    """How a search went; where it came is with the evaluations."""
+
+    iterations: int
+    message: str
+
+
+class _KeptError(Exception):
+    """All limits are kept."""
+
+
+class Search:
+    """One search, from a design that has been evaluated; `ask` gives the `Numbers` of what is `Asked`."""
+
+    def __init__(
+        self, start: Float[np.ndarray, "n"], first: Numbers, settings: Settings, ask: Callable[[Asked], Numbers]
+    ):
+        self._settings, self._ask = settings, ask
+        self._at, self._is_usable = start, first.is_valid
+        self._last = self._standing = start.tobytes(), _tempered(first)
+        self._is_accepted = True
+        self._iterations = 0
+
+    def run(self) -> Outcome:
+        """SLSQP; where it ends outside of the limits, the least violation and SLSQP from there."""
+        if not self._is_usable:
+            return Outcome(0, "No equilibrium, or none with derivatives, at the start")
+        message = self._optimize()
+        if not self._keeps():
+            self._restore()
+            message = self._optimize()
+        elif message != SUCCESS:
+            message = self._optimize()
+        return Outcome(self._iterations, message)
+
+    def _keeps(self) -> bool:
+        # SLSQP keeps constraints to its tolerance only.
+        slacks = self._numbers(self._at).slacks
+        return not len(slacks) or float(np.min(slacks)) >= 0.9 * self._settings.reserve
+
+    # --- evaluations, each once ---
+
+    def _numbers(self, design: Float[np.ndarray, "n"]) -> Numbers:
+        design = np.clip(design, 0.0, 1.0)
+        key = design.tobytes()
+        for known, numbers in (self._last, self._standing):
+            if known == key:
+                return numbers
+        found = self._ask(Asked(design.copy(), self._is_accepted))
+        self._is_accepted = False
+        if found.is_valid:
+            found = _tempered(found)
+        else:
+            standing = self._standing[1]
+            found = standing._replace(objective=standing.objective + PENALTY * self._settings.scale, is_valid=False)
+        self._last = key, found
+        return found
+
+    def _stand(self, design: Float[np.ndarray, "n"]) -> Numbers:
+        """Evaluated, and from now on what the search comes back to."""
+        found = self._numbers(design)
+        if found.is_valid:
+            self._at = np.clip(design, 0.0, 1.0)
+            self._standing = self._at.tobytes(), found
+            self._is_accepted |= self._last[0] == self._standing[0]
+        return found
+
+    # --- the two problems ---
+
+    def _optimize(self) -> str:
+        scale, reserve = self._settings.scale, self._settings.reserve
+        constraint = {
+            "type": "ineq",
+            "fun": lambda x: self._numbers(x).slacks - reserve,
+            "jac": lambda x: self._stand(x).rates[1:],
+        }
+        found = minimize(
+            lambda x: self._numbers(x).objective / scale,
+            self._at,
+            jac=lambda x: self._stand(x).rates[0] / scale,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * len(self._at),
+            constraints=[constraint] if len(self._numbers(self._at).slacks) else [],
+            options={"ftol": self._settings.tolerance, "maxiter": self._settings.iterations},
+        )
+        self._iterations += int(found.nit)
+        return str(found.message)
+
+    def _restore(self) -> None:
+        """Makes the largest violation least, until there is none."""
+        n, reserve = len(self._at), self._settings.reserve
+
+        def constraint(x: Float[np.ndarray, "n+1"]) -> Float[np.ndarray, "m"]:
+            return self._numbers(x[:n]).slacks - reserve + x[n]
+
+        def rates(x: Float[np.ndarray, "n+1"]) -> Float[np.ndarray, "m n+1"]:
+            found = self._stand(x[:n])
+            if found.is_valid and np.min(found.slacks) >= reserve:
+                raise _KeptError
+            return np.append(found.rates[1:], np.ones((len(found.slacks), 1)), axis=1)
+
+        first = max(reserve - float(np.min(self._numbers(self._at).slacks)), 0.0)
+        try:
+            found = minimize(
+                lambda x: x[n] + PENALTY * (not self._numbers(x[:n]).is_valid),
+                np.append(self._at, first),
+                jac=lambda x: np.append(np.zeros(n), 1.0),
+                method="SLSQP",
+                bounds=[(0.0, 1.0)] * n + [(0.0, MOST_VIOLATION)],
+                constraints=[{"type": "ineq", "fun": constraint, "jac": rates}],
+                options={"ftol": self._settings.tolerance, "maxiter": self._settings.iterations},
+            )
+            self._iterations += int(found.nit)
+        except _KeptError:
+            return
+
+
+SUCCESS = "Optimization terminated successfully"
+
+
+def _tempered(numbers: Numbers) -> Numbers:
+    """With slacks below -1 by their logarithm, smoothly: a rod pulled taut violates limits of force by millions."""
+    slacks = numbers.slacks
+    size = np.maximum(-slacks, 1.0)
+    rates = numbers.rates / np.append(1.0, size)[:, None]
+    return numbers._replace(slacks=np.where(slacks < -1, -1 - np.log(size), slacks), rates=rates)

@@ -1,0 +1,203 @@
+"""route(): an optimum in closed form, rates beside differences, obstacles, bits, and words for what cannot be kept."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax.routing.rounds import Rounds
+from rodjax.routing.route import _Fleet, _problem
+from rodjax.routing.search import Asked
+from rodjax.routing.variables import with_numbers
+
+RADIUS = 0.005
+AWAY = rj.Sphere((0.0, 1.0, 0.0), 0.05)
+TIGHT = rj.Newton(tolerance=1e-12)
+VARIABLES = [
+    rj.Between("end.position.0", 0.05, 0.25),
+    rj.Between("end.position.2", 0.05, 0.25),
+    rj.Between("rod.length", 0.1, 0.45),
+]
+
+
+def corner() -> rj.Scene:
+    """A cable that turns by a right angle, from x to z."""
+    rod = rj.Rod(0.3, 0.02, 0.015, 2e4, 0.15, RADIUS)
+    return rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Clamp((0.2, 0, 0.2), rj.frame((0, 0, 1))))
+
+
+def routed(bend_radius=9.0, obstacle=AWAY, seed=0) -> rj.Route:
+    limits = rj.Limits(bend_radius=bend_radius, clearance=0.01)
+    options = dict(limits=limits, obstacles=[obstacle], names=["the ball"], starts=4, segments=16, solver=TIGHT)
+    return rj.route(corner(), VARIABLES, seed=seed, **options)
+
+
+@pytest.fixture(scope="module")
+def shortest() -> rj.Route:
+    return routed()
+
+
+def test_the_shortest_turn_is_an_arc(shortest):
+    """Of all curves of a least radius of curvature that turn by a right angle, the shortest is the arc."""
+    radius = 9 * 2 * RADIUS + RADIUS
+    # A thousandth of the limit is kept in reserve; elements, 16 of them: 1e-5.
+    radius /= 1 - 1e-3
+    assert shortest.feasible
+    assert shortest.objective == pytest.approx(np.pi / 2 * radius, rel=1e-4)
+    # Where the end is, the length depends on by the square.
+    np.testing.assert_allclose(shortest.numbers[:2], radius, rtol=3e-3)
+    assert shortest.names == ("end.position.0", "end.position.2", "rod.length")
+    assert shortest.units == ("m", "m", "m")
+    assert shortest.values["rod.length"] == pytest.approx(shortest.objective, rel=1e-12)
+    assert shortest.margins.names == ("bend radius", "clearance to the ball")
+    assert 0 <= float(shortest.margins.margin[0]) < 3e-3
+    assert shortest.verified.s.shape == (33,)
+    np.testing.assert_array_equal(shortest.starts.feasible, True)
+    np.testing.assert_allclose(shortest.starts.objective, shortest.objective, rtol=1e-3)
+    # The length is the objective, and of no influence on itself but by one.
+    np.testing.assert_allclose(shortest.gradients["objective"], [0, 0, 1], atol=1e-12)
+    assert shortest.gradients["bend radius"].shape == (3,)
+    assert "keeps to all limits" in str(shortest)
+    assert "4 of 4 starts" in str(shortest)
+
+
+def test_rates_are_those_of_solves():
+    limits = rj.Limits(bend_radius=9.0, clearance=0.01)
+    problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+
+    def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        numbers = fleet.evaluate({1: Asked(design, False)})[1]
+        assert numbers.is_valid
+        return np.append(numbers.objective, numbers.slacks), numbers.rates
+
+    design = np.array([0.6, 0.5, 0.6])
+    _, rates = found(design)
+    h = 1e-5
+    for k, unit in enumerate(np.eye(3)):
+        ahead, behind = found(design + h * unit)[0], found(design - h * unit)[0]
+        # Central differences of solves to 1e-12 EI/L^2.
+        np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+
+
+def test_an_obstacle_in_the_way_is_passed(shortest):
+    """A ball on the arc: the way around it is longer, and clear of it on a finer mesh."""
+    ball = rj.Sphere(np.asarray(shortest.equilibrium.nodes[8]) + np.array([0.0, 0.002, 0.0]), 0.01)
+    around = routed(obstacle=ball)
+    assert around.feasible
+    assert around.objective > 1.01 * shortest.objective
+    finer = rj.solve(around.scene, segments=64, guess=around.equilibrium)
+    # As far as asked, to the samples of `clearance`, 1 mm apart.
+    assert float(rj.clearance(finer, [ball]).distance[0]) >= 0.01 * (1 - 1e-4)
+
+
+def test_the_same_arguments_give_the_same_bits(shortest):
+    again = routed()
+    for a, b in zip(jax.tree.leaves(shortest), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert shortest.starts.message == again.starts.message
+
+
+def test_what_cannot_be_kept_is_said(shortest):
+    """A bend radius of 0.4 m in a space of 0.25 m."""
+    route = routed(bend_radius=40.0)
+    assert not route.feasible
+    assert not np.any(route.starts.feasible)
+    assert np.all(route.starts.violation > 0)
+    assert "No route was found that keeps to all limits: 0 of 4" in str(route)
+    assert "bend radius by" in str(route)
+    assert float(route.margins.margin[0]) < 0
+
+
+def test_an_error_in_one_search_ends_all():
+    def failing(ask):
+        ask(1)
+        raise ZeroDivisionError("in a search")
+
+    def endless(ask):
+        while True:
+            ask(2)
+
+    with pytest.raises(ZeroDivisionError, match="in a search"):
+        Rounds([endless, failing, endless], lambda asked: asked).run()
+
+    def interrupted(asked):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Rounds([endless, endless], interrupted).run()
+
+
+def test_variables():
+    scene = rj.Scene(
+        rj.Rod(1.0, 0.02, 0.015, 2e4),
+        rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))),
+        rj.Swivel((0.8, 0, 0), (1, 0, 0)),
+        clips=[rj.Clip(0.4, (0.3, 0, 0), (1, 0, 0.2)), rj.Clip(0.7, (0.6, 0, 0))],
+    )
+    variables = (
+        rj.OnLine("clips.0.position", (0.2, 0, 0), (0.4, 0, 0.2)),
+        rj.OnSurface("clips.1.position", lambda u, v: jnp.stack([0.5 + 0.2 * u, 0.1 * v, 0.0 * u])),
+        rj.Turned("clips.0.tangent", 0.3),
+        rj.Turned("start.frame", 0.2),
+        rj.Between("clips.0.at", 0.3, 0.5),
+    )
+    count = sum(variable.count for variable in variables)
+    assert count == 9
+    moved = with_numbers(scene, variables, jnp.array([0.25, 0.5, 1.0, 1.0, 1.0, 0.5, 0.5, 1.0, 0.75]))
+    np.testing.assert_allclose(moved.clips[0].position, (0.25, 0, 0.05), atol=1e-15)
+    np.testing.assert_allclose(moved.clips[1].position, (0.6, 0.1, 0), atol=1e-15)
+    assert float(moved.clips[0].at) == pytest.approx(0.45)
+    # A corner of the square is on the rim of the disc: the full angle.
+    cosine = float(moved.clips[0].tangent @ scene.clips[0].tangent)
+    assert np.arccos(cosine) == pytest.approx(0.3, rel=1e-9)
+    # The third number turns about the tangent alone.
+    np.testing.assert_allclose(moved.start.frame[:, 2], (1, 0, 0), atol=1e-15)
+    assert float(moved.start.frame[:, 0] @ scene.start.frame[:, 0]) == pytest.approx(np.cos(0.2), rel=1e-12)
+    starts = [variable.start(np.asarray(value)) for variable, value in zip(variables, _nominal(scene), strict=True)]
+    expected = ([0.25], [0.5, 0], [0.5, 0.5], [0.5] * 3, [0.5])
+    for start, number in zip(starts, expected, strict=True):
+        np.testing.assert_allclose(start, number, atol=1e-12)
+
+
+def _nominal(scene: rj.Scene):
+    first, second = scene.clips
+    return first.position, second.position, first.tangent, scene.start.frame, first.at
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ([], "variables must hold at least one"),
+        ([rj.Between("clips.0.at", 0.1, 0.2)], "'clips.0.at' is no number of this scene; there are rod.length"),
+        ([rj.Between("end.position", 0.1, 0.2)], r"lower and upper of end.position must be numbers of shape \(3,\)"),
+        ([rj.Between("end.frame", 0.1, 0.2)], "end.frame is a direction or frame: rodjax.Turned varies it"),
+        ([rj.Turned("end.position", 0.1)], "end.position is no direction or frame"),
+        ([rj.OnLine("rod.length", (0, 0, 0), (1, 0, 0))], "rod.length is no position"),
+        ([rj.Between("rod.length", 0.1, 0.2)] * 2, r"variables\[1\]: rod.length varies already"),
+        (
+            [rj.Between("end.position.2", 0.1, 0.2), rj.OnLine("end.position", (0, 0, 0), (1, 0, 0))],
+            r"variables\[1\]: end.position varies already",
+        ),
+    ],
+)
+def test_variables_are_checked(variables, message):
+    with pytest.raises(ValueError, match=message):
+        rj.route(corner(), variables)
+
+
+def test_arguments_are_checked():
+    length = [rj.Between("rod.length", 0.2, 0.3)]
+    with pytest.raises(ValueError, match=r"lower must be below upper for rod\.length, got 0\.3 and 0\.2"):
+        rj.Between("rod.length", 0.3, 0.2)
+    with pytest.raises(TypeError, match="scene must be a Scene, got 3"):
+        rj.route(3, length)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="limits must have a clearance where there are obstacles"):
+        rj.route(corner(), length, obstacles=[AWAY])
+    with pytest.raises(ValueError, match="Objective must have at least one weight above 0"):
+        rj.Objective(length=0)
+    with pytest.raises(ValueError, match="starts must be a whole number from 1"):
+        rj.route(corner(), length, starts=0)
+    with pytest.raises(TypeError, match="solver must be a Newton"):
+        rj.route(corner(), length, solver=rj.NonlinearCG())  # pyright: ignore[reportArgumentType]

@@ -13,6 +13,7 @@ import csv
 import json
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,7 +143,9 @@ class Model:
     def cold(self, designs: np.ndarray) -> tuple[list[Values], Equilibrium]:
         """Each from the library's own start."""
         padded = jnp.asarray(np.pad(designs, ((0, self.size - len(designs)), (0, 0)), mode="edge"))
-        results = rj.solve_batch(scenes_of(self.problem, padded), segments=SEGMENTS)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rj.NotConvergedWarning)  # counted as not valid
+            results = rj.solve_batch(scenes_of(self.problem, padded), segments=SEGMENTS)
         return self._values(padded, results, len(designs)), results
 
     def warm(self, design: np.ndarray, guess: Equilibrium) -> tuple[Values, Equilibrium]:

@@ -18,6 +18,7 @@ from rodjax.routing.margins import Measured, measured
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Variable, leaf_names, with_numbers
 from rodjax.scene import Scene
+from rodjax.supports import Clip, Held, Support
 from rodjax.vectors import dot, root
 
 # Constraints along the rod are those of its worst place in each of so many equal parts.
@@ -64,7 +65,7 @@ def spans(scene: Scene, names: set[str]) -> Float[Array, "spans"]:
     of the rod.
     """
     length = scene.rod.length
-    supports = [(jnp.zeros_like(length), scene.start, False)]
+    supports: list[tuple[Float[Array, ""], Support | Clip, bool]] = [(jnp.zeros_like(length), scene.start, False)]
     supports += [(clip.at, clip, clip.sliding) for clip in scene.clips]
     supports += [(length, scene.end, False)]
     if not any(name == "rod.length" or name.endswith((".at", ".position")) for name in names):

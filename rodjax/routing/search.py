@@ -9,6 +9,9 @@ from scipy.optimize import minimize
 
 # What a design that has no equilibrium costs beyond the last, in scales of the objective: SLSQP steps back from it.
 PENALTY = 1e3
+# An attempt may take so many solves for each of the most iterations it is allowed: where it needs more, line searches
+# fail one after another.
+SOLVES_PER_ITERATION = 3
 # Slacks are by their logarithm where they are violated so much.
 MOST_VIOLATION = 1e3
 
@@ -49,6 +52,10 @@ class _KeptError(Exception):
     """All limits are kept."""
 
 
+class _SpentError(Exception):
+    """An attempt has had all its solves."""
+
+
 class Search:
     """One search, from a design that has been evaluated; `ask` gives the `Numbers` of what is `Asked`."""
 
@@ -59,7 +66,7 @@ class Search:
         self._at, self._is_usable = start, first.is_valid
         self._last = self._standing = start.tobytes(), _tempered(first)
         self._is_accepted = True
-        self._iterations = 0
+        self._iterations = self._spent = 0
 
     def run(self) -> Outcome:
         """SLSQP; where it ends outside of the limits, the least violation and SLSQP from there."""
@@ -69,7 +76,7 @@ class Search:
         if not self._keeps():
             self._restore()
             message = self._optimize()
-        elif message != SUCCESS:
+        elif message not in (SUCCESS, *SPENT):
             message = self._optimize()
         return Outcome(self._iterations, message)
 
@@ -86,6 +93,9 @@ class Search:
         for known, numbers in (self._last, self._standing):
             if known == key:
                 return numbers
+        if self._spent >= SOLVES_PER_ITERATION * self._settings.iterations:
+            raise _SpentError
+        self._spent += 1
         found = self._ask(Asked(design.copy(), self._is_accepted))
         self._is_accepted = False
         if found.is_valid:
@@ -114,17 +124,24 @@ class Search:
             "fun": lambda x: self._numbers(x).slacks - reserve,
             "jac": lambda x: self._stand(x).rates[1:],
         }
-        found = minimize(
-            lambda x: self._numbers(x).objective / scale,
-            self._at,
-            jac=lambda x: self._stand(x).rates[0] / scale,
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * len(self._at),
-            constraints=[constraint] if len(self._numbers(self._at).slacks) else [],
-            options={"ftol": self._settings.tolerance, "maxiter": self._settings.iterations},
-        )
-        self._iterations += int(found.nit)
+        self._spent = 0
+        try:
+            found = minimize(
+                lambda x: self._numbers(x).objective / scale,
+                self._at,
+                jac=lambda x: self._stand(x).rates[0] / scale,
+                method="SLSQP",
+                bounds=[(0.0, 1.0)] * len(self._at),
+                constraints=[constraint] if len(self._numbers(self._at).slacks) else [],
+                callback=self._count,
+                options={"ftol": self._settings.tolerance, "maxiter": self._settings.iterations},
+            )
+        except _SpentError:
+            return SPENT[0]
         return str(found.message)
+
+    def _count(self, _: Float[np.ndarray, "n"]) -> None:
+        self._iterations += 1
 
     def _restore(self) -> None:
         """Makes the largest violation least, until there is none."""
@@ -140,22 +157,24 @@ class Search:
             return np.append(found.rates[1:], np.ones((len(found.slacks), 1)), axis=1)
 
         first = max(reserve - float(np.min(self._numbers(self._at).slacks)), 0.0)
+        self._spent = 0
         try:
-            found = minimize(
+            minimize(
                 lambda x: x[n] + PENALTY * (not self._numbers(x[:n]).is_valid),
                 np.append(self._at, first),
                 jac=lambda x: np.append(np.zeros(n), 1.0),
                 method="SLSQP",
                 bounds=[(0.0, 1.0)] * n + [(0.0, MOST_VIOLATION)],
                 constraints=[{"type": "ineq", "fun": constraint, "jac": rates}],
+                callback=self._count,
                 options={"ftol": self._settings.tolerance, "maxiter": self._settings.iterations},
             )
-            self._iterations += int(found.nit)
-        except _KeptError:
+        except (_KeptError, _SpentError):
             return
 
 
 SUCCESS = "Optimization terminated successfully"
+SPENT = ("Limit of solves reached", "Iteration limit reached")
 
 
 def _tempered(numbers: Numbers) -> Numbers:

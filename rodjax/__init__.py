@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from rodjax.routing.objective import Objective
     from rodjax.routing.report import Report, report
     from rodjax.routing.route import Route, route
+    from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
     from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
 
 __version__ = "0.1.0"
@@ -72,6 +73,7 @@ __all__ = [
     "DistributedForce",
     "EndForce",
     "EndMoment",
+    "Envelope",
     "Equilibrium",
     "Experiment",
     "Fit",
@@ -107,6 +109,7 @@ __all__ = [
     "Status",
     "Steps",
     "Swivel",
+    "Tolerance",
     "Turned",
     "Union",
     "Unknown",
@@ -138,6 +141,7 @@ __all__ = [
     "solve_path",
     "squared_frequencies",
     "switch_branch",
+    "tolerances",
     "write_scene",
 ]
 
@@ -166,6 +170,9 @@ _LATER = {
     ),
     "Limits": "routing.limits",
     "Margins": "routing.margins",
+    "Envelope": "routing.tolerances",
+    "Tolerance": "routing.tolerances",
+    "tolerances": "routing.tolerances",
     "margins": "routing.margins",
     "Report": "routing.report",
     "report": "routing.report",

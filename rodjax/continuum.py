@@ -12,6 +12,7 @@ as easy as none, and the total twist (m.t) L/GJ is never reduced. Other rods, an
 
 import functools
 import math
+import operator
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -20,6 +21,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -31,7 +33,7 @@ from rodjax.energy import axial_strain_under, dead_load_energy, density
 from rodjax.equilibrium import MAX_SEGMENTS, solve
 from rodjax.result import Equilibrium, NotConvergedWarning, warn_if_not_converged
 from rodjax.rod import Rod
-from rodjax.scene import Scene, needs_frames, nondimensional
+from rodjax.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_places
 from rodjax.shooting import (
     Reached,
     Section,
@@ -47,7 +49,7 @@ from rodjax.shooting import (
     station_places,
     turn_between,
 )
-from rodjax.supports import Clamp, Pin
+from rodjax.supports import Clamp, Directed, Pin
 from rodjax.units import Units
 from rodjax.vectors import root
 
@@ -88,9 +90,11 @@ def solve_continuum(
     - `segments`: the result is given at `segments` + 1 equally spaced arclengths, or moved so that one lies at each
       point force; `None`: as many as those of the guess, else 50.
 
-    At a point force the tension is that beyond it. `stable` is not examined and False; `residual` is the largest miss
-    of a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest force and moment in the
-    rod. Above 1e-10 the result is marked as not converged, and outside `jit` a `NotConvergedWarning` says so.
+    At a point force or clip tension and curvature are those beyond it. `stable` is not examined and False; `residual`
+    is the largest miss of a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest force
+    and moment in the rod. Above 1e-10 the result is marked as not converged, and outside `jit` a `NotConvergedWarning`
+    says so.
+
     Raises `ValueError` or `TypeError` for arguments that make no sense.
     """
     instance(scene, "scene", Scene)
@@ -107,18 +111,20 @@ def solve_continuum(
         raise ValueError(f"rtol must lie in 1e-14 to 1e-3, got {rtol:g}")
     if intervals is not None:
         intervals = whole_number(intervals, "intervals", 1, MAX_INTERVALS)
+    # A node for each clip.
+    least = len(scene.clips) + 1
     if segments is not None:
-        segments = whole_number(segments, "segments", 1, MAX_SEGMENTS)
+        segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
     if guess is not None:
         instance(guess, "guess", Equilibrium)
         if guess.s.ndim != 1:
             raise ValueError(f"guess must be a single equilibrium, got several of shape {guess.s.shape[:-1]}")
     if segments is None:
-        segments = DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1
+        segments = max(DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1, least)
+    if scene.clips and needs_frames(scene):
+        raise ValueError("clips must be () for a rod or loads that need frames along the rod")
     if scene.obstacles:
         raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
-    if scene.clips:
-        raise ValueError("clips must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)
@@ -135,10 +141,12 @@ def solve_continuum(
 
 
 def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
-    """A guess with the turns that the scene states, and with frames where the scene needs them."""
+    """A guess with the turns and clips that the scene states, and with frames where the scene needs them."""
     has_frames = guess is not None and isinstance(guess.state.shape, FramedCurve)
     if guess is not None and scene.turns is None and (has_frames or not needs_frames(scene)):
-        return guess
+        kinds = ([clip.sliding for clip in of.clips] for of in (scene, guess.scene))
+        if operator.eq(*kinds):
+            return guess
     with warnings.catch_warnings():
         # Whether the continuum converges from there is what the caller is told.
         warnings.simplefilter("ignore", NotConvergedWarning)
@@ -236,19 +244,31 @@ def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEn
 @functools.partial(jax.jit, static_argnames=("rtol", "intervals", "segments"))
 def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     scaled, units = nondimensional(scene)
+    if slides(scene):
+        scaled = slid(scaled, _places(guess))
     start = _start(scaled, guess, units, intervals)
 
     def residual(stations: Stations, args: tuple[Scene, Start]):
         scene, start = args
+        scene, start = start.slid(scene, stations)
         sections = start.sections(stations)
         pieces = _intervals(scene, start, sections)
         return _residual(scene, start, stations, jax.vmap(functools.partial(far_end, rtol))(pieces))
 
-    # An unloaded rod between two pins can turn about the line through them.
+    # An unloaded rod between two pins can turn about the line through them, and one in clips where all lie on one line.
     is_loaded = scene.gravity is not None or scene.point_forces
     turns_freely = isinstance(scene.start, Pin) and isinstance(scene.end, Pin) and not is_loaded
+    if scene.clips:
+        directed = any(isinstance(end, Directed) for end in (scene.start, scene.end))
+        directed |= any(clip.tangent is not None for clip in scene.clips)
+        turns_freely = not is_loaded and not directed
     stations, iterations = met(residual, scaled, start, is_resisted=not turns_freely)
     return _equilibrium(scene, start, stations, iterations, rtol, segments)
+
+
+def _places(guess: Equilibrium) -> Float[Array, "slides"]:
+    """Of the sliding clips, as parts of the length."""
+    return jnp.stack([clip.at for clip in guess.scene.clips if clip.sliding]) / guess.scene.rod.length
 
 
 def _intervals(scene: Scene, start: Start, sections: Section) -> Piece:
@@ -261,8 +281,7 @@ def _residual(
 ) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
     """What intervals that end in `ends` miss the next stations by, and the ends of the rod their supports."""
     sections = start.sections(stations)
-    before = jax.tree.map(lambda leaf: leaf[:-1], sections)
-    reached = jax.vmap(functools.partial(_beyond, scene))(before, jnp.diff(start.s), ends)
+    reached = _reached(scene, start, sections, ends)
     gaps, at_start, at_end = misses(scene, start, sections, reached)
     if not any(isinstance(end, Clamp) for end in (scene.start, scene.end)):
         # Both ends ask for no torque, which is constant along the rod, and none fixes the spin: it stays the guess's.
@@ -270,14 +289,28 @@ def _residual(
     return gaps, at_start, at_end
 
 
-def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"]]:
-    """Forces at the nodes of a guess, and int sqrt(|n| + curvature^2) ds from the start to there."""
-    s = guess.s / guess.s[-1]
-    force = jnp.broadcast_to(guess.start_force / units.force, guess.nodes.shape)
+def _reached(scene: Scene, start: Start, sections: Section, ends: FarEnd) -> Section:
+    """The cross sections at the ends of the intervals."""
+    before = jax.tree.map(lambda leaf: leaf[:-1], sections)
+    return jax.vmap(functools.partial(_beyond, scene))(before, jnp.diff(start.s), ends)
+
+
+def _forces_along(scene: Scene, guess: Equilibrium, units: Units, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    """Of a guess, before a point force and beyond a clip."""
+    force = jnp.broadcast_to(guess.start_force / units.force, (len(s), 3))
     if scene.gravity is not None:
         force -= s[:, None] * scene.gravity[None]
     for load in scene.point_forces:
         force -= jnp.where(s > load.at, 1.0, 0.0)[:, None] * load.force[None]
+    for clip, reaction in zip(scene.clips, guess.clip_forces, strict=True) if scene.clips else ():
+        force -= jnp.where(s >= clip.at, 1.0, 0.0)[:, None] * (reaction / units.force)[None]
+    return force
+
+
+def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"]]:
+    """Forces at the nodes of a guess, and int sqrt(|n| + curvature^2) ds from the start to there."""
+    s = guess.s / guess.s[-1]
+    force = _forces_along(scene, guess, units, s)
     return force, error_growth(s, jnp.sqrt(jnp.sum(force**2, axis=1)), (guess.curvature * units.length) ** 2)
 
 
@@ -299,13 +332,15 @@ def _chosen_intervals(
 
 
 def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> Start:
-    """Stations where errors grow equally from each to the next and at the point forces, their values from a guess."""
+    """Stations where errors grow equally from each to the next, at clips and at the point forces, their values from a
+    guess.
+    """
     fixed, fixed_units = jax.lax.stop_gradient((scene, units))
     x = guess.s / guess.s[-1]
     node_force, growth = _growth_along(fixed, guess, fixed_units)
-    s, force_steps = station_places(scene, x, growth, intervals)
+    at = station_places(scene, x, growth, intervals)
 
-    fixed_s = jax.lax.stop_gradient(s)
+    fixed_s = jax.lax.stop_gradient(at.s)
     reference = _frames_between(x, guess.frames, guess.total_twist, fixed_s)
     tangents = guess.tangents
     moments = jnp.cross(tangents, _differences(tangents) / _differences(x)[:, None])
@@ -315,7 +350,26 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     moments = across + fixed.rod.GJ * guess.total_twist * tangents
     force = jnp.stack([jnp.interp(fixed_s, x, component) for component in node_force.T], axis=1)
     moment = jnp.stack([jnp.interp(fixed_s, x, component) for component in moments.T], axis=1)
-    return Start.near(guess, fixed_units, s, force_steps, reference, force, moment)
+    if scene.clips:
+        force = _forces_along(fixed, guess, fixed_units, fixed_s)
+        moment = moment.at[at.clips].set(_moments_beyond_clips(fixed, x, tangents, moments))
+    places = sliding_places(fixed)
+    return Start.near(guess, fixed_units, at, reference, force, moment, places)
+
+
+def _moments_beyond_clips(
+    scene: Scene, x: Float[Array, "n+1"], tangents: Float[Array, "n+1 3"], moments: Float[Array, "n+1 3"]
+) -> Float[Array, "clips 3"]:
+    """Beyond each clip, where moments may jump, the bending of the two cells between the nodes there extrapolated."""
+    middles = jnp.cross(tangents[:-1], tangents[1:]) / jnp.diff(x)[:, None]
+    found = []
+    for clip in scene.clips:
+        cell = jnp.clip(jnp.searchsorted(x, clip.at, side="right") - 1, 0, len(x) - 3)
+        part = (x[cell + 1] - x[cell]) / (x[cell + 2] - x[cell])
+        across = middles[cell] + part * (middles[cell] - middles[cell + 1])
+        t = tangents[cell]
+        found.append(across + jnp.sum((moments[cell] - across) * t) * t)
+    return jnp.stack(found)
 
 
 def _differences(values: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
@@ -343,6 +397,7 @@ def _equilibrium(
 ) -> Equilibrium:
     """The result, integrated from each station to the nodes behind it."""
     scaled, _ = nondimensional(scene)
+    scaled, start = start.slid(scaled, stations)
     rod = scaled.rod
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
@@ -362,6 +417,12 @@ def _equilibrium(
     points = jax.vmap(functools.partial(_beyond, scaled))(before, length, node_ends)
     s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
 
+    clip_moments = None
+    if scaled.clips:
+        assert start.clips is not None
+        jumps = _reached(scaled, start, sections, ends).moment[start.clips - 1] - sections.moment[start.clips]
+        is_directed = np.array([clip.tangent is not None for clip in scaled.clips])
+        clip_moments = jnp.where(is_directed[:, None], jumps, 0.0)
     twist = sections.torque[0] / rod.GJ
     moments = nodes.moment - nodes.torque[:, None] * nodes.tangent
     result = Reached(
@@ -375,6 +436,7 @@ def _equilibrium(
         load_energy=jnp.sum(ends.weight_energy),
         missed=_residual(scaled, start, stations, ends),
         shape=Curve(nodes.position, points.tangent.T, s),
+        clip_moments=clip_moments,
     )
     return equilibrium(scene, start, stations, iterations, result)
 

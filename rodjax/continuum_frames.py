@@ -360,9 +360,9 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     """Stations where errors grow equally, at the point forces and at jumps; their values from a guess."""
     fixed_units = jax.lax.stop_gradient(units)
     along = _along(guess, fixed_units)
-    s, force_steps = station_places(scene, along.s, along.growth, intervals, varying(scene))
+    at = station_places(scene, along.s, along.growth, intervals, varying(scene))
 
-    fixed_s = jax.lax.stop_gradient(s)
+    fixed_s = jax.lax.stop_gradient(at.s)
 
     def between(places: Float[Array, "m"], values: Float[Array, "c m"]) -> Float[Array, "c k"]:
         return jnp.stack([jnp.interp(fixed_s, places, component) for component in values])
@@ -370,7 +370,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     quaternions = unit(between(along.frame_places, along.quaternions))
     reference = jnp.moveaxis(columns(quaternions), 2, 0)
     force, moment = between(along.places, along.forces).T, between(along.places, along.moments).T
-    return Start.near(guess, fixed_units, s, force_steps, reference, force, moment)
+    return Start.near(guess, fixed_units, at, reference, force, moment)
 
 
 def _equilibrium(

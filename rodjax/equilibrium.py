@@ -333,7 +333,8 @@ def first_state(
 ) -> tuple[SolverState, Float[Array, ""]]:
     """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
     if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
-        return guess.state, guess.total_twist
+        state = guess.state
+        return SolverState(state.shape, state.end_force, state.units, state.places), guess.total_twist
     return _first_state(scene, guess, options)
 
 

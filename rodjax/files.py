@@ -71,6 +71,7 @@ FIELDS = {
         "force at s = L between held ends, with clips for each span, with obstacles for each element, solver's units",
     ),
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
+    "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),

@@ -47,13 +47,14 @@ class SolverState(eqx.Module):
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
     are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
     with the forces of the clips beyond it; `places`: arclengths at which the rod passes its sliding clips, as parts of
-    its length, where there are some.
+    its length, where there are some; `clip_moments`: in the continuum, where no mesh gives them.
     """
 
     shape: Shape
     end_force: Float[Array, "... 3"] | Float[Array, "... 3 spans"]
     units: Units
     places: Float[Array, "... slides"] | None = None
+    clip_moments: Float[Array, "... clips 3"] | None = None
 
 
 class Equilibrium(eqx.Module):
@@ -142,6 +143,8 @@ class Equilibrium(eqx.Module):
     def clip_moments(self) -> Float[Array, "... clips 3"]:
         if not self.scene.clips:
             return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        if self.state.clip_moments is not None:
+            return self.state.clip_moments * self.state.units.energy[..., None, None]
         return _clip_moments(self)
 
     @property

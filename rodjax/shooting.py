@@ -2,26 +2,31 @@
 
 The unknowns are cross sections at stations along the rod. Between two stations a rod is integrated by its own equations
 (`continuum`, `continuum_frames`); where it does not meet the next station, or misses a support, there is a residual.
+
+A clip has a station of its own, just beyond it. There the rod may jump in force, and so meets the position of the clip
+instead; where the clip holds the tangent, the moment across it may jump, and the tangent is met. No unknown is added,
+but where the rod slides: the arclength of the station.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.along import Along
 from rodjax.discretization.shape import Shape
 from rodjax.energy import dead_load_energy
 from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.result import Equilibrium, SolverState
-from rodjax.scene import Scene, held_at_both_ends, nondimensional
+from rodjax.scene import Scene, held_at_both_ends, nondimensional, slid
 from rodjax.status import Status, is_converged
 from rodjax.supports import Clamp, Free, Held, Support, Swivel
 from rodjax.units import Units
@@ -65,19 +70,22 @@ class Stations(eqx.Module):
     """The unknowns, and the residuals between them. Forces and moments in units of the `Start`'s scales.
 
     `turn`: Rodrigues vector 2 tan(angle/2) axis of the rotation from the guess's material frame, in the axes of that;
-    its pole, half a turn, is far from an equilibrium near the guess.
+    its pole, half a turn, is far from an equilibrium near the guess. `places`: arclengths of the sliding clips, and in
+    residuals what these apply to the rod along its tangent; `None` where there are none.
     """
 
     position: Float[Array, "k 3"]
     turn: Float[Array, "k 3"]
     force: Float[Array, "k 3"]
     moment: Float[Array, "k 3"]
+    places: Float[Array, "slides"] | None = None
 
 
 class Start(eqx.Module):
     """Where Newton begins, with what stays fixed while it runs.
 
-    `s`: arclengths of the stations; `force_steps`: point forces at each of them.
+    `s`: arclengths of the stations; `force_steps`: point forces at each of them; `clips`: the numbers of those at
+    clips, where there are clips.
     """
 
     stations: Stations
@@ -86,25 +94,26 @@ class Start(eqx.Module):
     reference: Float[Array, "k 3 3"]
     force_scale: Float[Array, ""]
     moment_scale: Float[Array, ""]
+    clips: Int[Array, "clips"] | None = None
 
     @staticmethod
     def near(
         guess: Equilibrium,
         units: Units,
-        s: Float[Array, "k"],
-        force_steps: Float[Array, "k 3"],
+        at: "StationPlaces",
         frames: Float[Array, "k 3 3"],
         force: Float[Array, "k 3"],
         moment: Float[Array, "k 3"],
+        places: Float[Array, "slides"] | None = None,
     ) -> "Start":
         """On the centerline of a guess, with its frames, forces and moments at the stations, nondimensional."""
-        places = jax.lax.stop_gradient(s) * guess.s[-1]
-        position = (guess.position_at(places) - units.origin[None]) / units.length
+        position = (guess.position_at(jax.lax.stop_gradient(at.s) * guess.s[-1]) - units.origin[None]) / units.length
         force_scale, moment_scale = (
             jnp.maximum(1.0, jnp.sqrt(jnp.max(jnp.sum(v**2, axis=1)))) for v in (force, moment)
         )
-        stations = Stations(position, jnp.zeros_like(position), force / force_scale, moment / moment_scale)
-        return Start(stations, s, force_steps, frames, force_scale, moment_scale)
+        turn = jnp.zeros_like(position)
+        stations = Stations(position, turn, force / force_scale, moment / moment_scale, places)
+        return Start(stations, at.s, at.force_steps, frames, force_scale, moment_scale, at.clips)
 
     def sections(self, stations: Stations) -> Section:
         """The cross sections at the stations, each just beyond its point force."""
@@ -112,6 +121,15 @@ class Start(eqx.Module):
         return Section(
             stations.position, frames, self.force_scale * stations.force, self.moment_scale * stations.moment
         )
+
+    def slid(self, scene: Scene, stations: Stations) -> tuple[Scene, "Start"]:
+        """With the sliding clips where the stations have them."""
+        if stations.places is None:
+            return scene, self
+        assert self.clips is not None
+        sliding = np.array([k for k, clip in enumerate(scene.clips) if clip.sliding])
+        s = self.s.at[self.clips[sliding]].set(stations.places)
+        return slid(scene, stations.places), eqx.tree_at(lambda start: start.s, self, s)
 
 
 def error_growth(
@@ -124,22 +142,34 @@ def error_growth(
     return jnp.concatenate([jnp.zeros_like(s[:1]), jnp.cumsum(steps)])
 
 
+class StationPlaces(NamedTuple):
+    """Names as in `Start`."""
+
+    s: Float[Array, "k"]
+    force_steps: Float[Array, "k 3"]
+    clips: Int[Array, "clips"] | None
+
+
 def station_places(
     scene: Scene,
     s: Float[Array, "n+1"],
     growth: Float[Array, "n+1"],
     intervals: int,
     jumps: Sequence[Float[Array, "j"]] = (),
-) -> tuple[Float[Array, "k"], Float[Array, "k 3"]]:
-    """Stations between which errors grow equally, at jumps and at the point forces; and these forces."""
+) -> StationPlaces:
+    """Stations between which errors grow equally, at jumps, clips and at the point forces; and these forces."""
     grid = jnp.interp(jnp.linspace(0.0, growth[-1], intervals + 1, dtype=s.dtype), growth, s)
     grid = grid.at[0].set(0.0).at[-1].set(1.0)
-    unsorted = jnp.concatenate([grid, *jumps, *(load.at[None] for load in scene.point_forces)])
+    loads = (load.at[None] for load in scene.point_forces)
+    unsorted = jnp.concatenate([grid, *jumps, *(clip.at[None] for clip in scene.clips), *loads])
     # A stable sort: a force on an end comes behind s = 0 and s = L, and so is part of what the rod exerts there.
     order = jnp.argsort(unsorted, stable=True)
     without_force = len(unsorted) - len(scene.point_forces)
     steps = [jnp.zeros((without_force, 3), s.dtype), *(load.force[None] for load in scene.point_forces)]
-    return unsorted[order], jnp.concatenate(steps)[order]
+    clips = None
+    if scene.clips:
+        clips = jnp.argsort(order)[without_force - len(scene.clips) : without_force]
+    return StationPlaces(unsorted[order], jnp.concatenate(steps)[order], clips)
 
 
 def integrated(
@@ -188,7 +218,10 @@ def met(
 def misses(
     scene: Scene, start: Start, sections: Section, reached: Section
 ) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
-    """What is missed between the sections at the stations and those `reached` from each before, and at the supports."""
+    """What is missed between the sections at the stations and those `reached` from each before, and at the supports.
+
+    Of a clip the missed position takes the place of a force, the missed tangent that of the moments across it.
+    """
     after = jax.tree.map(lambda leaf: leaf[1:], sections)
     gaps = Stations(
         position=after.position - reached.position,
@@ -196,8 +229,25 @@ def misses(
         force=(after.force + start.force_steps[1:] - reached.force) / start.force_scale,
         moment=(after.moment - reached.moment) / start.moment_scale,
     )
+    if scene.clips:
+        gaps = _with_clips(scene, start, gaps, after, reached)
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
     return gaps, _missed_support(scene.start, start, first, -1.0), _missed_support(scene.end, start, last, 1.0)
+
+
+def _with_clips(scene: Scene, start: Start, gaps: Stations, after: Section, reached: Section) -> Stations:
+    assert start.clips is not None
+    force, moment, axial_forces = gaps.force, gaps.moment, []
+    for k, clip in enumerate(scene.clips):
+        gap = start.clips[k] - 1
+        here, before = (jax.tree.map(lambda leaf, gap=gap: leaf[gap], sections) for sections in (after, reached))
+        force = force.at[gap].set(here.position - clip.position)
+        if clip.tangent is not None:
+            torque = (here.torque - before.torque) / start.moment_scale
+            moment = moment.at[gap].set(jnp.append(here.frame[:, :2].T @ clip.tangent, torque))
+        if clip.sliding:
+            axial_forces.append(jnp.sum((before.force - here.force) * here.tangent) / start.force_scale)
+    return Stations(gaps.position, gaps.turn, force, moment, jnp.stack(axial_forces) if axial_forces else None)
 
 
 def _missed_support(end: Support, start: Start, section: Section, sign: float) -> Float[Array, "6"]:
@@ -228,7 +278,7 @@ def _missed_support(end: Support, start: Start, section: Section, sign: float) -
 class Reached(eqx.Module):
     """What the integration from the stations on gives, nondimensional: cross sections at the nodes and strains there,
     and energies. `load_energy`: of the loads along the rod, as if each interval began at the origin; `missed`: between
-    stations and at supports; `shape`: what a discrete solve begins with.
+    stations and at supports; `shape`: what a discrete solve begins with; `clip_moments`: what the clips apply.
     """
 
     s: Float[Array, "n+1"]
@@ -241,10 +291,13 @@ class Reached(eqx.Module):
     load_energy: Float[Array, ""]
     missed: Any
     shape: Shape
+    clip_moments: Float[Array, "clips 3"] | None = None
 
 
 def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any, reached: Reached) -> Equilibrium:
     """The result in SI units."""
+    if stations.places is not None:
+        scene = slid(scene, stations.places * scene.rod.length)
     scaled, units = nondimensional(scene)
     sections = start.sections(stations)
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
@@ -256,6 +309,8 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     energy = reached.elastic_energy + reached.load_energy + _energy_at(scaled, start, from_origin)
     nodes = reached.nodes
     end_force = last.force if held_at_both_ends(scene) else jnp.zeros_like(last.force)
+    if scene.clips:
+        end_force = _end_forces_of_spans(scaled, start, sections)
     none = jnp.zeros((), int)
     return Equilibrium(
         s=reached.s * scene.rod.length,
@@ -280,9 +335,29 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         substeps=none + 1,
         residual=residual,
         scene=scene,
-        state=SolverState(reached.shape, end_force, units),
+        state=SolverState(reached.shape, end_force, units, stations.places, reached.clip_moments),
         discretization="continuum",
     )
+
+
+def _end_forces_of_spans(scene: Scene, start: Start, sections: Section) -> Float[Array, "3 spans"]:
+    """The force at s = L as each span between clips sees it: that at its beginning without the loads beyond, as in
+    `rodjax.discretization.clipped`; where the start is free, with those before.
+    """
+    assert start.clips is not None
+    at = jnp.pad(start.clips, (1, 0))
+    load = jnp.cumsum(start.force_steps, axis=0)
+    if scene.gravity is not None:
+        load += start.s[:, None] * scene.gravity[None]
+    if isinstance(scene.start, Free):
+        end_forces = sections.force[at] + load[at]
+        end_forces = end_forces if scene.start.force is None else end_forces + scene.start.force[None]
+        return end_forces.at[0].set(0.0).T
+    end_forces = sections.force[at] - (load[-1][None] - load[at])
+    if isinstance(scene.end, Free):
+        end_forces = end_forces if scene.end.force is None else end_forces - scene.end.force[None]
+        end_forces = end_forces.at[-1].set(0.0)
+    return end_forces.T
 
 
 def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Float[Array, ""]:

@@ -266,7 +266,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     clipped = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, clips=clips)
     scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
-    state = dataclasses.replace(single.state, places=single.s[:1])
+    state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1])
     results.append(dataclasses.replace(single, state=state))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")

@@ -1,0 +1,205 @@
+"""How the quantities of a rod at rest scatter with numbers of its scene: by derivatives, and by solves."""
+
+import functools
+import math
+import warnings
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rodjax.batch import CHUNKS, LANES, solve_batch
+from rodjax.checks import Numbers
+from rodjax.compilation import compiled
+from rodjax.identification.unknowns import nominal, with_values
+from rodjax.implicit import differentiable
+from rodjax.modes import lowest_mode
+from rodjax.obstacles import Obstacle
+from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.routing.limits import Limits
+from rodjax.routing.margins import measured
+from rodjax.scene import Scene, has_potential, slides
+from rodjax.supports import Free
+
+# Of the three-point rule of Gauss & Hermite, in standard deviations.
+STEP = math.sqrt(3.0)
+
+
+class Quantities(NamedTuple):
+    """What scatters: values of limits, nodes of the centerline across itself, forces at both ends; or changes of it."""
+
+    values: Float[Numbers, "... m"]
+    nodes: Float[Numbers, "... n+1 3"]
+    forces: Float[Numbers, "... 2 3"]
+
+
+class Moments(NamedTuple):
+    """Of quantities: their means, less the quantities as they should be, and covariances, of values variances."""
+
+    shift: Quantities
+    values: Float[np.ndarray, "m"]
+    nodes: Float[np.ndarray, "n+1 3 3"]
+    forces: Float[np.ndarray, "2 3 3"]
+
+    @staticmethod
+    def sums(changes: Quantities) -> "Moments":
+        """Sums over a leading axis, of changes and of their products."""
+        products = [np.einsum("knc,knd->ncd", x, x) for x in (changes.nodes, changes.forces)]
+        return Moments(
+            Quantities(*(np.sum(x, axis=0) for x in changes)), np.sum(np.square(changes.values), axis=0), *products
+        )
+
+
+class Slopes(NamedTuple):
+    """Quantities as they should be, their derivatives by p independent normal numbers of deviation 1; and so the
+    stiffness of the softest motion, not a number where that has none.
+    """
+
+    here: Quantities
+    by: Quantities
+    stiffness: Float[Numbers, ""]
+    stiffness_by: Float[Numbers, "p"]
+
+
+class Scattering(eqx.Module):
+    """An equilibrium whose scene scatters: the numbers of these keys by `root` times independent normal ones."""
+
+    equilibrium: Equilibrium
+    keys: tuple[str, ...] = eqx.field(static=True)
+    root: Float[Array, "p p"]
+    limits: Limits | None
+    obstacles: tuple[Obstacle, ...]
+
+    def scene(self, z: Float[Array, "p"]) -> Scene:
+        scene = self.equilibrium.scene
+        changes = self.root.astype(z.dtype) @ z
+        values = [nominal([key], scene) + change for key, change in zip(self.keys, changes, strict=True)]
+        return with_values(scene, [[key] for key in self.keys], ["linear"] * len(self.keys), values)
+
+    def quantities(self, equilibrium: Equilibrium) -> Quantities:
+        values = jnp.zeros(0, equilibrium.s.dtype)
+        if self.limits is not None:
+            values = jnp.concatenate([each.value for each in measured(equilibrium, self.limits, self.obstacles)])
+        along = self.equilibrium.tangents
+        scene = self.equilibrium.scene
+        for end, node in ((scene.start, 0), (scene.end, -1)):
+            if isinstance(end, Free):
+                along = along.at[node].set(0.0)
+        nodes = equilibrium.nodes - jnp.sum(equilibrium.nodes * along, axis=1)[:, None] * along
+        return Quantities(values, nodes, jnp.stack([equilibrium.start_force, equilibrium.end_force]))
+
+    def slopes(self) -> Slopes:
+        return jax.tree.map(np.asarray, _slopes(self))
+
+    def solved(self, zs: Float[np.ndarray, "k p"]) -> Iterator[tuple[Quantities, Bool[np.ndarray, "k"]]]:
+        """Of the rods with these numbers, so many at a time; and which of them are at rest."""
+        size = next((size for size in CHUNKS if len(zs) <= size), CHUNKS[-1])
+        n = self.equilibrium.s.shape[-1] - 1
+        options: dict[str, Any] = {"segments": n, "discretization": self.equilibrium.discretization}
+        # A saddle that is kept would be left otherwise.
+        options["find"] = "minimum" if bool(self.equilibrium.stable) else "equilibrium"
+        for begin in range(0, len(zs), size):
+            count = min(size, len(zs) - begin)
+            which = begin + np.minimum(np.arange(size), count - 1)
+            with warnings.catch_warnings():
+                # How many did not converge is what the caller is told.
+                warnings.simplefilter("ignore", NotConvergedWarning)
+                rods = solve_batch(_scenes(self, zs[which]), guess=self.equilibrium, **options)
+            found = Quantities(*(np.asarray(x)[:count] for x in _quantities(self, rods)))
+            yield found, np.asarray(rods.converged)[:count]
+
+
+@compiled
+def _slopes(scattering: Scattering) -> Slopes:
+    result = scattering.equilibrium
+    is_examined = has_potential(result.scene) and not slides(result.scene)
+
+    def found(z: Float[Array, "p"]) -> tuple[Quantities, Float[Array, ""]]:
+        near = differentiable(scattering.scene(z), result)
+        stiffness = lowest_mode(near).stiffness if is_examined else jnp.full_like(near.energy, jnp.nan)
+        return scattering.quantities(near), stiffness
+
+    z = jnp.zeros(len(scattering.root), result.s.dtype)
+    along = jax.vmap(lambda direction: jax.jvp(found, (z,), (direction,)), out_axes=(None, 0))
+    (here, stiffness), (by, stiffness_by) = along(jnp.eye(len(z), dtype=z.dtype))
+    return Slopes(here, by, stiffness, stiffness_by)
+
+
+@compiled
+def _scenes(scattering: Scattering, zs: Float[Array, "k p"]) -> Scene:
+    return jax.vmap(scattering.scene)(zs.astype(scattering.equilibrium.s.dtype))
+
+
+@compiled
+def _quantities(scattering: Scattering, rods: Equilibrium) -> Quantities:
+    # Not by `batch_size`: there may be no values.
+    count = rods.s.shape[0]
+    lanes = jax.tree.map(lambda x: x.reshape(count // LANES, LANES, *x.shape[1:]), rods)
+    found = jax.lax.map(jax.vmap(scattering.quantities), lanes)
+    return Quantities(*(x.reshape(count, *x.shape[2:]) for x in found))
+
+
+def by_derivatives(slopes: Slopes) -> Moments:
+    """Of the normal distribution of the first order."""
+    nothing = Quantities(*(np.zeros_like(x) for x in slopes.here))
+    return Moments.sums(slopes.by)._replace(shift=nothing)
+
+
+def by_samples(
+    scattering: Scattering, here: Quantities, zs: Float[np.ndarray, "k p"]
+) -> tuple[Moments, Float[np.ndarray, "c m"]]:
+    """Of a Monte Carlo, and the values of its c rods that are at rest."""
+    parts, values = [], []
+    for found, converged in scattering.solved(zs):
+        changes = Quantities(*(x[converged] - x0[None] for x, x0 in zip(found, here, strict=True)))
+        parts.append(Moments.sums(changes))
+        values.append(found.values[converged])
+    count = sum(map(len, values))
+    sums = jax.tree.map(lambda *x: functools.reduce(np.add, x), *parts)
+    mean = Quantities(*(x / max(count, 1) for x in sums.shift))
+    last = max(count - 1, 1)
+    squares = [np.einsum("nc,nd->ncd", x, x) for x in (mean.nodes, mean.forces)]
+    moments = Moments(
+        mean,
+        np.maximum(sums.values - count * mean.values**2, 0.0) / last,
+        *((x - count * square) / last for x, square in zip(sums[2:], squares, strict=True)),
+    )
+    return moments, np.concatenate(values)
+
+
+def by_few(scattering: Scattering, slopes: Slopes) -> tuple[Moments, Moments, int]:
+    """By the three-point rule along each of the p normal numbers, as if each acted alone; of the values also along the
+    direction in which each grows most; and how many of the rods are not at rest, in whose stead is the first order.
+    """
+    p, m = len(scattering.root), len(slopes.here.values)
+    steepest = np.nan_to_num(slopes.by.values.T, posinf=0.0, neginf=0.0)
+    sizes = np.linalg.norm(steepest, axis=1, keepdims=True)
+    ways = np.concatenate([np.eye(p), steepest / np.where(sizes > 0, sizes, 1.0)])
+    signed = np.concatenate([STEP * ways, -STEP * ways])
+    chunks = list(scattering.solved(signed))
+    converged = np.concatenate([converged for _, converged in chunks])
+    rods = Quantities(*(np.concatenate(x) for x in zip(*(found for found, _ in chunks), strict=True)))
+    # Without rods at rest on both sides nothing is known beyond the first order.
+    is_known = np.all(converged.reshape(2, -1), axis=0)
+    changes = []
+    for x, x0, by in zip(rods, slopes.here, slopes.by, strict=True):
+        change = (x - x0[None]).reshape(2, p + m, *x0.shape)
+        linear = np.tensordot(signed, by, 1).reshape(change.shape)
+        changes.append(np.where(is_known.reshape(1, -1, *[1] * x0.ndim), change, linear))
+    slope = Quantities(*((x[0] - x[1]) / (2 * STEP) for x in changes))
+    bend = Quantities(*((x[0] + x[1]) / STEP**2 for x in changes))
+
+    def moments(slope: Quantities, bend: Quantities) -> Moments:
+        first, second = Moments.sums(slope), Moments.sums(bend)
+        total = jax.tree.map(lambda a, b: a + b / 2, first, second)
+        return total._replace(shift=Quantities(*(x / 2 for x in second.shift)))
+
+    each = moments(*(Quantities(*(x[:p] for x in of)) for of in (slope, bend)))
+    own = range(m), range(p, p + m)
+    steep_slope, steep_bend = (of.values[own[1], own[0]] for of in (slope, bend))
+    steep = each._replace(shift=each.shift._replace(values=steep_bend / 2), values=steep_slope**2 + steep_bend**2 / 2)
+    return each, steep, int(np.sum(~converged))

@@ -83,7 +83,7 @@ def found(starts: int, seed: int = 0, *, progress: bool = False) -> rj.Route:
 
 def reported(route: rj.Route) -> rj.Report:
     return rj.report(
-        route.equilibrium,
+        route.verified,
         limits=LIMITS,
         obstacles=list(OBSTACLES.values()),
         names=list(OBSTACLES),
@@ -94,7 +94,7 @@ def reported(route: rj.Route) -> rj.Report:
 
 def in_the_continuum(route: rj.Route) -> rj.Margins:
     """The margins of the same design without a mesh."""
-    exact = rj.solve_continuum(route.scene, guess=route.equilibrium)
+    exact = rj.solve_continuum(route.scene, guess=route.verified)
     if not exact.converged:
         raise RuntimeError(f"no equilibrium of the continuum: {rj.describe(exact)}")
     return rj.margins(exact, LIMITS, list(OBSTACLES.values()), list(OBSTACLES))

@@ -266,6 +266,7 @@ def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, *
         (lambda: rj.solve(with_floor(), planar=True), "planar must be False for a scene with obstacles"),
         (lambda: rj.solve(with_floor(), solver=rj.NonlinearCG()), "discretization must be 'hermite' for a scene"),
         (lambda: rj.solve_continuum(with_floor()), "obstacles must be () in the continuum"),
+        (lambda: rj.write_scene(with_floor(), "floor.toml"), "scene.obstacles must be () to be written"),
         (lambda: rj.follow([with_floor(), with_floor()]), "needs scenes without obstacles"),
         (
             lambda: rj.solve_path([with_floor(), with_floor()], at_critical="stop"),

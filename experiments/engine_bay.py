@@ -32,6 +32,8 @@ from rodjax.routing.problem import Problem, arranged, scenes_of, valued
 from rodjax.routing.route import RESERVE, SEGMENTS, TOLERANCE
 from rodjax.routing.variables import checked_variables
 
+jax.config.update("jax_enable_x64", True)  # before the numbers below are made
+
 OBSTACLES = {
     "engine block": rj.Box((0.35, 0.15, 0.0), (0.3, 0.2, 0.25)),
     "coolant pipe": rj.Capsule((0.6, -0.2, 0.1), (0.6, 0.5, 0.1), 0.03),
@@ -268,7 +270,6 @@ def compared(route: rj.Route, seconds: float, *, most: float, differences: int =
 
 
 def main(arguments: list[str] | None = None) -> rj.Route:
-    jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the report")
     parser.add_argument("--starts", type=int, default=64)

@@ -21,6 +21,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
+import rodjax as rj
 from rodjax import (
     Clamp,
     Clip,
@@ -264,7 +265,17 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     scene = single.scene
     clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True)]
     clipped = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, clips=clips)
-    scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped]
+    corners = [(0, 0, -1), (1, 0, -1), (0, 1, -1), (0, 0, -2)]
+    bodies = [
+        rj.Plane((0, 0, -2), (0, 0, 1)),
+        rj.Cylinder((0, 0, -2), (1, 0, -2), 0.1),
+        rj.Box((0, 0, -2), (1, 1, 1), np.eye(3)),
+        rj.Sphere((0, 0, -2), 0.1),
+        rj.Mesh(corners, [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]),
+    ]
+    obstacles = [*bodies, rj.Union(*bodies, rj.Union(*bodies))]
+    touching = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, obstacles=obstacles)
+    scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped, touching]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
     state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1])
     results.append(dataclasses.replace(single, state=state))

@@ -268,21 +268,19 @@ def _clearances(
     # The search needs no derivatives.
     fixed, fixed_s, fixed_radius, bodies = jax.lax.stop_gradient((equilibrium, s, radius, obstacles))
     positions = fixed.position_at(fixed_s)
-    distances = [body.distance(positions) - fixed_radius for body in bodies]
-    at = jnp.stack([_least_in(windows, distance) for distance in distances])
-    beside, shifts = zip(
-        *(_shift(fixed_s, distance, of_one, windows) for distance, of_one in zip(distances, at, strict=True)),
-        strict=True,
-    )
-    before, beyond = jnp.stack(beside, axis=1)
-    # The worst of the places looked at, and the lowest place of the parabola through it and those beside it.
-    chosen = jnp.stack([s[at], s[at] + jnp.stack(shifts) * (s[beyond] - s[before])], axis=-1)
-    points = equilibrium.position_at(chosen.reshape(-1)).reshape(*chosen.shape, 3)
+    at = jnp.stack([_least_in(windows, body.distance(positions) - fixed_radius) for body in bodies])
+    # The worst of the places looked at with those beside it, and the lowest place of the parabola through the three.
+    parts = _parts(windows, len(s))
+    near = jnp.stack([jnp.maximum(at - 1, parts[None, :, 0]), at, jnp.minimum(at + 1, parts[None, :, -1])], axis=-1)
+    points = equilibrium.position_at(s[near.reshape(-1)]).reshape(*near.shape, 3)
+    values = jnp.stack([jax.vmap(jax.vmap(body.at))(points[k]) for k, body in enumerate(obstacles)]) - radius[near]
+    lowest = jax.vmap(jax.vmap(_lowest))(s[near], values)
+    low_points = equilibrium.position_at(lowest.reshape(-1)).reshape(*at.shape, 3)
 
     def to(number: int, obstacle: Obstacle) -> Measured:
-        both = jax.vmap(jax.vmap(obstacle.at))(points[number]) - radius[at[number]][:, None]
-        distance = least(both[:, 0], both[:, 1])
-        place = jnp.where(both[:, 1] < both[:, 0], chosen[number, :, 1], chosen[number, :, 0])
+        low = jax.vmap(obstacle.at)(low_points[number]) - radius[at[number]]
+        distance = least(values[number, :, 1], low)
+        place = jnp.where(low < values[number, :, 1], lowest[number], s[at[number]])
         limit = jnp.broadcast_to(limits[number], distance.shape)
         slack = (distance - limit) / (2 * radius[at[number]])
         return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, place, number)
@@ -290,20 +288,14 @@ def _clearances(
     return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
 
 
-def _shift(
-    s: Float[Array, "k"], values: Float[Array, "k"], at: Int[Array, "w"], windows: int
-) -> tuple[Int[Array, "2 w"], Float[Array, "w"]]:
-    """The places before and beyond a least value, and the shift from it to the lowest place of the parabola through the
-    three, as a part of the way from the one to the other; none where the least value is at an end of its part.
-    """
-    parts = _parts(windows, len(values))
-    before, beyond = jnp.maximum(at - 1, parts[:, 0]), jnp.minimum(at + 1, parts[:, -1])
-    a, b = s[at] - s[before], s[beyond] - s[at]
-    rise, fall = values[before] - values[at], values[beyond] - values[at]
+def _lowest(s: Float[Array, "3"], values: Float[Array, "3"]) -> Float[Array, ""]:
+    """The lowest place of the parabola through three values; the middle one where two of the places are the same."""
+    a, b = s[1] - s[0], s[2] - s[1]
+    rise, fall = values[0] - values[1], values[2] - values[1]
     bend = a * fall + b * rise
     is_between = (a > 0) & (b > 0) & (bend > 0)
-    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(is_between, bend, 1.0) * jnp.where(a + b > 0, a + b, 1.0))
-    return jnp.stack([before, beyond]), jnp.where(is_between, shift, 0.0)
+    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(is_between, bend, 1.0))
+    return s[1] + jnp.where(is_between, shift, 0.0)
 
 
 def _parts(windows: int, count: int) -> Int[Array, "w p"]:

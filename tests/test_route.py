@@ -81,6 +81,7 @@ def test_rates_are_those_of_solves():
         np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_obstacle_in_the_way_is_passed(shortest):
     """A ball on the arc: the way around it is longer, and clear of it on a finer mesh."""
     ball = rj.Sphere(np.asarray(shortest.equilibrium.nodes[8]) + np.array([0.0, 0.002, 0.0]), 0.01)
@@ -92,6 +93,7 @@ def test_an_obstacle_in_the_way_is_passed(shortest):
     assert float(rj.clearance(finer, [ball]).distance[0]) >= 0.01 * (1 - 1e-4)
 
 
+@pytest.mark.slow
 def test_the_same_arguments_give_the_same_bits(shortest):
     again = routed()
     for a, b in zip(jax.tree.leaves(shortest), jax.tree.leaves(again), strict=True):
@@ -99,6 +101,7 @@ def test_the_same_arguments_give_the_same_bits(shortest):
     assert shortest.starts.message == again.starts.message
 
 
+@pytest.mark.slow
 def test_what_cannot_be_kept_is_said(shortest):
     """A bend radius of 0.4 m in a space of 0.25 m."""
     route = routed(bend_radius=40.0)

@@ -46,8 +46,9 @@ class SolverState(eqx.Module):
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
     are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
-    with the forces of the clips beyond it; `places`: arclengths at which the rod passes its sliding clips, as parts of
-    its length, where there are some; `clip_moments`: in the continuum, where no mesh gives them.
+    with the forces of the clips beyond it, with obstacles one for each segment, with those of clips and contacts;
+    `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
+    `clip_moments`: in the continuum, where no mesh gives them.
     """
 
     shape: Shape

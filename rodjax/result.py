@@ -320,9 +320,7 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     form, _ = form_and_point(equilibrium)
     assert isinstance(form, TouchingForm)
     state = equilibrium.state
-    # The forces at both ends are those of the supports there, or of the loads and contacts beyond a free one.
-    around = jnp.pad(state.end_force, ((0, 0), (1, 1)))
-    forces = (around[:, :-1] - around[:, 1:]).T * state.units.force
+    forces = form.at_nodes(state.end_force).T * state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 

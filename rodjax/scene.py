@@ -39,8 +39,9 @@ class Scene(eqx.Module):
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
-        the nodes of the mesh. Where none touches the rod they only cost time: to see how far it is from things that it
-        stays away from, `rodjax.clearance` needs no obstacles in the scene.
+        the nodes of the mesh. All loads together press it in by 3e-5 of its radius; where it is jammed it may lie
+        deeper, and `rodjax.describe` says so. Where no obstacle touches the rod they only cost time: to see how far it
+        is from what it stays away from, `rodjax.clearance` needs none in the scene. Double precision only.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
@@ -127,6 +128,11 @@ def _check_obstacles(scene: Scene) -> None:
         raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
     if needs_frames(scene):
         raise ValueError("obstacles must be () for a rod or loads that need frames along the rod")
+    if scene.rod.length.dtype != jnp.float64:
+        raise ValueError(
+            "obstacles must be () in single precision, in which contacts have no digits: "
+            "jax.config.update('jax_enable_x64', True) before making the scene"
+        )
     if slides(scene):
         raise ValueError("obstacles must be () where the rod slides through clips")
     if dead_end_moment(scene) is not None:

@@ -250,6 +250,10 @@ def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, *
     return Scene(rod or cable(), Clamp((0, 0, 1), LEVEL), end or Free(), GRAVITY, obstacles=[FLOOR], **others)
 
 
+def single(parts):
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), parts)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -266,6 +270,10 @@ def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, *
         (lambda: rj.solve(with_floor(), planar=True), "planar must be False for a scene with obstacles"),
         (lambda: rj.solve(with_floor(), solver=rj.NonlinearCG()), "discretization must be 'hermite' for a scene"),
         (lambda: rj.solve_continuum(with_floor()), "obstacles must be () in the continuum"),
+        (
+            lambda: Scene(*single((cable(), Clamp((0, 0, 1), LEVEL), Free())), obstacles=single([FLOOR])),
+            "obstacles must be () in single precision",
+        ),
         (lambda: rj.write_scene(with_floor(), "floor.toml"), "scene.obstacles must be () to be written"),
         (lambda: rj.follow([with_floor(), with_floor()]), "needs scenes without obstacles"),
         (

@@ -1,5 +1,6 @@
 """route(): an optimum in closed form, rates beside differences, obstacles, bits, and words for what cannot be kept."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,6 +80,42 @@ def test_rates_are_those_of_solves():
         ahead, behind = found(design + h * unit)[0], found(design - h * unit)[0]
         # Central differences of solves to 1e-12 EI/L^2.
         np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+
+
+def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):
+    solve, calls = _Fleet._solved_cold, []
+
+    def missing_one(self, designs):
+        results = solve(self, designs)
+        calls.append(designs.copy())
+        # In the first two draws the third start has none.
+        return eqx.tree_at(lambda r: r.converged, results, results.converged.at[2].set(len(calls) > 2))
+
+    monkeypatch.setattr(_Fleet, "_solved_cold", missing_one)
+    problem, _ = _problem(corner(), VARIABLES, rj.Limits(bend_radius=9.0), None, (), None, 16, TIGHT)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+    assert fleet.redrawn == 2
+    np.testing.assert_array_equal(fleet.solves, [1, 1, 3, 1])
+    others = [0, 1, 3]
+    np.testing.assert_array_equal(calls[2][others], calls[0][others])
+    assert np.all(calls[2][2] != calls[0][2])
+    np.testing.assert_array_equal(fleet._starts, calls[2])
+
+
+@pytest.mark.slow
+def test_a_softest_motion_may_be_limited(shortest):
+    stiffness = float(rj.lowest_mode(shortest.verified).stiffness)
+    limits = rj.Limits(bend_radius=9.0, stability=0.9 * stiffness)
+    route = rj.route(corner(), VARIABLES, limits=limits, starts=2, segments=16, solver=TIGHT)
+    assert route.feasible
+    kept = dict(zip(route.margins.names, np.asarray(route.margins.margin), strict=True))
+    # The same arc as without: what is asked of the motion it has, to the reserve of the bend radius.
+    assert kept["stability"] == pytest.approx(1 / 0.9 - 1, abs=5e-3)
+    assert route.objective == pytest.approx(shortest.objective, rel=1e-4)
+    stiffer = rj.Limits(stability=4 * stiffness)
+    route = rj.route(corner(), VARIABLES, limits=stiffer, starts=2, segments=16, solver=TIGHT)
+    assert route.feasible
+    assert float(rj.lowest_mode(route.verified).stiffness) >= 4 * stiffness
 
 
 @pytest.mark.slow

@@ -132,8 +132,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
 def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Errors:
     """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node."""
     h = jnp.diff(form.field.s)
-    around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
-    forces = jnp.where(form.is_held[None], 0.0, around[:, :-1] - around[:, 1:])
+    forces = jnp.where(form.is_held[None], 0.0, form.at_nodes(point.end_force))
     beside = jnp.pad(forces, ((0, 0), (1, 1)))
     alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
     spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2

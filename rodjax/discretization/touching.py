@@ -99,6 +99,12 @@ class TouchingForm(PartedForm):
 
     # --- places and contacts -----------------------------------------------------------------------------------------
 
+    @staticmethod
+    def at_nodes(end_force: Float[Array, "3 n"]) -> Float[Array, "3 n+1"]:
+        """What clips, contacts and supports apply at the nodes, of the forces through the elements."""
+        around = jnp.pad(end_force, ((0, 0), (1, 1)))
+        return around[:, :-1] - around[:, 1:]
+
     @property
     def is_held(self) -> Bool[Array, "n+1"]:
         _, nodes = self.held_places
@@ -140,13 +146,7 @@ class TouchingForm(PartedForm):
         return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
 
     def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
-        energy = jnp.zeros((), positions.dtype)
-        for obstacle in self.scene.obstacles:
-            energy += self._energy_at(obstacle, positions)
-        return energy
-
-    def _energy_at(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
-        return self.stiffness / 2 * jnp.sum(self._depths(obstacle, positions) ** 2)
+        return self.stiffness / 2 * jnp.sum(self.depths(positions) ** 2)
 
     def _contacts(
         self, positions: Float[Array, "n+1 3"], forces: Float[Array, "n+1 3"]
@@ -191,12 +191,11 @@ class TouchingForm(PartedForm):
         cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         positions = self.positions(edges)
-        around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
-        pushing = (around[:, :-1] - around[:, 1:]).T
+        pushing = self.at_nodes(point.end_force).T
         first, second = self._contacts(positions, pushing)
-        balance = first + pushing
-        balance = jnp.where(self.is_held[:, None], 0.0, balance)
-        closure = [balance.reshape(-1), self._gaps(positions, edges).reshape(-1)]
+        balance = jnp.where(self.is_held[:, None], 0.0, first + pushing)
+        unbalanced = jnp.max(jnp.abs(balance))
+        closure = [balance.reshape(-1), self._gaps(edges).reshape(-1)]
         dtype = energy.dtype
         if softness is None:
             border, compliance = jnp.zeros((2, 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
@@ -223,10 +222,10 @@ class TouchingForm(PartedForm):
             closure=jnp.concatenate(closure),
             system=system,
             energy=energy + self._stretching(tangents, point.end_force)[0],
-            residual=jnp.where(jnp.max(jnp.abs(balance)) > residual, jnp.max(jnp.abs(balance)), residual),
+            residual=jnp.where(unbalanced > residual, unbalanced, residual),
         )
 
-    def _gaps(self, positions: Float[Array, "n+1 3"], edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def _gaps(self, edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """What the elements lack of the ways between their nodes: those before held nodes."""
         places, held = self.held_places
         sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
@@ -242,10 +241,9 @@ class TouchingForm(PartedForm):
         strain = axial_strain_under(self.scene.rod, tension)
         ways = (weights * (1 + strain))[None] * self.field.of_sides(tangents)
         edges = jnp.sum(ways, axis=1).T
-        positions = self.positions(edges)
-        gaps = self._gaps(positions, edges)
+        gaps = self._gaps(edges)
         energy = jnp.sum(weights * density(self.scene.rod, axial_strain=strain)) - jnp.sum(self.side_forces * ways)
-        return energy + self._contact_energy(positions) + jnp.sum(end_force * gaps.T), gaps
+        return energy + self._contact_energy(self.positions(edges)) + jnp.sum(end_force * gaps.T), gaps
 
     def under_force(
         self,

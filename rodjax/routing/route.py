@@ -232,7 +232,7 @@ class _Fleet:
             designs[again] = self._drawn(len(again), rng)
             new = self._solved_cold(designs)
             results = chosen(jnp.asarray(converged), results, new)
-            converged |= np.asarray(new.converged)
+            converged = converged | np.asarray(new.converged)
             self.solves[again] += 1
         self.solves += 1
         if not np.any(converged):

@@ -14,6 +14,9 @@ PENALTY = 1e3
 SOLVES_PER_ITERATION = 3
 # Slacks are by their logarithm where they are violated so much.
 MOST_VIOLATION = 1e3
+# What SLSQP says, and what is said in its place.
+SUCCESS = "Optimization terminated successfully"
+SPENT = ("Limit of solves reached", "Iteration limit reached")
 
 
 class Asked(NamedTuple):
@@ -171,10 +174,6 @@ class Search:
             )
         except (_KeptError, _SpentError):
             return
-
-
-SUCCESS = "Optimization terminated successfully"
-SPENT = ("Limit of solves reached", "Iteration limit reached")
 
 
 def _tempered(numbers: Numbers) -> Numbers:

@@ -15,7 +15,13 @@ from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.compilation import compiled
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
-from rodjax.discretization.error import Errors, errors_of_differences, errors_of_elements, with_contacts
+from rodjax.discretization.error import (
+    Errors,
+    depths_of_elements,
+    errors_of_differences,
+    errors_of_elements,
+    with_contacts,
+)
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
@@ -300,7 +306,7 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
 
 
 def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:
-    """How deep the nodes are within obstacles, as a part of the radius."""
+    """How deep the rod lies within obstacles, at nodes and between them, as a part of the radius."""
     if not equilibrium.scene.obstacles:
         return np.zeros(equilibrium.s.shape[:-1])
     return np.asarray(_deepest(equilibrium))
@@ -310,8 +316,7 @@ def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:
 def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, TouchingForm)
-    depths = form.depths(form.positions(form.edges(point)))
-    return jnp.max(depths / form.radius[None])
+    return jnp.max(depths_of_elements(form, point))
 
 
 @over_leading_axes

@@ -108,6 +108,43 @@ def test_meshes_are_chosen_with_contacts():
     _, end = heavy_elastica(0.3)
     assert float(result.error_estimate) < 1e-4
     assert float(result.nodes[-1, 2]) - RADIUS == pytest.approx(end[2], abs=1e-4)
+    assert deepest(result) < DEEPEST
+
+
+def deepest(result: rj.Equilibrium) -> float:
+    """Of all places, at nodes and between them, by the radius."""
+    return -float(jnp.min(rj.clearance(result, result.scene.obstacles, points=9).distance)) / RADIUS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(cable(1.2), Clamp((0, 0, 0.2), LEVEL), Clamp((0.8, 0, 0.2), LEVEL), GRAVITY, obstacles=[FLOOR]),
+        Scene(
+            cable(mass_per_length=0.0),
+            Clamp((0, 0, 0.1), LEVEL),
+            Free(force=(0, 0, -4.0)),
+            obstacles=[rj.Cylinder((0, -1, 0), (0, 1, 0), 0.1 - RADIUS)],
+        ),
+    ],
+    ids=["sagging to a floor", "over a cylinder"],
+)
+def test_meshes_are_as_fine_as_contacts_between_nodes_need(scene):
+    result = rj.solve(scene)
+    assert deepest(result) < DEEPEST
+    assert "pressed into" not in rj.describe(result)
+
+
+@pytest.mark.slow
+def test_an_edge_costs_no_finest_mesh():
+    """What no mesh without a node there helps is said, and not sought."""
+    box = rj.Box((0.4, 0, -0.25), (0.1, 1, 0.6))
+    scene = Scene(cable(1.2), Clamp((0, 0, 0.1), LEVEL), Clamp((0.8, 0, 0.1), LEVEL), GRAVITY, obstacles=[box])
+    result = rj.solve(scene)
+    assert result.converged
+    assert len(result.s) - 1 < 512
+    assert "pressed into an obstacle by more than 0.0001 of the radius" in rj.describe(result)
 
 
 # --- over a cylinder -------------------------------------------------------------------------------------------------

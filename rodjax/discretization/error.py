@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.results import positions_between
 from rodjax.discretization.touching import TouchingForm
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
@@ -38,6 +39,8 @@ COUPLE_REACH = 12.0
 # A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
 # displaces it by about half of that.
 CONTACT_REACH = 16.0
+# Where it is looked at how deep a rod lies within obstacles, as parts of elements.
+DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 class Section(NamedTuple):
@@ -51,12 +54,14 @@ class Section(NamedTuple):
 class Errors(NamedTuple):
     """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
     as the displacement that each alone might make, `None` where there are none; `axial`: of the forces by which clips
-    pull along a rod that slides through them, `None` without such.
+    pull along a rod that slides through them, `None` without such; `depths`: how deep each element lies within
+    obstacles, by the radius, `None` without such.
     """
 
     nodes: Float[Array, "n+1 3"]
     defects: Float[Array, "n"] | None
     axial: Float[Array, "slides"] | None = None
+    depths: Float[Array, "n"] | None = None
 
 
 def errors_of_differences(
@@ -130,7 +135,10 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
 
 
 def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Errors:
-    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node."""
+    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node.
+
+    And how deep the rod lies between the nodes.
+    """
     h = jnp.diff(form.field.s)
     forces = jnp.where(form.is_held[None], 0.0, form.at_nodes(point.end_force))
     beside = jnp.pad(forces, ((0, 0), (1, 1)))
@@ -141,7 +149,25 @@ def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Erro
     defects = errors.defects
     if defects is not None:
         defects = defects + (sizes[:-1] + sizes[1:]) / 2
-    return errors._replace(nodes=errors.nodes + misplaced[:, jnp.argmax(sizes)][None], defects=defects)
+    nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
+    return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point))
+
+
+def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n"]:
+    """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
+    beside a held place so much more than it is held there.
+    """
+    s, nodes = form.field.s, form.positions(form.edges(point))
+    held = jnp.where(form.is_held, form.depths_at(s, nodes), 0.0)
+    parts = jnp.array(DEPTH_PLACES, s.dtype)
+    places = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
+    positions = positions_between(form, point, nodes, places.reshape(-1))
+    between = form.depths_at(places.reshape(-1), positions).reshape(places.shape)
+    at_ends = jnp.where(form.is_held, 0.0, form.depths_at(s, nodes))
+    depths = jnp.concatenate(
+        [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1
+    )
+    return jnp.maximum(jnp.max(depths, axis=1), 0.0)
 
 
 def _axial_error(

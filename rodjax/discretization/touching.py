@@ -119,9 +119,11 @@ class TouchingForm(PartedForm):
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
+        return self.radius_at(self.field.s)
+
+    def radius_at(self, s: Float[Array, "k"]) -> Float[Array, "k"]:
         radius = self.scene.rod.radius
         assert radius is not None, "a scene with obstacles has a radius"
-        s = self.field.s
         return value_at(radius, s, s, s)
 
     @property
@@ -144,6 +146,12 @@ class TouchingForm(PartedForm):
     def _depths(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
         depths = self.radius - jax.vmap(obstacle.at)(positions)
         return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
+
+    def depths_at(self, s: Float[Array, "k"], positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
+        """How far the rod is within the nearest obstacle at arclengths, by its radius there; 0 outside."""
+        radius = self.radius_at(s)
+        distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
+        return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
 
     def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
         return self.stiffness / 2 * jnp.sum(self.depths(positions) ** 2)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax.routing.margins import measured
 from rodjax.sensitivity import moved
 
 TIGHT = rj.Newton(tolerance=1e-12)
@@ -92,6 +93,23 @@ def test_a_straight_rod():
     rates, values = jax.jit(jax.jacfwd(found, has_aux=True))(jnp.array(0.0))
     assert np.isinf(values).all()
     np.testing.assert_array_equal(rates, 0)
+
+
+def test_slacks_are_continuous_as_an_obstacle_moves_along():
+    """By no more than it moves, each: 0.1 mm a step, past the ends of parts of the rod and of the rod itself."""
+    scene = rj.Scene(rod(0.8), rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Clamp((0.8, 0, 0), rj.frame((1, 0, 0))))
+    result = rj.solve(scene, segments=16, solver=TIGHT)
+    limits = rj.Limits(clearance=0.01)
+
+    @jax.jit
+    def values(x):
+        sphere = rj.Sphere(jnp.stack([x, 0.0 * x, 0.0 * x + 0.06]), 0.02)
+        return measured(result, limits, (sphere,), 8)[0].value
+
+    for begin in (-0.01, 0.09, 0.79):
+        found = np.asarray(jax.vmap(values)(begin + 1e-4 * np.arange(201)))
+        # From one parabola to the next the value changes by 1e-6 m too.
+        assert np.max(np.abs(np.diff(found, axis=0))) < 1e-4 + 2e-6
 
 
 @pytest.mark.slow

@@ -269,33 +269,35 @@ def _clearances(
     fixed, fixed_s, fixed_radius, bodies = jax.lax.stop_gradient((equilibrium, s, radius, obstacles))
     positions = fixed.position_at(fixed_s)
     at = jnp.stack([_least_in(windows, body.distance(positions) - fixed_radius) for body in bodies])
-    # The worst of the places looked at with those beside it, and the lowest place of the parabola through the three.
-    parts = _parts(windows, len(s))
-    near = jnp.stack([jnp.maximum(at - 1, parts[None, :, 0]), at, jnp.minimum(at + 1, parts[None, :, -1])], axis=-1)
+    # The worst of the places looked at with those beside it, also beyond its part of the rod, and the lowest place of
+    # the parabola through the three: where the next place becomes the worst one, it stays.
+    near = jnp.clip(at, 1, len(s) - 2)[..., None] + jnp.arange(-1, 2)[None, None]
     points = equilibrium.position_at(s[near.reshape(-1)]).reshape(*near.shape, 3)
     values = jnp.stack([jax.vmap(jax.vmap(body.at))(points[k]) for k, body in enumerate(obstacles)]) - radius[near]
     lowest = jax.vmap(jax.vmap(_lowest))(s[near], values)
     low_points = equilibrium.position_at(lowest.reshape(-1)).reshape(*at.shape, 3)
 
     def to(number: int, obstacle: Obstacle) -> Measured:
-        low = jax.vmap(obstacle.at)(low_points[number]) - radius[at[number]]
-        distance = least(values[number, :, 1], low)
-        place = jnp.where(low < values[number, :, 1], lowest[number], s[at[number]])
+        here = at[number]
+        worst = jnp.take_along_axis(values[number], (here - near[number, :, 0])[:, None], axis=1)[:, 0]
+        low = jax.vmap(obstacle.at)(low_points[number]) - radius[here]
+        distance = least(worst, low)
+        place = jnp.where(low < worst, lowest[number], s[here])
         limit = jnp.broadcast_to(limits[number], distance.shape)
-        slack = (distance - limit) / (2 * radius[at[number]])
+        slack = (distance - limit) / (2 * radius[here])
         return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, place, number)
 
     return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
 
 
 def _lowest(s: Float[Array, "3"], values: Float[Array, "3"]) -> Float[Array, ""]:
-    """The lowest place of the parabola through three values; the middle one where two of the places are the same."""
+    """The lowest place between three of the parabola through their values; the middle one where it has none."""
     a, b = s[1] - s[0], s[2] - s[1]
     rise, fall = values[0] - values[1], values[2] - values[1]
     bend = a * fall + b * rise
-    is_between = (a > 0) & (b > 0) & (bend > 0)
-    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(is_between, bend, 1.0))
-    return s[1] + jnp.where(is_between, shift, 0.0)
+    has_lowest = bend > 0
+    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(has_lowest, bend, 1.0))
+    return jnp.where(has_lowest, jnp.clip(s[1] + shift, s[0], s[2]), s[1])
 
 
 def _parts(windows: int, count: int) -> Int[Array, "w p"]:

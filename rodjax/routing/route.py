@@ -39,6 +39,8 @@ SEGMENTS = 48
 RESERVE = 1e-3
 TOLERANCE = 1e-6
 ITERATIONS = 100
+# SLSQP begins as if second derivatives by the variables in 0 to 1 were so much, as a part of the objective.
+FIRST_CURVATURE = 0.3
 # A start is drawn so many times, of which the first counts whose clips leave the rod long enough between them; where
 # it has no equilibrium it is drawn again, so often.
 DRAWS = 64
@@ -253,6 +255,9 @@ class _Fleet:
         first = np.where(np.any(spare > 0, axis=1), np.argmax(spare > 0, axis=1), np.argmax(spare, axis=1))
         return designs[np.arange(count), first]
 
+    def _spare(self, design: Float[np.ndarray, "n"]) -> float:
+        return float(spare_lengths(self._problem, jnp.asarray(design)[None])[0])
+
     def _solved_cold(self, designs: Float[np.ndarray, "k n"]) -> Equilibrium:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConvergedWarning)
@@ -264,11 +269,11 @@ class _Fleet:
         count, self._reserve = len(self._starts), reserve
         first = self.evaluate({k: Asked(start, False) for k, start in enumerate(self._starts)})
         usable = [abs(numbers.objective) for numbers in first.values() if numbers.is_valid]
-        scale = usable[0] if usable and usable[0] > 0 else 1.0
-        settings = Settings(scale, reserve, tolerance, iterations)
+        scale = FIRST_CURVATURE * (usable[0] if usable and usable[0] > 0 else 1.0)
+        settings = Settings(scale, reserve, tolerance / FIRST_CURVATURE, iterations)
 
         def search(k: int) -> Callable[[Callable[[Asked], Numbers]], Outcome]:
-            return lambda ask: Search(self._starts[k], first[k], settings, ask).run()
+            return lambda ask: Search(self._starts[k], first[k], settings, ask, self._spare).run()
 
         with tqdm(disable=not self._progress, unit="round") as bar:
 

@@ -12,6 +12,9 @@ PENALTY = 1e3
 # An attempt may take so many solves for each of the most iterations it is allowed: where it needs more, line searches
 # fail one after another.
 SOLVES_PER_ITERATION = 3
+# A trial that would leave so much too little rod between two held places, as a part of its length, and more so than
+# where the search stands, pulls it taut: it is stepped back from without a solve.
+TAUT = 1e-3
 # Slacks are by their logarithm where they are violated so much.
 MOST_VIOLATION = 1e3
 # What SLSQP says, and what is said in its place.
@@ -60,12 +63,19 @@ class _SpentError(Exception):
 
 
 class Search:
-    """One search, from a design that has been evaluated; `ask` gives the `Numbers` of what is `Asked`."""
+    """One search, from a design that has been evaluated; `ask` gives the `Numbers` of what is `Asked`, `spare` by how
+    much the rod of a design is longer than the straight ways between held places.
+    """
 
     def __init__(
-        self, start: Float[np.ndarray, "n"], first: Numbers, settings: Settings, ask: Callable[[Asked], Numbers]
+        self,
+        start: Float[np.ndarray, "n"],
+        first: Numbers,
+        settings: Settings,
+        ask: Callable[[Asked], Numbers],
+        spare: Callable[[Float[np.ndarray, "n"]], float],
     ):
-        self._settings, self._ask = settings, ask
+        self._settings, self._ask, self._spare = settings, ask, spare
         self._at, self._is_usable = start, first.is_valid
         self._last = self._standing = start.tobytes(), _tempered(first)
         self._is_accepted = True
@@ -99,15 +109,17 @@ class Search:
         if self._spent >= SOLVES_PER_ITERATION * self._settings.iterations:
             raise _SpentError
         self._spent += 1
+        if self._spare(design) < min(-TAUT, 2 * self._spare(self._at)):
+            return self._refused()
         found = self._ask(Asked(design.copy(), self._is_accepted))
         self._is_accepted = False
-        if found.is_valid:
-            found = _tempered(found)
-        else:
-            standing = self._standing[1]
-            found = standing._replace(objective=standing.objective + PENALTY * self._settings.scale, is_valid=False)
+        found = _tempered(found) if found.is_valid else self._refused()
         self._last = key, found
         return found
+
+    def _refused(self) -> Numbers:
+        standing = self._standing[1]
+        return standing._replace(objective=standing.objective + PENALTY * self._settings.scale, is_valid=False)
 
     def _stand(self, design: Float[np.ndarray, "n"]) -> Numbers:
         """Evaluated, and from now on what the search comes back to."""

@@ -14,7 +14,7 @@ from rodjax.files import load, save
 from rodjax.guess import Guess
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
-from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Plane, Sphere, Union
+from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Law, Rod
@@ -96,6 +96,7 @@ __all__ = [
     "OnPatch",
     "OnSurface",
     "Pin",
+    "Pipe",
     "Plane",
     "PointForce",
     "Reading",

@@ -28,7 +28,7 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Plane, Sphere, Union
+from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.result import Equilibrium
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free, Pin, Swivel
@@ -112,9 +112,10 @@ FIELDS = {
             ("point", "m", "point of the plane of a half space"),
             ("normal", "1", "direction out of a half space"),
             ("center", "m", "centre of a ball or box"),
-            ("radius", "m", "radius of a ball, capsule or cylinder"),
+            ("radius", "m", "radius of a ball, capsule, pipe or cylinder"),
             ("start", "m", "where the axis of a capsule or cylinder begins"),
             ("end", "m", "where the axis of a capsule or cylinder ends"),
+            ("points", "m", "along the axis of a pipe"),
             ("size", "m", "edges of a box"),
             ("frame", "1", "directions of these edges, in columns"),
             ("triangles", "m", "corners of the triangles of a body"),
@@ -135,7 +136,7 @@ FIELDS = {
     },
 }
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
-OBSTACLES = (Plane, Sphere, Capsule, Cylinder, Box, Union, Mesh)
+OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
 # How deep unions may lie in one another in a file.
 MOST_UNIONS = 2
 # What stands in the attribute `kind` of a group: which of several classes the values are of.

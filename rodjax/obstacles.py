@@ -109,6 +109,26 @@ class Capsule(Obstacle):
         return root(squared_distance_to_segment(point, self.start, self.end)) - self.radius
 
 
+class Pipe(Obstacle):
+    """A pipe with bends, or another cable: all points within a distance of a line through points.
+
+    `points`: (n, 3) [m], n >= 2, one after another; `radius` [m]. Of a rod at rest: `Pipe(result.nodes, radius)`.
+    """
+
+    points: Float[Array, "n 3"]
+    radius: Float[Array, ""]
+
+    def __init__(self, points: Any, radius: Any):
+        self.points = leaf(rows(points, "points", least=2, shape="(n, 3), n >= 2"))
+        if self.points.ndim != 2:
+            raise ValueError(f"points must be numbers of shape (n, 3), got an array of shape {self.points.shape}")
+        self.radius = leaf(positive(radius, "radius"))
+
+    def at(self, point: Float[Array, "3"]) -> Float[Array, ""]:
+        squared = squared_distance_to_segment(point[:, None], self.points[:-1].T, self.points[1:].T)
+        return root(squared[jnp.argmin(jax.lax.stop_gradient(squared))]) - self.radius
+
+
 class Cylinder(Obstacle):
     """A solid cylinder with flat ends. `start`, `end`: (3,) [m], of its axis; `radius` [m]."""
 

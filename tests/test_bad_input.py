@@ -284,6 +284,11 @@ CALLS: dict[str, tuple[Callable, dict[str, Any], dict[str, st.SearchStrategy]]] 
     "Plane": (rj.Plane, dict(point=(0, 0, 0), normal=(0, 0, 1)), dict(point=VECTOR, normal=DIRECTION)),
     "Sphere": (rj.Sphere, dict(center=(0, 0, 0), radius=1.0), dict(center=VECTOR, radius=POSITIVE)),
     "Capsule": (rj.Capsule, SEGMENT, dict(start=VECTOR, end=VECTOR | st.just((0, 0, 0)), radius=POSITIVE)),
+    "Pipe": (
+        rj.Pipe,
+        dict(points=np.eye(3), radius=1.0),
+        dict(points=not_finite((4, 3)) | numbers((4, 3)).filter(lambda value: not is_points(value)), radius=POSITIVE),
+    ),
     "Cylinder": (rj.Cylinder, SEGMENT, dict(start=VECTOR, end=VECTOR | st.just((0, 0, 0)), radius=POSITIVE)),
     "Box": (
         rj.Box,
@@ -364,7 +369,7 @@ def refuses_the_argument(example, world):
 
 for group in (["Rod", "circular", "tube", "poisson"], ["Clamp", "Swivel", "Pin", "Free", "PointForce"]):
     PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument
-for group in (["Plane", "Sphere", "Capsule"], ["Cylinder", "Box", "Mesh"]):
+for group in (["Plane", "Sphere", "Capsule", "Pipe"], ["Cylinder", "Box", "Mesh"]):
     PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument
 for group in (["frame", "rotate"], ["Scene", "Guess"], ["Newton", "NonlinearCG", "LineSearch"]):
     PROPERTIES["arguments of " + ", ".join(group)] = bad_calls(group), refuses_the_argument

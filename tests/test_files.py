@@ -269,6 +269,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     bodies = [
         rj.Plane((0, 0, -2), (0, 0, 1)),
         rj.Cylinder((0, 0, -2), (1, 0, -2), 0.1),
+        rj.Pipe([(0, 0, -2), (1, 0, -2)], 0.1),
         rj.Box((0, 0, -2), (1, 1, 1), np.eye(3)),
         rj.Sphere((0, 0, -2), 0.1),
         rj.Mesh(corners, [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]),

@@ -111,12 +111,14 @@ def test_a_mesh_and_a_union(files):
         'scene = "scene.toml"\n[[obstacles]]\nkind = "mesh"\nfile = "box.stl"\nunit = "1 mm"\n'
         '[[obstacles]]\nkind = "union"\nparts = [{ kind = "sphere", center = "[1, 0, 0] m", radius = "1 dm" }, '
         '{ kind = "plane", point = "[0, 0, -1] m", normal = [0, 0, 2] }]\n'
+        '[[obstacles]]\nkind = "pipe"\npoints = "[[0, 0, 0], [40, 0, 0], [40, 30, 0]] mm"\nradius = "5 mm"\n'
     )
     read = read_route_file("a.toml")
-    assert read.names == ("obstacle 0", "obstacle 1")
+    assert read.names == ("obstacle 0", "obstacle 1", "obstacle 2")
     assert read.limits is None
     np.testing.assert_allclose(read.obstacles[0].distance([[0.06, 0, 0]]), 0.01, rtol=1e-6)
     np.testing.assert_allclose(read.obstacles[1].distance([[1, 0, 0.3], [0, 0, 0]]), [0.2, 0.9])
+    np.testing.assert_allclose(read.obstacles[2].distance([[0.02, 0.01, 0], [0.05, 0.02, 0]]), [0.005, 0.005])
 
 
 def test_clips_may_vary_by_their_keys(files):

@@ -38,6 +38,7 @@ A complete example; quantities are as in scene files, a number and any unit of t
 The keys of an obstacle, besides its kind and name:
 
 - "plane": point, normal; "sphere": center, radius; "capsule" and "cylinder": start, end, radius
+- "pipe", with bends, or another cable: points = "[[0, 0, 0], [100, 0, 0], [100, 80, 0]] mm", radius
 - "box": center, size [frame = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], its columns along the edges]
 - "mesh": file = "engine.stl", in a folder as seen from this file [unit = "1 mm", that of the file; without it metres]
 - "union": parts, a list of obstacles without names
@@ -81,7 +82,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
-from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Plane, Sphere, Union
+from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.quantities import (
     OF_TABLES,
     QUANTITIES,
@@ -105,6 +106,7 @@ OBSTACLES: dict[str, tuple[Callable[..., Obstacle], tuple[str, ...], tuple[str, 
     "plane": (Plane, ("point", "normal"), ()),
     "sphere": (Sphere, ("center", "radius"), ()),
     "capsule": (Capsule, ("start", "end", "radius"), ()),
+    "pipe": (Pipe, ("points", "radius"), ()),
     "cylinder": (Cylinder, ("start", "end", "radius"), ()),
     "box": (Box, ("center", "size"), ("frame",)),
 }

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.compilation import compiled
-from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Plane, Sphere, Union
+from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.plot import quads
 from rodjax.triangle_mesh import Mesh
 
@@ -66,6 +66,9 @@ def _faces(obstacle: Obstacle, region: Region) -> Faces:
     if isinstance(obstacle, Capsule | Cylinder):
         has_caps = isinstance(obstacle, Capsule)
         return round_faces(obstacle.start, obstacle.end, float(obstacle.radius), region.extent, has_caps)
+    if isinstance(obstacle, Pipe):
+        ends = itertools.pairwise(np.asarray(obstacle.points))
+        return np.concatenate([round_faces(*pair, float(obstacle.radius), region.extent, True) for pair in ends])
     if isinstance(obstacle, Box):
         return _box(obstacle, region.extent)
     if isinstance(obstacle, Mesh):

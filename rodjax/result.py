@@ -19,7 +19,12 @@ from rodjax.discretization.error import Errors, errors_of_differences, errors_of
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
+from rodjax.discretization.framed_results import (
+    clip_moments_of_frames,
+    errors_of_frames,
+    positions_between_frames,
+    resultants_of_frames,
+)
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
@@ -328,6 +333,8 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        return clip_moments_of_frames(form, point) * equilibrium.state.units.energy
     assert isinstance(form, MixedForm)
     return clip_moments(form, point) * equilibrium.state.units.energy
 

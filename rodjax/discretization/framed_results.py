@@ -99,6 +99,24 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
     return NodeStrains(moments, strains, axial, dot(mean, tangent(q)))
 
 
+def strains_beside_nodes(
+    form: FrameForm, point: FramePoint
+) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
+    """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
+    field, own = form.field, own_moments(form, point)
+    moments = jnp.stack([-own[:, 0], own[:, 2]], axis=1)
+    q = field.of_cells(point.quaternions)[:, ::2]
+    tension = dot(form.forces(point.quaternions, point.end_force)[:, ::2], tangent(q))
+    sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
+    sections = eqx.combine(sections, form.sections)
+    strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
+    s = field.strain_places[::2]
+    rest = form.scene.rod.rest_shape
+    if rest is not None:
+        strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
+    return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
+
+
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
     """What the clips apply to the rod, nondimensional: the jumps of the section moment."""
     assert isinstance(form, ClippedFrameForm)

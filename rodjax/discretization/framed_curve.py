@@ -43,7 +43,10 @@ class FramedCurve(Shape):
         return FramedCurve(form.nodes(form.edges(point)), point.quaternions, form.field.s)
 
     def change_to(self, other: Any) -> Float[Array, ""]:
-        return jnp.max(jnp.abs(other.nodes - self.nodes))
+        # A straight rod may twist in its place.
+        of_frames = jnp.max(jnp.abs(nearer(other.quaternions, self.quaternions) - self.quaternions))
+        of_nodes = jnp.max(jnp.abs(other.nodes - self.nodes))
+        return jnp.where(of_nodes > of_frames, of_nodes, of_frames)
 
     def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> "FramedCurve":
         before = nearer(older.quaternions, self.quaternions)

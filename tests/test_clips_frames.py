@@ -288,11 +288,11 @@ def test_a_clip_off_that_shape_bends_the_rod():
 # --- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def with_changes(scene: Scene, by) -> Scene:
-    """Clips moved along the rod and in space, and turned."""
+def with_changes(scene: Scene, frames: list, by) -> Scene:
+    """Clips moved along the rod and in space, and turned. `frames`: of those that hold a tangent."""
     clips = []
-    for clip, change in zip(scene.clips, by, strict=True):
-        tangent = None if clip.tangent is None else rotate(frame(clip.tangent), change[4:])[:, 2]
+    for clip, at_rest, change in zip(scene.clips, frames, by, strict=True):
+        tangent = None if clip.tangent is None else rotate(at_rest, change[4:])[:, 2]
         held = None if clip.frame is None else rotate(clip.frame, change[4:])
         clips.append(Clip(clip.at + change[0] / 10, clip.position + change[1:4] / 10, tangent, frame=held))
     return Scene(scene.rod, scene.start, scene.end, scene.gravity, clips=clips)
@@ -316,9 +316,10 @@ def test_derivatives_by_place_position_and_frame(is_plain):
     base = rj.solve(scene, **options)
     assert base.converged
     direction = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (len(scene.clips), 7)))
+    frames = [None if clip.tangent is None else frame(clip.tangent) for clip in scene.clips]
 
     def found(by):
-        return numbers(rj.solve(with_changes(scene, by), guess=base, **options))
+        return numbers(rj.solve(with_changes(scene, frames, by), guess=base, **options))
 
     @jax.jit
     def derivatives(weights):

@@ -263,7 +263,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
             assert all(FIELDS[place])
 
     scene = single.scene
-    clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True)]
+    clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True), Clip(0.6, (0.45, 0.0, 0.0), frame=np.eye(3))]
     clipped = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, clips=clips)
     corners = [(0, 0, -1), (1, 0, -1), (0, 1, -1), (0, 0, -2)]
     bodies = [

@@ -178,8 +178,9 @@ def test_the_difference_to_a_rod_by_tangents_is_of_fourth_order(end, with_tangen
         sizes = [np.max(np.abs(np.asarray(getattr(plain, field)))) + 1e-3 for field in FIELDS[1:]]
         shape = np.max(np.linalg.norm(framed.nodes - plain.position_at(framed.s), axis=1))
         errors.append(np.array([shape, *(np.max(np.abs(x)) / y for x, y in zip(differences, sizes, strict=True))]))
-    # What is left of the next order: 12 per cent of the error with 64 elements, with 128 eight.
-    np.testing.assert_allclose(framed.error_estimate, shape, rtol=0.3)
+    # Bent this sharply the next orders are large: 22 per cent with 32 elements, 12 with 64, 8 with 128, in other scenes
+    # more; always on the safe side.
+    assert 0.9 * shape < framed.error_estimate < 1.5 * shape
     # Those that are no rounding.
     orders = np.log2(errors[0] / errors[1])[errors[1] > 1e-10]
     assert np.min(orders) > 3.5
@@ -201,6 +202,7 @@ def cut() -> tuple[rj.Equilibrium, list[rj.Equilibrium]]:
     return whole, halves
 
 
+@pytest.mark.slow
 def test_spans_between_held_frames_are_rods_of_their_own(cut):
     whole, (first, second) = cut
     assert whole.converged
@@ -229,6 +231,7 @@ def beam() -> rj.Equilibrium:
     return rj.solve(scene, segments=32, solver=TIGHT)
 
 
+@pytest.mark.slow
 def test_a_flat_continuous_beam_is_that_of_three_moments(beam):
     """Across d1 and across d2, with the same reactions, and curvatures by the stiffness of each."""
     moments, reactions = three_moments([0.25, 0.375, 0.375], 1e-3, clamped=True)
@@ -372,7 +375,7 @@ def test_loads_without_a_potential_are_carried():
         assert result.converged
         frames, weights = result.frames[:, :, :2], np.gradient(np.asarray(result.s))
         weights[[0, -1]] /= 2
-        along = np.einsum("k,kij,j->i", weights, frames, np.array([4.0, 3.0]) * 0 + [0.0, 4.0])
+        along = np.einsum("k,kij,j->i", weights, frames, np.array([0.0, 4.0]))
         along += 3.0 * weights @ np.asarray(result.tangents)
         at_end = np.asarray(result.frames[-1]) @ np.array([1.0, 0.5, 2.0])
         np.testing.assert_allclose(result.end_force, at_end, rtol=1e-12)
@@ -410,8 +413,6 @@ def test_the_rod_spins_with_a_single_held_frame(start):
     result = rj.solve(scene, segments=16)
     assert result.converged
     np.testing.assert_allclose(result.frames[node_at(result, 0.4)], clip.frame, atol=1e-14)
-    torques = np.einsum("ki,ki->k", result.tangents, np.cross(result.nodes, 0.0 * result.nodes))
-    np.testing.assert_allclose(torques, 0.0)
     # Without a torque at the ends there is none along a rod whose stiffnesses are the same.
     np.testing.assert_allclose(result.twist, 0.0, atol=1e-4)
 

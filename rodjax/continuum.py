@@ -122,7 +122,7 @@ def solve_continuum(
     if segments is None:
         segments = max(DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1, least)
     if scene.clips and needs_frames(scene):
-        raise ValueError("clips must be () for a rod or loads that need frames along the rod")
+        raise ValueError("clips must be () in the continuum for a rod, loads or clips that need frames along the rod")
     if scene.obstacles:
         raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.

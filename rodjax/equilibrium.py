@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
+from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.error import Errors
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.form import Form, Point
@@ -288,18 +289,23 @@ def checked_options(
         solver = DEFAULT_SOLVER
     instance(solver, "solver", typing.get_args(Solver))
     if discretization is None:
-        discretization = _discretization(guess, segments, solver)
+        discretization = _discretization(scene, guess, segments, solver)
     one_of(discretization, "discretization", typing.get_args(Discretization))
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
     if needs_frames(scene):
         if isinstance(solver, NonlinearCG):
-            raise ValueError("solver must be a Newton for a rod or loads that need frames along the rod")
+            raise ValueError("solver must be a Newton for a rod, loads or clips that need frames along the rod")
         if planar:
-            raise ValueError("planar must be False for a rod or loads that need frames along the rod")
+            raise ValueError("planar must be False for a rod, loads or clips that need frames along the rod")
     if scene.clips:
-        if needs_frames(scene):
-            raise ValueError("clips must be () for a rod or loads that need frames along the rod")
+        if needs_frames(scene) and discretization == "finite_difference":
+            raise ValueError(
+                "discretization must be 'hermite' for clips on a rod, or with loads or clips, that need frames along "
+                "the rod"
+            )
+        if needs_frames(scene) and slides(scene):
+            raise ValueError("clips must not be sliding for a rod, loads or clips that need frames along the rod")
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
         if planar:
@@ -353,10 +359,14 @@ def checked_rtol(rtol: Any) -> float:
     return value
 
 
-def _discretization(guess: Guess | Equilibrium | None, segments: int | None, solver: Solver) -> Discretization:
+def _discretization(
+    scene: Scene, guess: Guess | Equilibrium | None, segments: int | None, solver: Solver
+) -> Discretization:
     """The one to take where none is asked for."""
     if isinstance(solver, NonlinearCG):
         return "finite_difference"
+    if scene.clips and needs_frames(scene):
+        return "hermite"
     if segments is None and isinstance(guess, Equilibrium) and _is_by_differences(guess.state.shape):
         return "finite_difference"
     return "hermite"
@@ -418,15 +428,19 @@ def _first_state(
         shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
     else:
         shape = kind.through(state.shape.points(pieces))
-    end_force = state.end_force
-    if end_force.shape != no_force.shape:
-        # Of a scene with other clips: the force at the end in all spans.
-        last = end_force if end_force.ndim == 1 else end_force[:, -1]
-        end_force = last if no_force.ndim == 1 else jnp.broadcast_to(last[:, None], no_force.shape)
+    end_force = _in_spans(state.end_force, no_force.shape)
     places = sliding_places(scaled)
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
     return SolverState(shape, end_force, state.units, places), guess.total_twist
+
+
+def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Float[Array, "3 *others"]:
+    """What is known of the force at s = L; of a scene with other clips: the force at the end in all spans."""
+    if end_force.shape == shape:
+        return end_force
+    last = end_force if end_force.ndim == 1 else end_force[:, -1]
+    return last if len(shape) == 1 else jnp.broadcast_to(last[:, None], shape)
 
 
 def _first_frames(
@@ -436,11 +450,12 @@ def _first_frames(
     of_joints = options.discretization == "finite_difference"
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
-    no_force = jnp.zeros(3, s.dtype)
+    no_force = jnp.zeros(force_shape(scene, options.segments), s.dtype)
     if isinstance(guess, Equilibrium):
         shape, twist = guess.state.shape, guess.total_twist
         if isinstance(shape, FramedCurve):
-            return SolverState(shape.on(s, of_joints), guess.state.end_force, guess.state.units), twist
+            end_force = _in_spans(guess.state.end_force, no_force.shape)
+            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), twist
         points = _in_units(guess.state, units).shape.points(pieces)
         return SolverState(framed_through(scene, points, of_joints), no_force, units), twist
     if guess is not None:
@@ -546,8 +561,11 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
     scene, shape, field = form.scene, guess.shape, form.field
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        quaternions = shape.turned_to_ends(scene, form.field, twist)
-        end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
+        quaternions = shape.turned_to_ends(form, twist)
+        if isinstance(form, ClippedFrameForm):
+            end_force = form.force_change(form.of_force(guess.end_force))
+        else:
+            end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
         return shape, form.holding(FramePoint(quaternions, end_force, twist))
     if isinstance(form, PartedForm):
         end_force = form.force_change(form.of_force(guess.end_force))

@@ -35,8 +35,10 @@ from rodjax.supports import Clamp, Free, Pin, Swivel
 from rodjax.triangle_mesh import Mesh
 
 SUFFIX = ".vtkhdf"
-# Of the group /rodjax. Raise it where an older rodjax could not read what this one writes.
-FORMAT = 7
+# Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
+# that this one reads where fields are asked for that the older ones lack.
+FORMAT = 8
+OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -105,6 +107,7 @@ FIELDS = {
     "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
     "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
+    "scene/clips/*/frame": ("1", "frame that a clip holds, columns d1, d2, t, global axes"),
     **{
         f"scene/obstacles/*{part}/{name}": (unit, f"{description}, global axes")
         for part in ("", "/obstacles/*", "/obstacles/*/obstacles/*")
@@ -255,10 +258,10 @@ def _check_format(group: h5py.Group, path: Path) -> None:
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
             f"this rodjax reads formats up to {FORMAT}: update it"
         )
-    if written < FORMAT:
+    if written < OLDEST_FORMAT:
         raise ValueError(
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}, which lacks fields of "
-            f"format {FORMAT}: solve its scene again"
+            f"format {OLDEST_FORMAT}: solve its scene again"
         )
 
 

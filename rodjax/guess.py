@@ -112,7 +112,7 @@ def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
     any_direction = jnp.array([1.0, 0.0, 0.0], s.dtype)
     held: list[Support] = [scene.start]
     for before, clip, after in zip(positions, clips, positions[2:], strict=False):
-        tangent = clip.tangent
+        tangent = clip.direction
         if tangent is None:
             line = (clip.position if after is None else after) - (clip.position if before is None else before)
             tangent = _direction(line, any_direction)

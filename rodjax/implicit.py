@@ -127,7 +127,7 @@ def _change(
 
     def reached(scene: Scene, motion: Motion) -> tuple[Shape, Point]:
         form, there = carried_to(scene, shape, point, motion)
-        return shape.reached(form, there), there
+        return shape.reached(form, there), form.settled(there)
 
     form, begin = carried_to(scene, shape, point)
     here = form.linearized(begin)

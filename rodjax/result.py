@@ -25,7 +25,13 @@ from rodjax.discretization.error import (
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_results import errors_of_frames, positions_between_frames, resultants_of_frames
+from rodjax.discretization.framed_results import (
+    clip_moments_of_frames,
+    errors_of_frames,
+    positions_between_frames,
+    resultants_of_frames,
+    strains_beside_nodes,
+)
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
@@ -38,6 +44,7 @@ from rodjax.sliding import slide
 from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
+from rodjax.vectors import dot, root
 
 # A rod deeper within an obstacle than this part of its radius is so by forces beyond all loads on it, as in a jam.
 MOST_PENETRATION = 1e-4
@@ -80,7 +87,9 @@ class Equilibrium(eqx.Module):
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
-      position, zero where it holds no direction; the moments are computed when they are asked for
+      position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
+      when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
+      just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
@@ -333,8 +342,30 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        return clip_moments_of_frames(form, point) * equilibrium.state.units.energy
     assert isinstance(form, MixedForm)
     return clip_moments(form, point) * equilibrium.state.units.energy
+
+
+class Sides(eqx.Module):
+    """Arclengths [m] of both ends of each element in turn; curvature [1/m], twist [rad/m] and axial strain there."""
+
+    s: Float[Array, "... 2n"]
+    curvature: Float[Array, "... 2n"]
+    twist: Float[Array, "... 2n"]
+    axial_strain: Float[Array, "... 2n"]
+
+
+@over_leading_axes
+def beside_nodes(equilibrium: Equilibrium) -> Sides:
+    """Of an equilibrium on elements whose frames are unknown, on both sides of its nodes: at clips they jump."""
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, FrameForm)
+    s, strains, axial = strains_beside_nodes(form, point)
+    length = equilibrium.state.units.length
+    curvature = root(dot(strains[:2], strains[:2]))
+    return Sides(s * length, curvature / length, strains[2] / length, axial)
 
 
 @over_leading_axes

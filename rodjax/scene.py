@@ -35,7 +35,8 @@ class Scene(eqx.Module):
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
-        total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only.
+        total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only, and
+        no clip with a frame between them: there an earlier equilibrium as a guess carries the turns of each span.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
@@ -121,6 +122,11 @@ def _check_supports(scene: Scene) -> None:
             raise ValueError("clips must be () where a moment acts on a free end: the two together are not supported")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
+    if scene.turns is not None and any(clip.frame is not None for clip in scene.clips):
+        raise ValueError(
+            "turns must be None where a clip has a frame: each span between held frames has turns of its own, which an "
+            "earlier equilibrium as a guess carries"
+        )
 
 
 def _check_obstacles(scene: Scene) -> None:
@@ -129,7 +135,7 @@ def _check_obstacles(scene: Scene) -> None:
     if scene.rod.radius is None:
         raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
     if needs_frames(scene):
-        raise ValueError("obstacles must be () for a rod or loads that need frames along the rod")
+        raise ValueError("obstacles must be () for a rod, loads or clips that need frames along the rod")
     if scene.rod.length.dtype != jnp.float64:
         raise ValueError(
             "obstacles must be () in single precision, in which contacts have no digits: "
@@ -191,12 +197,19 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     def support(end: Support, other: Support) -> Support:
         mixed = jax.tree.map(number, end, other)
         if isinstance(end, Clamp) and isinstance(other, Clamp):
-            turn = Rotation.from_matrix(end.frame.T @ other.frame).as_rotvec()
-            frame = end.frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
-            return eqx.tree_at(lambda mixed: mixed.frame, mixed, frame)
+            return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(end.frame, other.frame))
         if isinstance(end, Swivel):
             return Swivel(mixed.position, mixed.tangent)
         return mixed
+
+    def turned(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        turn = Rotation.from_matrix(frame.T @ other).as_rotvec()
+        return frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
+
+    def clip(mixed: Clip, first: Clip, other: Clip) -> Clip:
+        if first.frame is None or other.frame is None:
+            return Clip(mixed.at, mixed.position, mixed.tangent, mixed.sliding)
+        return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(first.frame, other.frame))
 
     def number(a, b):
         return a + fraction * (b - a)
@@ -206,7 +219,7 @@ def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
     if not scene.clips:
         return mixed
-    clips = tuple(Clip(clip.at, clip.position, clip.tangent, clip.sliding) for clip in mixed.clips)
+    clips = tuple(clip(*of_three) for of_three in zip(mixed.clips, scene.clips, other.clips, strict=True))
     return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
 
 
@@ -255,8 +268,10 @@ def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
 
 
 def needs_frames(scene: Scene) -> bool:
-    """Whether the rod or its loads ask for the angle of the sections about the tangent, all along the rod."""
-    return bool(scene.distributed) or not scene.rod.is_plain or _follows(scene.start) or _follows(scene.end)
+    """Whether the rod, its loads or clips ask for the angle of the sections about the tangent, all along the rod."""
+    holds_frames = any(clip.frame is not None for clip in scene.clips)
+    follows = _follows(scene.start) or _follows(scene.end)
+    return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames
 
 
 def _follows(end: Support) -> bool:

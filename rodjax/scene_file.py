@@ -41,6 +41,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # at = "0.4 m"
     # position = "[0.3, 0, -0.05] m"
     # tangent = [1, 0, 0]          # optional: where the clip holds the direction of the rod, too
+    # d2 = [0, 1, 0]               # optional, with tangent or spin: where it holds the twist, too, as a clamp does; or
+    # spin = "90 deg"              # frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]] with or without spin
     # sliding = true               # optional: where the rod slides through; the search for its place begins at `at`
 
     [solve]                        # optional
@@ -225,7 +227,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
             if isinstance(load, kind):
                 lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
     for clip in scene.clips:
-        lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent"))]
+        lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
         lines += ["sliding = true"] if clip.sliding else []
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
@@ -440,17 +442,22 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
-        if "frame" in values and "d2" in values:
-            raise SceneFileError(
-                f"{where}.d2 is not allowed together with {where}.frame, which has d2 as its second column"
-            )
-        values = {"spin": np.zeros(())} | ({} if "frame" in values else {"d2": np.array([0.0, 1.0, 0.0])}) | values
+        values = _frame_values(values, where)
         if abs(values["spin"]) > math.pi:
             raise SceneFileError(
                 f"{where}.spin must lie in -180 deg to 180 deg in the first scene, got {table['spin']!r}; "
                 "turn further along a [[path]], or by whole turns with end.turns"
             )
     return values
+
+
+def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """With what is left out of a frame, or of a tangent that makes one."""
+    if "frame" in values and "d2" in values:
+        raise SceneFileError(
+            f"{where}.d2 is not allowed together with {where}.frame, which has d2 as its second column"
+        )
+    return {"spin": np.zeros(())} | ({} if "frame" in values else {"d2": np.array([0.0, 1.0, 0.0])}) | values
 
 
 def _loads(
@@ -476,11 +483,33 @@ def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
     clips = []
     for k, table in enumerate(table_list(tables, "clips")):
         where = f"clips[{k}]"
-        values = reader.si_values(table, where, ("at", "position"), ("tangent",), other=("sliding",))
+        optional = ("tangent", "frame", "d2", "spin")
+        values = reader.si_values(table, where, ("at", "position"), optional, other=("sliding",))
         sliding = flag(table, where, "sliding")
+        if "frame" in values and "tangent" in values:
+            raise SceneFileError(
+                f"{where}.tangent is not allowed together with {where}.frame, whose third column it is"
+            )
         with named(where):
-            clips.append(Clip(**values, sliding=sliding))
+            clips.append(
+                Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
+            )
     return clips
+
+
+def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """The tangent that a clip holds, or the frame, made as that of a clamp is; nothing where it holds neither."""
+    if not any(key in values for key in ("frame", "d2", "spin")):
+        return {"tangent": values["tangent"]} if "tangent" in values else {}
+    if "frame" not in values and "tangent" not in values:
+        raise SceneFileError(f"{where}.tangent or {where}.frame is needed where {where} has d2 or spin")
+    values = _frame_values(values, where)
+    if abs(values["spin"]) > math.pi:
+        raise SceneFileError(
+            f"{where}.spin must lie in -180 deg to 180 deg, got {math.degrees(float(values['spin'])):g} deg"
+        )
+    placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
+    return {"frame": _spun(placed, float(values["spin"]))}
 
 
 def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:

@@ -99,30 +99,50 @@ class Free(Support):
 
 
 class Clip(eqx.Module):
-    """What holds a place between the ends of a rod: its position, and its direction too where `tangent` is given.
+    """What holds a place between the ends of a rod: its position; its direction too where `tangent` is given; direction
+    and twist where `frame` is.
 
     `at`: arclength s [m], between 0 and L; `position`: (3,) [m]; `tangent`: (3,), any nonzero vector along the rod,
-    which is free to spin in the clip, or `None` for a rod that is free to turn there. `sliding`: the rod slides
-    through without friction, so that no axial force acts on it there; where it passes the clip is then unknown, and
-    `at` where the search for that begins.
+    which is free to spin in the clip; `frame`: (3, 3), columns d1, d2, t, a rotation, as that of a `Clamp`: then
+    `tangent` is `None`. Without both the rod is free to turn there. `sliding`: the rod slides through without friction,
+    so that no axial force acts on it there; where it passes the clip is then unknown, and `at` where the search for
+    that begins.
+
+    A rod in a clip that holds its twist is solved by frames along it, as one whose section is not round is: by elements
+    of a `Newton`, and without obstacles; such rods slide through no clips.
+
+    Raises `ValueError` where both `tangent` and `frame` are given, and for a `frame` in a sliding clip.
     """
 
     at: Float[Array, ""]
     position: Float[Array, "3"]
     tangent: Float[Array, "3"] | None
+    frame: Float[Array, "3 3"] | None
     sliding: bool = eqx.field(static=True)
 
-    def __init__(self, at: Any, position: Any, tangent: Any = None, sliding: bool = False):
+    def __init__(self, at: Any, position: Any, tangent: Any = None, sliding: bool = False, frame: Any = None):
         instance(sliding, "sliding", bool)
+        if tangent is not None and frame is not None:
+            raise ValueError("tangent must be None where frame is given, which has it as its third column")
+        if sliding and frame is not None:
+            raise ValueError(
+                "sliding must be False where frame is given: a rod that slides while its twist is held is not supported"
+            )
         self.sliding = sliding
         self.at = leaf(positive(at, "at"))
         self.position = leaf(vector(position, "position"))
         self.tangent = None if tangent is None else leaf(direction(tangent, "tangent"))
+        self.frame = None if frame is None else leaf(rotation(frame, "frame"))
 
     def in_units(self, units: Units) -> "Clip":
         """The same clip in the units of the rod: see `rodjax.scene.nondimensional`."""
         position = (self.position - units.origin) / units.length
-        return Clip(self.at / units.length, position, self.tangent, self.sliding)
+        return Clip(self.at / units.length, position, self.tangent, self.sliding, self.frame)
+
+    @property
+    def direction(self) -> Float[Array, "3"] | None:
+        """The direction along the rod that it holds; `None` where it holds none."""
+        return self.tangent if self.frame is None else self.frame[:, 2]
 
 
 # The supports that hold the position, and those that also hold the tangent; a `Clamp` alone holds the twist.

@@ -43,7 +43,7 @@ from rodjax import (
     solve_path,
 )
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.files import FIELDS, FORMAT, load, point_data, save
+from rodjax.files import FIELDS, FORMAT, OLDEST_FORMAT, load, point_data, save
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
 CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))
@@ -263,7 +263,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
             assert all(FIELDS[place])
 
     scene = single.scene
-    clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True)]
+    clips = [Clip(0.5, (0.4, 0.0, 0.0), (1.0, 0.0, 0.0), sliding=True), Clip(0.6, (0.45, 0.0, 0.0), frame=np.eye(3))]
     clipped = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, clips=clips)
     corners = [(0, 0, -1), (1, 0, -1), (0, 1, -1), (0, 0, -2)]
     bodies = [
@@ -511,6 +511,13 @@ def test_what_a_file_lacks_is_named(missing, message, saved):
         del file[missing]
     with pytest.raises(ValueError, match=rf"rod\.vtkhdf {message}"):
         load(saved)
+
+
+def test_the_oldest_format_that_lacks_nothing_is_read(saved):
+    expected = load(saved)
+    with h5py.File(saved, "r+") as file:
+        file["rodjax"].attrs.update({"format": OLDEST_FORMAT, "version": "0.0"})
+    jax.tree.map(np.testing.assert_array_equal, load(saved), expected)
 
 
 def test_other_and_absent_formats_are_refused(saved):

@@ -15,11 +15,11 @@ from typing import Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.along import Steps, stiffness_at
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
-from rodjax.discretization.nodes import with_nodes_at
+from rodjax.discretization.nodes import with_nodes_at, with_nodes_at_clips
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod
@@ -204,14 +204,18 @@ class ElementCells(eqx.Module):
     Seen from its middle, the frame in an element turns by the rotation vector v(s), a parabola through those of both
     ends: helices are exact. The strains at the three points enter with Simpson's weights. As in `hermite`, the length
     of v is the angle as far as its tenth power, and beyond grows without bound as this approaches pi.
+    `clip_nodes`: the numbers of the nodes at which clips hold the rod, where there are clips.
     """
 
     s: Float[Array, "n+1"]
+    clip_nodes: Int[Array, "clips"] | None = None
 
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "ElementCells":
-        """On these nodes, moved so that one lies at each point force and at each jump of the rod."""
+        """On these nodes, moved so that one lies at each clip, each point force and each jump of the rod."""
         places = [load.at for load in scene.point_forces] + [jump for steps in varying(scene) for jump in steps]
+        if scene.clips:
+            return ElementCells(*with_nodes_at_clips(scene, s, places))
         return ElementCells(with_nodes_at(s, jnp.sort(jnp.stack(places)), may_repeat=True) if places else s)
 
     @property

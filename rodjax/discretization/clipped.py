@@ -1,13 +1,9 @@
 """A rod in clips: the mixed form with a force of its own in each span.
 
-Clips part the rod into spans. Under dead loads the force in every point of a span is known up to one vector, the end
-force that the span sees: the force at s = L and the forces of the clips beyond. Each span between two held places has
-one, the multiplier of its closure, so that the system of `mixed` has a wider border and nothing else changes. What a
-clip applies to the rod is the difference of the forces on its two sides. A clip that holds the tangent takes the
-rotations of its node, as a clamp does at an end.
+Clips part the rod into spans (`spans`), so that the system of `mixed` has a wider border and nothing else changes. A
+clip that holds the tangent takes the rotations of its node, as a clamp does at an end.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,62 +11,29 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.mixed import MixedPoint, Stretched
 from rodjax.discretization.parted import PartedForm
+from rodjax.discretization.spans import SpannedForm, span_of_cells
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
 from rodjax.scene import Scene
-from rodjax.supports import Held
 from rodjax.vectors import dot
 
 
-class ClippedForm(PartedForm):
-    """A nondimensional scene with clips on a field of tangents; the `end_force` of its points is (3, spans).
-
-    `span_of`: 1 where a cell belongs to a span, else 0.
-    """
-
-    span_of: Float[Array, "spans n"] = eqx.field(kw_only=True)
+class ClippedForm(SpannedForm, PartedForm):
+    """A nondimensional scene with clips on a field of tangents."""
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "ClippedForm":
         side_forces = field.side_forces(scene)
         forces_beyond = field.of_points(field.side_weights[None] * side_forces) / field.weights[None]
         assert field.clip_nodes is not None
-        cells = jnp.arange(side_forces.shape[-1])
-        span = jnp.sum(cells[None] >= field.clip_nodes[:, None], axis=0)
-        spans = jnp.arange(len(scene.clips) + 1)
         return cls(
             scene=scene,
             field=field,
             forces_beyond=forces_beyond,
             force_spread=None,
             side_forces=side_forces,
-            span_of=(span[None] == spans[:, None]).astype(forces_beyond.dtype),
+            span_of=span_of_cells(scene, field.clip_nodes, side_forces.shape[-1], forces_beyond.dtype),
         )
-
-    def of_cells(self, end_force: Float[Array, "3 spans"]) -> Float[Array, "3 n"]:
-        return end_force @ self.span_of
-
-    @property
-    def _closed(self) -> slice:
-        """The spans between two held places."""
-        count = len(self.scene.clips) + 1
-        first = 0 if isinstance(self.scene.start, Held) else 1
-        return slice(first, count if isinstance(self.scene.end, Held) else count - 1)
-
-    @property
-    def _closures(self) -> int:
-        return 3 * (self._closed.stop - self._closed.start)
-
-    def of_force(self, vector: Float[Array, "3 spans"]) -> Float[Array, "c"]:
-        return vector[:, self._closed].T.reshape(-1)
-
-    def force_turned(self, point: MixedPoint, axis: Float[Array, "3"]) -> Float[Array, "c"]:
-        return self.of_force(jnp.cross(axis[:, None], point.end_force, axis=0))
-
-    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3 spans"]:
-        closed = self._closed
-        beyond = len(self.scene.clips) + 1 - closed.stop
-        return jnp.pad(closure.reshape(-1, 3).T, ((0, 0), (closed.start, beyond)))
 
     def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3 spans"]:
         return ways @ self.span_of.T

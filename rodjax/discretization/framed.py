@@ -12,12 +12,12 @@ Couples, follower loads and dead moments have no potential. Their virtual work e
 change far away makes the matrix full, and the method Newton's own on all of it.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.along import Along
 from rodjax.discretization.cells import REFERENCE, Cells, ElementCells, Frames, JointCells
@@ -29,7 +29,7 @@ from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rotations import Vector, columns, from_frame, inner, inverse, nearer, rotated, swung, tangent, turned, unit
 from rodjax.scene import Scene, has_potential, held_position
 from rodjax.staging import staged
-from rodjax.supports import Clamp, Free, Held, Swivel
+from rodjax.supports import Clamp, Directed, Free, Held
 from rodjax.vectors import components, dot
 
 
@@ -37,7 +37,7 @@ class FramePoint(eqx.Module):
     """Frames along the rod; the force at s = L between held ends, else zero; the total twist [rad], where known."""
 
     quaternions: Float[Array, "4 m"]
-    end_force: Float[Array, "3"]
+    end_force: Float[Array, "3 *spans"]
     total_twist: Float[Array, ""]
 
     @property
@@ -57,6 +57,14 @@ class Strained(eqx.Module):
     tangents: Float[Array, "3 p n"]
 
 
+class HeldFrame(NamedTuple):
+    """What a support holds of the frame of this number: its tangent, or where `frame` is given all of it."""
+
+    number: int | Int[Array, ""]
+    tangent: Float[Array, "3"]
+    frame: Float[Array, "3 3"] | None
+
+
 class FrameForm(Form):
     """A nondimensional scene on cells, as a function of a `FramePoint`.
 
@@ -72,17 +80,9 @@ class FrameForm(Form):
     loads: Float[Array, "3 k n"]
     axes: Float[Array, "3 a"] | None = None
 
-    @staticmethod
-    def of(scene: Scene, field: Cells) -> "FrameForm":
-        rest_strains, rest_ways = _at_rest(scene, field)
-        return FrameForm(
-            scene=scene,
-            field=field,
-            sections=field.sections(scene.rod),
-            rest_strains=rest_strains,
-            rest_ways=rest_ways,
-            loads=_dead_loads(scene, field),
-        )
+    @classmethod
+    def of(cls, scene: Scene, field: Cells) -> "FrameForm":
+        return cls(**parts_of(scene, field))
 
     @property
     def has_potential(self) -> bool:
@@ -92,12 +92,18 @@ class FrameForm(Form):
     def is_free(self) -> Float[Array, "3 m"]:
         """1 for the rotations in the axes of each frame that no support holds, else 0."""
         free = jnp.ones((3, len(self.field.places)), self.loads.dtype)
-        for end, k in ((self.scene.start, 0), (self.scene.end, -1)):
-            if isinstance(end, Clamp):
-                free = free.at[:, k].set(0.0)
-            elif isinstance(end, Swivel):
-                free = free.at[:2, k].set(0.0)
+        for held in self.held_frames:
+            free = free.at[: 2 if held.frame is None else 3, held.number].set(0.0)
         return free
+
+    @property
+    def held_frames(self) -> list[HeldFrame]:
+        ends = ((self.scene.start, 0), (self.scene.end, -1))
+        return [
+            HeldFrame(k, end.tangent, end.frame if isinstance(end, Clamp) else None)
+            for end, k in ends
+            if isinstance(end, Directed)
+        ]
 
     def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
         return columns(point.quaternions) * self.is_free[None]
@@ -108,11 +114,9 @@ class FrameForm(Form):
     def holding(self, point: FramePoint) -> FramePoint:
         """The point with the frames and tangents that supports hold."""
         q = point.quaternions
-        for end, k in ((self.scene.start, 0), (self.scene.end, -1)):
-            if isinstance(end, Clamp):
-                q = q.at[:, k].set(nearer(from_frame(end.frame), q[:, k]))
-            elif isinstance(end, Swivel):
-                q = q.at[:, k].set(swung(q[:, k], end.tangent))
+        for k, direction, frame in self.held_frames:
+            held = swung(q[:, k], direction) if frame is None else nearer(from_frame(frame), q[:, k])
+            q = q.at[:, k].set(held)
         return FramePoint(q, point.end_force, point.total_twist)
 
     def settled(self, point: FramePoint) -> FramePoint:
@@ -130,17 +134,45 @@ class FrameForm(Form):
         point: FramePoint,
         bases: Float[Array, "3 3 m"],
         rotation: Float[Array, "3 m"],
-        force_change: Float[Array, "3"],
+        force_change: Float[Array, "3 *spans"],
     ) -> FramePoint:
         # Rounding would grow with every step.
         quaternions = unit(turned(point.quaternions, rotation))
         return FramePoint(quaternions, point.end_force + force_change, point.total_twist)
 
-    # --- strains, forces and ways ------------------------------------------------------------------------------------
+    # --- forces, and what the ends lack ------------------------------------------------------------------------------
 
-    def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]) -> Float[Array, "3 k n"]:
+    def through(self, end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
+        """The force through the cells besides that of the loads."""
+        return end_force[:, None, None]
+
+    @property
+    def spans(self) -> Float[Array, "3 *spans"]:
+        """The ways between held ends."""
+        start, end = self.scene.start, self.scene.end
+        assert isinstance(start, Held)
+        assert isinstance(end, Held)
+        return end.position - start.position
+
+    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3 *spans"]:
+        """What the cells add up to between held ends."""
+        return jnp.stack([jnp.sum(component) for component in ways])
+
+    def work_of_spans(self, end_force: Float[Array, "3 *spans"]) -> Float[Array, ""]:
+        """Of the force at s = L on the way between held ends."""
+        return jnp.sum(end_force * self.spans)
+
+    def by_spans(self, by_cell: Float[Array, "3 3 p n"]) -> Float[Array, "3 c p n"]:
+        """By the components of the force in cells, as by those of the end force."""
+        return by_cell
+
+    def compliance(self, by_cell: Float[Array, "3 3 n"]) -> Float[Array, "c c"]:
+        """The same of what the cells give way by."""
+        return jnp.sum(by_cell, axis=2)
+
+    def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 k n"]:
         """The force through the rod at the strain points."""
-        forces = end_force[:, None, None] + self.loads
+        forces = self.through(end_force) + self.loads
         following = self._following(quaternions)
         return forces if following is None else forces + following
 
@@ -235,24 +267,33 @@ class FrameForm(Form):
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""
-        scene, q = self.scene, point.quaternions
+        total, given = self._loads_on_all(point.quaternions)
+        if isinstance(self.scene.start, Free):
+            return -given, -total
+        return (total, given) if isinstance(self.scene.end, Free) else (point.end_force + total, point.end_force)
+
+    def _loads_on_all(self, q: Float[Array, "4 m"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """All loads together, and the given force on an end that is free."""
+        scene = self.scene
         total = total_force(scene)
+        given = jnp.zeros_like(total)
         for load in scene.distributed:
             if isinstance(load, DistributedForce) and load.follower:
-                given = rotated(q, jnp.broadcast_to(load.force[:, None], q[1:].shape))
-                total += self.field.summed_beyond(given)[1]
-        for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1)):
-            if isinstance(end, Free):
-                given = jnp.zeros_like(total) if end.force is None else end.force
+                along = rotated(q, jnp.broadcast_to(load.force[:, None], q[1:].shape))
+                total += self.field.summed_beyond(along)[1]
+        for end, k in ((scene.start, 0), (scene.end, -1)):
+            if isinstance(end, Free) and end.force is not None:
+                given = end.force
                 if end.follower:
                     given = rotated(q[:, k], given)
                     total += given
-                return (-given, -total) if sign < 0 else (total, given)
-        return point.end_force + total, point.end_force
+        return total, given
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
-    def by_rotations(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]) -> Float[Array, "3 p n"]:
+    def by_rotations(
+        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]
+    ) -> Float[Array, "3 p n"]:
         """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
         frames = of_cells(self.field, quaternions)
         forces = unstacked(self.forces(quaternions, end_force))
@@ -260,7 +301,7 @@ class FrameForm(Form):
         return stacked(jax.grad(lambda rotations: jnp.sum(self._by_cells(frames, rotations, forces)))(nothing))
 
     def _unbalanced(
-        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3"]
+        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]
     ) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         """What is out of balance at the frames, in their axes, and what the rod lacks of its span."""
         gradient = self.field.assembled(self.by_rotations(quaternions, end_force))
@@ -269,19 +310,12 @@ class FrameForm(Form):
             gradient -= couples
         closure = jnp.zeros(0, end_force.dtype)
         if self._closures:
-            edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros_like(end_force[0])))
-            closure = self._span - jnp.sum(edges, axis=0)
+            edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros((), end_force.dtype)))
+            closure = self.of_force(self.spans - self.along_spans(edges.T))
         return gradient * self.is_free, closure
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         return self._unbalanced(point.quaternions, point.end_force)
-
-    @property
-    def _span(self) -> Float[Array, "3"]:
-        start, end = self.scene.start, self.scene.end
-        assert isinstance(start, Held)
-        assert isinstance(end, Held)
-        return end.position - start.position
 
     def linearized(self, point: FramePoint) -> Linearization:
         return self._with_cells(point) if self.has_potential else self.with_all(point)
@@ -293,18 +327,19 @@ class FrameForm(Form):
         loads = unstacked(self.loads)
         p, n = field.lengths.shape
         closures = self._closures
+        of_cell = 3 if closures else 0
 
         def energies(rotations: tuple[Vector, ...], force: Vector) -> Float[Array, ""]:
             forces = tuple(tuple(f + load for f, load in zip(force, at, strict=True)) for at in loads)
             return jnp.sum(self._by_cells(frames, rotations, forces))
 
         nothing = jax.tree.map(jnp.zeros_like, tuple(frame[1:] for frame in frames))
-        x, y, z = (jnp.broadcast_to(component, (n,)) for component in point.end_force)
+        x, y, z = (jnp.broadcast_to(component[0], (n,)) for component in self.through(point.end_force))
         force = (x, y, z)
         value = energies(nothing, force)
         first, by_all = jax.linearize(jax.grad(energies, argnums=(0, 1) if closures else (0,)), nothing, force)
         # Each rotation of each frame changed in all cells at once, then each component of the force.
-        unknowns = 3 * p + closures
+        unknowns = 3 * p + of_cell
         directions = jnp.broadcast_to(jnp.eye(unknowns, dtype=value.dtype)[..., None], (unknowns, unknowns, n))
         of_frames = tuple(tuple(directions[:, 3 * k + a] for a in range(3)) for k in range(p))
         of_force = tuple(directions[:, 3 * p + a] if closures else jnp.zeros_like(directions[:, 0]) for a in range(3))
@@ -322,11 +357,11 @@ class FrameForm(Form):
         closure, border = jnp.zeros(0, value.dtype), jnp.zeros((3, 0, free.shape[1]), value.dtype)
         compliance = jnp.zeros((0, 0), value.dtype)
         if closures:
-            value += jnp.sum(point.end_force * self._span)
-            closure = self._span + jnp.stack([jnp.sum(component) for component in first[1]])
+            value += self.work_of_spans(point.end_force)
+            closure = self.of_force(self.spans + self.along_spans(jnp.stack(first[1])))
             by_force = by_rotation[3 * p :].transpose(2, 0, 1, 3)  # [a, component of the force, i]
-            border = field.assembled(by_force) * free[:, None]
-            compliance = -jnp.stack([jnp.sum(component[3 * p :], axis=1) for component in second[1]])
+            border = field.assembled(self.by_spans(by_force)) * free[:, None]
+            compliance = -self.compliance(jnp.stack([component[3 * p :] for component in second[1]]))
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
@@ -370,32 +405,36 @@ class FrameForm(Form):
         return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))
 
     def under_force(
-        self, point: FramePoint, bases: Float[Array, "3 3 m"], rotation: Float[Array, "3 m"], change: Float[Array, "3"]
+        self,
+        point: FramePoint,
+        bases: Float[Array, "3 3 m"],
+        rotation: Float[Array, "3 m"],
+        change: Float[Array, "3 *spans"],
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         """With another end force: what the rod lacks of its span and the rate of that as the frames begin to turn;
         by how much L differs, and by how much the rate of L does.
         """
+        zero = jnp.zeros((), change.dtype)
         if not self._closures:
             nothing = jnp.zeros(0, change.dtype)
-            return nothing, nothing, jnp.zeros_like(change[0]), jnp.zeros_like(change[0])
+            return nothing, nothing, zero, zero
         frames = of_cells(self.field, point.quaternions)
         turning = unstacked(self.field.of_cells(rotation))
 
-        def parts(amount: Float[Array, ""], force: Float[Array, "3"]) -> tuple[Array, Array]:
+        def parts(amount: Float[Array, ""], force: Float[Array, "3 *spans"]) -> tuple[Array, Array]:
             def value(force):
-                forces = unstacked(force[:, None, None] + self.loads)
+                forces = unstacked(self.through(force) + self.loads)
                 cells = self._by_cells(frames, jax.tree.map(lambda x: amount * x, turning), forces)
-                return jnp.sum(cells) + force @ self._span
+                return jnp.sum(cells) + self.work_of_spans(force)
 
             return jax.value_and_grad(value)(force)
 
-        def rates(force: Float[Array, "3"]):
-            zero = jnp.zeros_like(change[0])
+        def rates(force: Float[Array, "3 *spans"]):
             return jax.jvp(lambda amount: parts(amount, force), (zero,), (jnp.ones_like(zero),))
 
         (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
         (before, _), (rate_before, _) = rates(point.end_force)
-        return closure, closure_rate, energy - before, rate - rate_before
+        return self.of_force(closure), self.of_force(closure_rate), energy - before, rate - rate_before
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
@@ -403,6 +442,19 @@ class FrameForm(Form):
         stiffest = jnp.maximum(jnp.max(self.sections.EI), jnp.max(self.sections.GJ))
         eps = jnp.finfo(largest.dtype).eps
         return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * jnp.maximum(stiffest, 1.0) / self.field.finest**2)
+
+
+def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
+    """What a form by frames is made of."""
+    rest_strains, rest_ways = _at_rest(scene, field)
+    return {
+        "scene": scene,
+        "field": field,
+        "sections": field.sections(scene.rod),
+        "rest_strains": rest_strains,
+        "rest_ways": rest_ways,
+        "loads": _dead_loads(scene, field),
+    }
 
 
 def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:

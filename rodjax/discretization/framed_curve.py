@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells
+from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm, FramePoint, of_cells, stacked
@@ -32,7 +33,7 @@ class FramedCurve(Shape):
     def is_of_joints(self) -> bool:
         return self.quaternions.shape[-1] == self.nodes.shape[-2] + 1
 
-    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> FramePoint:
+    def point(self, end_force: Float[Array, "3 *spans"], total_twist: Float[Array, ""]) -> FramePoint:
         return FramePoint(self.quaternions, end_force, total_twist)
 
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "FramedCurve":
@@ -42,7 +43,10 @@ class FramedCurve(Shape):
         return FramedCurve(form.nodes(form.edges(point)), point.quaternions, form.field.s)
 
     def change_to(self, other: Any) -> Float[Array, ""]:
-        return jnp.max(jnp.abs(other.nodes - self.nodes))
+        # A straight rod may twist in its place.
+        of_frames = jnp.max(jnp.abs(nearer(other.quaternions, self.quaternions) - self.quaternions))
+        of_nodes = jnp.max(jnp.abs(other.nodes - self.nodes))
+        return jnp.where(of_nodes > of_frames, of_nodes, of_frames)
 
     def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> "FramedCurve":
         before = nearer(older.quaternions, self.quaternions)
@@ -64,10 +68,17 @@ class FramedCurve(Shape):
     def cells(self) -> Cells:
         return _cells(self.s, self.is_of_joints)
 
-    def turned_to_ends(self, scene: Scene, cells: Cells, twist: Float[Array, ""]) -> Float[Array, "4 m"]:
+    def turned_to_ends(self, form: FrameForm, twist: Float[Array, ""]) -> Float[Array, "4 m"]:
         """The frames turned to those that the supports hold, by less and less away from them; and between two clamps
         spun by whole turns to the total twist nearest to `twist`, or to the turns of the scene.
+
+        With clips: so between neighbouring supports, and the twist of each span between two that hold it is the
+        nearest to the one that it had, with its part of what all of the rod shall have beyond that.
         """
+        scene, cells = form.scene, form.field
+        if isinstance(form, ClippedFrameForm):
+            q = _turned_to_supports(form, self.quaternions, twist)
+            return q if scene.turns is None else _with_turns(scene, cells, q, twist)
         q, places = self.quaternions, cells.places
         for end, k, part in ((scene.start, 0, 1.0 - places), (scene.end, -1, places)):
             if isinstance(end, Directed):
@@ -84,10 +95,7 @@ class FramedCurve(Shape):
                 turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half)[None] * axis[:, None]])
                 q = jnp.where(is_turned, product(turn, q), q)
         if isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp):
-            here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
-            principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
-            turns = jnp.round((nearest_twist(principal, twist, scene.turns) - here) / (2 * jnp.pi))
-            q = jnp.where(turns != 0, spun(q, 2 * jnp.pi * turns * places), q)
+            q = _with_turns(scene, cells, q, twist)
         return q
 
 
@@ -95,8 +103,81 @@ def _cells(s: Float[Array, "n+1"], of_joints: bool) -> Cells:
     return JointCells(s) if of_joints else ElementCells(s)
 
 
+def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], twist: Float[Array, ""]) -> Float[Array, "4 m"]:
+    """Frames between two clamps, spun by whole turns to the total twist nearest to `twist`, or to the turns given."""
+    here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
+    principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
+    turns = jnp.round((nearest_twist(principal, twist, scene.turns) - here) / (2 * jnp.pi))
+    return jnp.where(turns != 0, spun(q, 2 * jnp.pi * turns * cells.places), q)
+
+
+def _turned_to_supports(form: ClippedFrameForm, q: Float[Array, "4 m"], twist: Float[Array, ""]) -> Float[Array, "4 m"]:
+    """Frames swung to the tangents that ends and clips hold, by less and less towards the supports beside each, then
+    spun about their tangents to the frames that are held, linearly between these.
+    """
+    cells, places = form.field, form.field.places
+    had = cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2]
+    zero, last = jnp.zeros((), int), jnp.asarray(len(places) - 1)
+    supports = jnp.stack([zero, *(2 * form.clip_nodes), last])
+    numbered = [(held, jnp.asarray(held.number) % len(places)) for held in form.held_frames]
+    for held, number in numbered:
+        beside = jnp.searchsorted(supports, number)
+        at = places[number]
+        before = places[supports[jnp.maximum(beside - 1, 0)]]
+        after = places[supports[jnp.minimum(beside + 1, len(supports) - 1)]]
+        # Of an end there is nothing on one side.
+        rise = jnp.where(at > before, (places - before) / jnp.where(at > before, at - before, 1.0), 1.0)
+        fall = jnp.where(after > at, (after - places) / jnp.where(after > at, after - at, 1.0), 1.0)
+        q = _swung_partly(q, tangent(q[:, number]), held.tangent, jnp.clip(jnp.minimum(rise, fall), 0.0, 1.0))
+    spinning = [(held.frame, number) for held, number in numbered if held.frame is not None]
+    if not spinning:
+        return q
+    numbers = jnp.stack([number for _, number in spinning])
+    order = jnp.argsort(numbers)
+    at = places[numbers[order]]
+    spins = jnp.stack([_spin_between(q[:, number], frame) for frame, number in spinning])[order]
+    q = jnp.where(jnp.any(spins != 0), spun(q, jnp.interp(places, at, spins)), q)
+    if len(spinning) == 1:
+        return q
+    # Between two of them: the cells from the one to the other, and by how much they are twisted.
+    nodes = numbers[order] // 2
+    cell = jnp.arange(had.shape[1])
+    is_between = (cell[None] >= nodes[:-1, None]) & (cell[None] < nodes[1:, None])
+    here = stacked(cells.strains(of_cells(cells, q)))[2] * cells.lengths
+    more = (twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
+    wanted = jnp.sum(jnp.where(is_between, (jnp.sum(had - here, axis=0) + more)[None], 0.0), axis=1)
+    turns = jnp.concatenate([jnp.zeros_like(spins[:1]), jnp.cumsum(jnp.round(wanted / (2 * jnp.pi)))])
+    return jnp.where(jnp.any(turns != 0), spun(q, 2 * jnp.pi * jnp.interp(places, at, turns)), q)
+
+
+def _swung_partly(
+    q: Float[Array, "4 m"], old: Float[Array, "3"], new: Float[Array, "3"], part: Float[Array, "m"]
+) -> Float[Array, "4 m"]:
+    """Turned by parts of the smallest rotation from one unit vector to another; the same bits where these are equal."""
+    across = jnp.cross(old, new)
+    sine, cosine = jnp.sqrt(jnp.sum(across**2)), jnp.sum(old * new)
+    # Of opposite ones about any axis across them.
+    any_axis = jnp.cross(old, jnp.eye(3, dtype=old.dtype)[jnp.argmin(jnp.abs(old))])
+    is_opposite = (cosine < 0) & (sine < jnp.finfo(sine.dtype).eps ** 0.5)
+    axis = jnp.where(is_opposite, any_axis, across)
+    size = jnp.sqrt(jnp.sum(axis**2))
+    is_turned = is_opposite | (sine > jnp.finfo(sine.dtype).eps * 8)
+    half = part * jnp.arctan2(sine, cosine) / 2
+    unit_axis = axis / jnp.where(is_turned, size, 1.0)
+    turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half)[None] * unit_axis[:, None]])
+    return jnp.where(is_turned, product(turn, q), q)
+
+
+def _spin_between(q: Float[Array, "4"], frame: Float[Array, "3 3"]) -> Float[Array, ""]:
+    """The angle [rad] about its tangent from a frame to another one of the same tangent; 0 where it is rounding."""
+    w, _, _, z = product(inverse(q), nearer(from_frame(frame), q))
+    angle = 2 * jnp.arctan2(z, w)
+    return jnp.where(jnp.abs(angle) > 16 * jnp.finfo(angle.dtype).eps, angle, 0.0)
+
+
 def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
-    return FrameForm.of(scene, shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s))
+    cells = shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s)
+    return (ClippedFrameForm if scene.clips else FrameForm).of(scene, cells)
 
 
 def framed_through(scene: Scene, points: Float[Array, "k 3"], of_joints: bool) -> FramedCurve:
@@ -170,9 +251,12 @@ def first_frames(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> Frame
     if rest is None:
         return framed_through(scene, first_shape(scene, pieces), of_joints)
     resting = at_rest(scene, s, of_joints)
-    if not held_at_both_ends(scene):
+    if not held_at_both_ends(scene) and not scene.clips:
         return resting
     bent = framed_through(scene, first_shape(scene, pieces), of_joints)
+    if scene.clips:
+        is_near = _misses_clips(scene, resting) < NEAR_REST
+        return jax.tree.map(lambda a, b: jnp.where(is_near, a, b), resting, bent)
     start, end = scene.start, scene.end
     assert isinstance(start, Held)
     assert isinstance(end, Held)
@@ -182,3 +266,16 @@ def first_frames(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> Frame
     angle = jnp.mean(jnp.sqrt(dot(curvature, curvature)))
     is_near = (jnp.sqrt(jnp.sum(missed**2)) < NEAR_REST) | (angle > COILED)
     return jax.tree.map(lambda a, b: jnp.where(is_near, a, b), resting, bent)
+
+
+def _misses_clips(scene: Scene, curve: FramedCurve) -> Float[Array, ""]:
+    """By how much a curve misses clips and ends that are held, at most, in parts of the shorter span beside each."""
+    ends = (scene.start.position if isinstance(scene.start, Held) else None, *(clip.position for clip in scene.clips))
+    positions = [*ends, scene.end.position if isinstance(scene.end, Held) else None]
+    zero = jnp.zeros((), curve.s.dtype)
+    at = jnp.stack([zero, *(clip.at for clip in scene.clips), zero + 1])
+    spans = jnp.diff(at)
+    shorter = jnp.minimum(jnp.append(spans, spans[-1]), jnp.append(spans[:1], spans))
+    nodes = jax.vmap(lambda coordinate: jnp.interp(at, curve.s, coordinate), 1, 1)(curve.nodes)
+    missed = [jnp.sum((nodes[k] - x) ** 2) / shorter[k] ** 2 for k, x in enumerate(positions) if x is not None]
+    return jnp.sqrt(jnp.max(jnp.stack(missed)))

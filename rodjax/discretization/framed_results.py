@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells, JointCells
+from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.error import COUPLE_REACH, STEPS, TURN_REACH, Errors
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.results import Resultants
@@ -70,10 +71,14 @@ def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
 
 
 def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
-    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too."""
+    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip they may
+    jump, and are those beyond it.
+    """
     field = form.field
     own = own_moments(form, point)
     moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
+    if isinstance(form, ClippedFrameForm):
+        moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
     forces = form.forces(point.quaternions, point.end_force)
     first, last = forces[:, 0], forces[:, 2]
@@ -92,6 +97,40 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
         strains += rest.at(field.s, *last_cell)
     mean = jnp.concatenate([first[:, :1], (first[:, 1:] + last[:, :-1]) / 2, last[:, -1:]], axis=1)
     return NodeStrains(moments, strains, axial, dot(mean, tangent(q)))
+
+
+def strains_beside_nodes(
+    form: FrameForm, point: FramePoint
+) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
+    """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
+    field, own = form.field, own_moments(form, point)
+    moments = jnp.stack([-own[:, 0], own[:, 2]], axis=1)
+    q = field.of_cells(point.quaternions)[:, ::2]
+    tension = dot(form.forces(point.quaternions, point.end_force)[:, ::2], tangent(q))
+    sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
+    sections = eqx.combine(sections, form.sections)
+    strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
+    s = field.strain_places[::2]
+    rest = form.scene.rod.rest_shape
+    if rest is not None:
+        strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
+    return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
+
+
+def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
+    """What the clips apply to the rod, nondimensional: the jumps of the section moment."""
+    assert isinstance(form, ClippedFrameForm)
+    own, nodes = own_moments(form, point), form.clip_nodes
+    jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
+    moments = []
+    for k, clip in enumerate(form.scene.clips):
+        moment = jnp.zeros_like(jumps[:, k])
+        if clip.frame is not None:
+            moment = jumps[:, k]
+        elif clip.tangent is not None:
+            moment = jumps[:, k] - jnp.sum(jumps[:, k] * clip.tangent) * clip.tangent
+        moments.append(moment)
+    return jnp.stack(moments)
 
 
 def _arrays(sections: Sections) -> Sections:
@@ -205,7 +244,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point)
-    moments = _on_elements(form, point).moments
+    moments, ends = _on_elements(form, point).moments, own_moments(form, point)[:, 2]
     nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments[:, 1:]), nodes[:, :-1], moments[:, :-1])
     last = _integrated(form, field, point, first)
@@ -216,7 +255,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
     middles = q[:, 1::2]
     force = form.forces(q, point.end_force)[:, 1]
     gap = last.way - edges - field.h[None] / 2 * cross(turn, tangent(middles))
-    couple = last.moment - moments[:, 1:] + cross(last.way - edges, force)
+    couple = last.moment - ends + cross(last.way - edges, force)
 
     strains = jnp.broadcast_to((rotated(inverse(middles), turn) / field.h[None])[:, None], form.loads.shape)
     ways = rotated(inverse(middles), gap)

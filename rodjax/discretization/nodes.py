@@ -81,7 +81,7 @@ def with_nodes_at_clips(
 
 
 class HeldNode(NamedTuple):
-    """The node at which a clip, the number `clip` of a scene, holds the tangent."""
+    """The node at which a clip, the number `clip` of a scene, holds the tangent, alone or with the twist."""
 
     clip: int
     node: Int[Array, ""]
@@ -92,7 +92,8 @@ def held_nodes(scene: Scene, clip_nodes: Int[Array, "clips"] | None) -> list[Hel
     """All of those, where `clip_nodes` are the numbers of the nodes at the clips."""
     if clip_nodes is None:
         return []
-    return [HeldNode(k, clip_nodes[k], clip.tangent) for k, clip in enumerate(scene.clips) if clip.tangent is not None]
+    directions = [(k, clip.direction) for k, clip in enumerate(scene.clips)]
+    return [HeldNode(k, clip_nodes[k], direction) for k, direction in directions if direction is not None]
 
 
 def node_moved(

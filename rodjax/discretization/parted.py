@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, Int
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.spans import held_places, nodes_along
 from rodjax.energy import axial_strain_under, density
 from rodjax.scene import held_position
-from rodjax.supports import Free, Held
+from rodjax.supports import Free
 from rodjax.vectors import dot
 
 
@@ -50,28 +51,14 @@ class PartedForm(MixedForm):
     @property
     def held_places(self) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
         """The positions that are held along the rod, and the numbers of the nodes there."""
-        start, end, nodes = self.scene.start, self.scene.end, self.field.clip_nodes
-        nodes = jnp.zeros(0, int) if nodes is None else nodes
-        positions = [clip.position for clip in self.scene.clips]
-        if isinstance(start, Held):
-            positions, nodes = [start.position, *positions], jnp.pad(nodes, (1, 0))
-        if isinstance(end, Held):
-            positions = [*positions, end.position]
-            nodes = jnp.pad(nodes, (0, 1), constant_values=len(self.field.s) - 1)
-        return jnp.stack(positions, axis=1), nodes
+        return held_places(self.scene, self.field.s, self.field.clip_nodes)
 
     def with_end_force(self, point: MixedPoint, loads: Float[Array, "3 *c n"]) -> Float[Array, "3 *c n"]:
         return self.of_cells(point.end_force).reshape(3, *[1] * (loads.ndim - 2), -1) + loads
 
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
         """Nodes along the edges, at held places to the last digit."""
-        positions, held = self.held_places
-        nodes = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        missing = positions.T - nodes[held]
-        # Beyond the last held place all of the rod goes with it.
-        s = self.field.s
-        nodes += jax.vmap(lambda component: jnp.interp(s, s[held], component), 1, 1)(missing)
-        return nodes.at[held].set(positions.T)
+        return nodes_along(edges, self.field.s, *self.held_places)
 
     def end_forces(self, point: MixedPoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""

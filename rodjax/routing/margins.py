@@ -10,10 +10,11 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.checks import instance, sequence
 from rodjax.clearance import POINTS, places, radius_at
+from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.modes import lowest_mode
 from rodjax.obstacles import Obstacle, checked_obstacles, least
-from rodjax.result import Equilibrium, over_leading_axes
+from rodjax.result import Equilibrium, beside_nodes, over_leading_axes
 from rodjax.routing.limits import Limits
 from rodjax.vectors import dot, root
 
@@ -86,7 +87,8 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     Each is that of the worst place. Clearance is looked for at the nodes and four places between two of them, and where
     a parabola through the worst of these and those beside it is lowest; curvature at the nodes, on both
     sides of them and between them where the mesh is of elements whose tangents are the unknowns, else at the nodes;
-    twist and strain at the nodes, the strain at a clip the mean of both sides.
+    twist and strain at the nodes, the strain at a clip the mean of both sides. Of rods in clips whose frames are the
+    unknowns, curvature, twist and strain on both sides of the nodes.
 
     Derivatives are those of the worst place, which stays at the same part of the mesh, by numbers of the scene, the
     limits and the obstacles; of a straight rod, that of the bend radius is 0.
@@ -172,12 +174,13 @@ def measured(
             for end, s in (("start", equilibrium.s[0]), ("end", equilibrium.s[-1])):
                 vector = getattr(equilibrium, f"{end}_{kind}")
                 found.append(_size(f"{kind} of {end}", unit, vector, limit, s))
+    along = beside_nodes(equilibrium) if _has_sides(equilibrium) else equilibrium
     for name, unit, limit, values in (
-        ("twist", "rad/m", limits.twist, equilibrium.twist),
-        ("strain", "", limits.strain, equilibrium.axial_strain),
+        ("twist", "rad/m", limits.twist, along.twist),
+        ("strain", "", limits.strain, along.axial_strain),
     ):
         if limit is not None:
-            found.append(_largest(name, unit, values, limit, equilibrium.s, windows))
+            found.append(_largest(name, unit, values, limit, along.s, windows))
     if limits.stability is not None:
         stiffness = lowest_mode(equilibrium).stiffness
         unit = limits.stability + scene.rod.bending_scale / scene.rod.length**2
@@ -224,12 +227,12 @@ def _largest(
 
 def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
     is_of_elements = isinstance(equilibrium.state.shape, Curve)
-    s = _both_sides(equilibrium) if is_of_elements else equilibrium.s
+    s, at_nodes = (_both_sides(equilibrium), None) if is_of_elements else _along(equilibrium)
     radius = radius_at(equilibrium.scene.rod, s)
     limit = 2 * multiple.astype(radius.dtype) * radius
 
     def curvature_at(equilibrium: Equilibrium, at: Int[Array, "w"]) -> Float[Array, "w"]:
-        return _curvature(equilibrium, s[at]) if is_of_elements else equilibrium.curvature[at]
+        return _curvature(equilibrium, s[at]) if at_nodes is None else _along(equilibrium)[1][at]
 
     # The search needs no derivatives.
     curvature = curvature_at(jax.lax.stop_gradient(equilibrium), jnp.arange(len(s)))
@@ -240,6 +243,17 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: 
     inside = jnp.where(is_straight, jnp.inf, 1 / jnp.where(is_straight, 1.0, curvature) - radius)
     slack = 1 - curvature * (limit + radius)
     return Measured("bend radius", "m", True, inside, limit, slack, s[at])
+
+
+def _has_sides(equilibrium: Equilibrium) -> bool:
+    """Whether strains are looked at on both sides of the nodes by the frames there."""
+    return bool(equilibrium.scene.clips) and isinstance(equilibrium.state.shape, FramedCurve)
+
+
+def _along(equilibrium: Equilibrium) -> tuple[Float[Array, "... k"], Float[Array, "... k"]]:
+    """Arclengths and curvature, at nodes or beside them."""
+    along = beside_nodes(equilibrium) if _has_sides(equilibrium) else equilibrium
+    return along.s, along.curvature
 
 
 def _both_sides(equilibrium: Equilibrium) -> Float[Array, "k"]:
@@ -316,6 +330,6 @@ def _least_in(windows: int, values: Float[Array, "k"]) -> Int[Array, "w"]:
 def curvature_along(equilibrium: Equilibrium) -> tuple[Float[Array, "... k"], Float[Array, "... k"]]:
     """Arclengths [m] one after another, as close as limits are looked at, and the curvature there [1/m]."""
     if not isinstance(equilibrium.state.shape, Curve):
-        return equilibrium.s, equilibrium.curvature
+        return _along(equilibrium)
     s = _both_sides(equilibrium)
     return s, _curvature(equilibrium, s)

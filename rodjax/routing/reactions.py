@@ -15,7 +15,7 @@ STEEP = 1e-6
 class Reaction(NamedTuple):
     """What one support applies to the rod.
 
-    - `name`: "start", "clip 0", ..., "end"; `kind`: "clamp", "clip", "sliding clip", ...
+    - `name`: "start", "clip 0", ..., "end"; `kind`: "clamp", "clip", "sliding clip", "clip with frame", ...
     - `s` [m]: where it holds the rod, `position` (3,) [m]: the centerline there
     - `force` (3,) [N], `moment` (3,) [N m] about `position`, axes of the scene
     - `axes` (3, 3), rows: the tangent of the rod, the level normal to the left of it, and the normal upwards. Where the
@@ -47,7 +47,8 @@ def reactions(equilibrium: Equilibrium) -> list[Reaction]:
     forces, moments = equilibrium.clip_forces, equilibrium.clip_moments
     for k, clip in enumerate(scene.clips):
         node = int(np.argmin(np.abs(s - float(clip.at))))
-        found.append(reaction(f"clip {k}", "sliding clip" if clip.sliding else "clip", node, forces[k], moments[k]))
+        kind = "sliding clip" if clip.sliding else "clip" if clip.frame is None else "clip with frame"
+        found.append(reaction(f"clip {k}", kind, node, forces[k], moments[k]))
     return [*found, reaction("end", kinds[1], len(s) - 1, equilibrium.end_force, equilibrium.end_moment)]
 
 

@@ -226,7 +226,7 @@ class Turned(Variable):
     """A direction or frame that turns away from that of the scene by at most `angle` [rad].
 
     `key`: `"clips.0.tangent"`, `"end.tangent"` of a `Swivel`: two numbers, turns about axes across the direction; or
-    `"end.frame"` of a `Clamp`: three, a rotation vector along the frame's d1, d2, t.
+    `"end.frame"` of a `Clamp`, `"clips.0.frame"`: three, a rotation vector along the frame's d1, d2, t.
     """
 
     key: str = eqx.field(static=True)

@@ -78,12 +78,14 @@ def scene_at(scenes: Scene, segment: Int[Array, ""], parameter: Float[Array, ""]
     fraction = parameter - segment.astype(parameter.dtype)
     mixed = between(scene, other, fraction)
     # As `between` has them, but smooth where the frames are the same.
-    for name in ("start", "end"):
-        support, next_support = getattr(scene, name), getattr(other, name)
-        if isinstance(support, Clamp) and isinstance(next_support, Clamp):
-            frame = rotate(support.frame, fraction * rotation_vector(support.frame, next_support.frame))
-            mixed = eqx.tree_at(lambda mixed, name=name: getattr(mixed, name).frame, mixed, frame)
-    return mixed
+    pairs = zip(_held_frames(scene), _held_frames(other), strict=True)
+    frames = [rotate(frame, fraction * rotation_vector(frame, next_frame)) for frame, next_frame in pairs]
+    return eqx.tree_at(_held_frames, mixed, frames) if frames else mixed
+
+
+def _held_frames(scene: Scene) -> list[Float[Array, "3 3"]]:
+    ends = [end.frame for end in (scene.start, scene.end) if isinstance(end, Clamp)]
+    return ends + [clip.frame for clip in scene.clips if clip.frame is not None]
 
 
 def rotation_vector(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:

@@ -116,6 +116,30 @@ def test_vmap_over_frames_is_one_solve_after_another(twisted):
 # --- beside rods by tangents, cut rods, and the theory of beams ------------------------------------------------------
 
 
+@pytest.mark.slow
+def test_a_twisted_span_buckles_by_itself():
+    """Clamped at both ends under a torque of 8.98682 EI/l (4.4934 = tan 4.4934, twice), whatever its length l."""
+    angles = np.array([0.0, 3.0, 6.0, 9.0, 12.0, 14.0])
+    branch = rj.follow([straight(0.5, 0.5 + angle) for angle in angles], segments=24)
+    assert branch.ended is rj.BranchEnd.SCENES
+    found = branch.critical_points[0]
+    angle = np.interp(float(found.parameter), np.arange(len(angles)), angles)
+    # Elements of 0.4 rad of twist: 1e-5.
+    assert angle == pytest.approx(8.98682 / GJ, rel=1e-4)
+    assert np.all(np.asarray(branch.index)[np.asarray(branch.parameter) < float(found.parameter) - 1e-6] == 0)
+
+
+@pytest.mark.slow
+def test_a_route_finds_how_a_clip_should_be_turned():
+    """A straight rod costs nothing in a clip that is turned by nothing."""
+    begin = Clip(0.4, (0.4, 0.0, 0.0), frame=rotate(LEVEL, (0.1, 0.2, -0.15)))
+    scene = Scene(Rod(1.0, 1.0, GJ, 1e4), Clamp(ORIGIN, LEVEL), Clamp((1.0, 0, 0), LEVEL), clips=[begin])
+    found = rj.route(scene, [rj.Turned("clips.0.frame", 0.5)], objective=rj.Objective(energy=1), starts=2, segments=8)
+    # A search ends where the energy falls by less than 1e-6 of what it was at the start, and this by the square.
+    np.testing.assert_allclose(found.scene.clips[0].frame[:, 2], [1, 0, 0], atol=3e-3)
+    assert found.objective < 1e-3 * float(rj.solve(scene, segments=8).elastic_energy)
+
+
 def by_frames(scene: Scene) -> Scene:
     """The same with a rod of two equal bending stiffnesses, of which the library does not know that they are."""
     rod = scene.rod

@@ -17,7 +17,6 @@ from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
 from rodjax.discretization.clipped_frames import ClippedFrameForm
-from rodjax.discretization.error import Errors
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
@@ -31,9 +30,8 @@ from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import Guess, first_shape
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
-from rodjax.refinement import SAFETY, SIZES, first_size, graded, next_size
+from rodjax.refinement import SAFETY, SIZES, Depth, first_size, graded, next_size, shares
 from rodjax.result import (
-    MOST_PENETRATION,
     Equilibrium,
     Found,
     NotConvergedWarning,
@@ -76,8 +74,6 @@ SPAN_SEGMENTS = 3
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
 MOST_FAILURES = 3
-# Contacts press in with so high an order of the mesh, or not because of it.
-LEAST_ORDER = 1.5
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
@@ -149,18 +145,18 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
     """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`, and
     contacts press the rod in between its nodes no deeper than at them.
     """
-    failures, depth = 0, _Depth()
+    failures, depth = 0, Depth()
     while True:
         failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
         error = float(np.max(np.linalg.norm(errors.nodes, axis=1)))
-        sinks = depth.lacking(errors, options)
+        sinks = depth.lacking(errors, options.segments)
         is_fine = bool(result.converged) and max(SAFETY * error / rtol, sinks) <= 1
         if is_fine or _is_finest(options) or failures == MOST_FAILURES:
             break
         defects = errors.defects
         if sinks and defects is not None and errors.depths is not None:
-            defects = SAFETY * error / rtol * _shares(defects) + sinks * _shares(errors.depths)
+            defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
         lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
         finer = _solve(result.scene, _finer(result, defects, options), result.total_twist, options)
@@ -174,30 +170,6 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
     return result
 
 
-def _shares(values: Float[Array, "n"]) -> Float[Array, "n"]:
-    return values / (jnp.sum(values) + jnp.finfo(values.dtype).tiny)
-
-
-class _Depth:
-    """How deep contacts press a rod in, from mesh to mesh."""
-
-    def __init__(self):
-        self._last: tuple[int, float] | None = None
-        self._is_counted = True
-
-    def lacking(self, errors: Errors, options: Options, converged: Bool[np.ndarray, "k"] | None = None) -> float:
-        """What is allowed is 1; 0 where a finer mesh does not help: on an edge, or in a jam."""
-        if errors.depths is None or not self._is_counted:
-            return 0.0
-        depths = np.max(np.asarray(errors.depths), axis=-1)
-        most = float(np.max(depths if converged is None else depths[converged], initial=0.0)) / MOST_PENETRATION
-        if self._last is not None and min(most, self._last[1]) > 1:
-            segments, before = self._last
-            self._is_counted = most < before * (segments / options.segments) ** LEAST_ORDER
-        self._last = options.segments, most
-        return most if self._is_counted else 0.0
-
-
 def refined_together(
     solve: Callable[[Options, Equilibrium | None], Equilibrium], options: Options, rtol: float | None
 ) -> Equilibrium:
@@ -206,12 +178,12 @@ def refined_together(
 
     `solve` is given the options and what it found with the last ones.
     """
-    result, depth = solve(options, None), _Depth()
+    result, depth = solve(options, None), Depth()
     while rtol is not None and is_here(result):
         errors, converged = estimated_errors(result), np.asarray(result.converged)
         sizes = np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1)
         error = float(np.max(sizes[converged], initial=0.0))
-        sinks = depth.lacking(errors, options, converged)
+        sinks = depth.lacking(errors, options.segments, converged)
         if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
             _warn_if_inaccurate(error, rtol, options)
             break

@@ -2,7 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rodjax.discretization.error import Errors
+from rodjax.result import MOST_PENETRATION
 
 # The order of the shape error in 1/segments, and the numbers of segments: few, as each is a program to compile.
 ORDERS = {"finite_difference": 2, "hermite": 4}
@@ -19,6 +23,8 @@ LEAST_GROWTH, MOST_GROWTH = 1.2, 4.0
 # The longest element is at most so many times as long as one of equal elements, and neighbours differ by this factor.
 LONGEST = 2.0
 GRADING = 2.0
+# Contacts press in with so high an order of the mesh, or not because of it.
+LEAST_ORDER = 1.5
 
 
 def first_size(rtol: float, discretization: str, least: int = 0) -> int:
@@ -52,3 +58,28 @@ def graded(s: Float[Array, "n+1"], defects: Float[Array, "n"], segments: int) ->
     sums = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.cumsum(density * h)])
     nodes = jnp.interp(jnp.linspace(0.0, 1.0, segments + 1, dtype=h.dtype) * sums[-1], sums, s)
     return nodes.at[0].set(0.0).at[-1].set(1.0)
+
+
+def shares(values: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Parts of their sum; nothing of nothing."""
+    return values / (jnp.sum(values) + jnp.finfo(values.dtype).tiny)
+
+
+class Depth:
+    """How deep contacts press a rod in, from mesh to mesh."""
+
+    def __init__(self):
+        self._last: tuple[int, float] | None = None
+        self._is_counted = True
+
+    def lacking(self, errors: Errors, segments: int, converged: Bool[np.ndarray, "k"] | None = None) -> float:
+        """What is allowed is 1; 0 where a finer mesh does not help: on an edge, or in a jam."""
+        if errors.depths is None or not self._is_counted:
+            return 0.0
+        depths = np.max(np.asarray(errors.depths), axis=-1)
+        most = float(np.max(depths if converged is None else depths[converged], initial=0.0)) / MOST_PENETRATION
+        if self._last is not None and min(most, self._last[1]) > 1:
+            coarser, before = self._last
+            self._is_counted = most < before * (coarser / segments) ** LEAST_ORDER
+        self._last = segments, most
+        return most if self._is_counted else 0.0

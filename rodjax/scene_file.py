@@ -45,6 +45,11 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # spin = "90 deg"              # frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]] with or without spin
     # sliding = true               # optional: where the rod slides through; the search for its place begins at `at`
 
+    # [[obstacles]]                # any number of these, see `rodjax.obstacle_tables`: they push the rod back
+    # kind = "plane"
+    # point = "[0, 0, -20] cm"
+    # normal = [0, 0, 1]
+
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
     discretization = "hermite"     # or "finite_difference"
@@ -95,6 +100,8 @@ from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, leaf, shown, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.obstacle_tables import obstacle, written_obstacle
+from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     LISTS,
     SceneFileError,
@@ -145,13 +152,15 @@ _SCENE_KEYS = {
     "turns": "end.turns",
     "point_forces": "loads.point_force",
     "clips": "clips",
+    "obstacles": "obstacles",
+    "rod": "rod",
     "the start and clips": "clips: the start and clips",
     "the ends": "start.position, end.position: the ends",
     "": "start.support, end.support: ",
 }
 
 # Those that a file must have, and may have.
-SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "solve", "path")
+SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles", "solve", "path")
 # What is read of so many tables a reader keeps at most, about 10 MB.
 MAX_KEPT = 10_000
 
@@ -189,8 +198,9 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
 def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None = None) -> None:
     """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
 
-    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, and for a rod of
-    `Rod.from_centerline` or with a law, or obstacles, which a file cannot hold; `OSError` where it cannot be written.
+    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, for a rod of
+    `Rod.from_centerline` or with a law, and for meshes and obstacles of one's own, which a file cannot hold; `OSError`
+    where it cannot be written.
 
     Of the loads along the rod the file keeps the order among the forces and among the couples.
     """
@@ -202,10 +212,6 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
     if scene.rod.law is not None:
         raise ValueError("scene.rod.law must be None to be written: a law is code, which a scene file cannot hold")
-    if scene.obstacles:
-        raise ValueError(
-            "scene.obstacles must be () to be written: scene files have none; save writes them with a result"
-        )
     if scene.rod.rest_centerline is not None:
         raise ValueError(
             "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
@@ -229,6 +235,8 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
     for clip in scene.clips:
         lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
         lines += ["sliding = true"] if clip.sliding else []
+    for k, one in enumerate(scene.obstacles):
+        lines += ["", "[[obstacles]]", *written_obstacle(one, f"scene.obstacles[{k}]")]
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
     replace_file(path, "\n".join([*lines, ""]).encode())
@@ -326,6 +334,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     followers = {name: kind == "free" and flag(content[name], name, "follower") for name, kind in kinds.items()}
     loads, point_forces, distributed = part(_loads, content.get("loads", {}))
     clips = part(_clips, content.get("clips", []))
+    obstacles = part(_obstacles, content.get("obstacles", []))
     values["loads"] = dict(loads)
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
     discretization = cast(
@@ -347,7 +356,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             part(_support, kind, values[name], f"{where}{name}", followers[name]) for name, kind in kinds.items()
         )
         try:
-            return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips)
+            return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -495,6 +504,10 @@ def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
                 Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
             )
     return clips
+
+
+def _obstacles(reader: SceneReader, tables: Any) -> list[Obstacle]:
+    return [obstacle(table, f"obstacles[{k}]", folder=None) for k, table in enumerate(table_list(tables, "obstacles"))]
 
 
 def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:

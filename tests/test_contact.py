@@ -1,5 +1,7 @@
 """Rods that touch obstacles, against closed forms, another solver, rods that touch nothing, and finite differences."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -287,6 +289,9 @@ def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, *
     return Scene(rod or cable(), Clamp((0, 0, 1), LEVEL), end or Free(), GRAVITY, obstacles=[FLOOR], **others)
 
 
+OWN = rj.Union(FLOOR, rj.Distance(lambda x: x[2]))
+
+
 def single(parts):
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), parts)
 
@@ -311,7 +316,10 @@ def single(parts):
             lambda: Scene(*single((cable(), Clamp((0, 0, 1), LEVEL), Free())), obstacles=single([FLOOR])),
             "obstacles must be () in single precision",
         ),
-        (lambda: rj.write_scene(with_floor(), "floor.toml"), "scene.obstacles must be () to be written"),
+        (
+            lambda: rj.write_scene(dataclasses.replace(with_floor(), obstacles=(OWN,)), "floor.toml"),
+            "scene.obstacles[0].obstacles[1] must be of the kinds plane, sphere, capsule, pipe, cylinder, box or union",
+        ),
         (lambda: rj.follow([with_floor(), with_floor()]), "needs scenes without obstacles"),
         (
             lambda: rj.solve_path([with_floor(), with_floor()], at_critical="stop"),

@@ -12,18 +12,25 @@ import pytest
 
 import rodjax
 from rodjax import (
+    Box,
+    Capsule,
     Clamp,
+    Cylinder,
     DistributedCouple,
     DistributedForce,
     Free,
     Law,
     Pin,
+    Pipe,
+    Plane,
     PointForce,
     Rod,
     Scene,
     Smooth,
+    Sphere,
     Steps,
     Swivel,
+    Union,
     problems,
     scene_file,
 )
@@ -116,6 +123,24 @@ def general_rods(seed):
         "both": Rod(1 / 3, (steps, smooth), other, c[0], rest_curvature=(other, rest), rest_twist=other),
         "one of a pair": Rod(1 / 3, (a[0], steps), b[0], c[0]),
     }
+
+
+def test_obstacles_come_back_to_the_last_bit(tmp_path):
+    path, rod = tmp_path / "scene.toml", problems.cable()
+    x, y, z = np.abs(awkward((3, 3))) / 10
+    bodies = [
+        Plane(-x, z),
+        Sphere(-y, z[0]),
+        Capsule(-x, -y, z[1]),
+        Pipe([-x, -y, -z], z[2]),
+        Cylinder(-y, -z, x[0]),
+        Box(-x, y),
+        Box(-z, x, rodjax.frame(x, y)),
+    ]
+    clamp = Clamp((0, 0, 0), np.eye(3))
+    scene = Scene(rod, clamp, Free(), (0, 0, -9.81), obstacles=[*bodies, Union(bodies[0], Union(*bodies[1:]))])
+    write_scene(scene, path)
+    assert_same(read_scene(path), scene)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -360,6 +385,13 @@ def test_a_clamp_with_a_frame_may_move_and_spin(read):
     np.testing.assert_allclose(scenes[2].start.frame, [[0, 0, 1], [0, -1, 0], [1, 0, 0]], atol=1e-15)
 
 
+FLOOR = """
+[[obstacles]]
+kind = "plane"
+point = "[0, 0, -1] m"
+normal = [0, 0, 1]
+"""
+THICK = ROD + 'radius = "5 mm"\n'
 MISTAKES = [
     # syntax and tables
     ("[rod\n", "is not valid TOML", "line 1"),
@@ -370,7 +402,7 @@ MISTAKES = [
         "rod.color is not allowed",
         "length, GJ, EA, EI, EI1, EI2, mass_per_length, radius, rest_curvature_1",
     ),
-    (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, clips, solve, path"),
+    (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, clips, obstacles, solve, path"),
     (ROD + START + END + "path = 1\n", "end.path is not allowed", "position, frame, tangent, d2, spin"),
     ("path = 1\n" + ROD + START + END, "path must be a list of tables", "[[path]]"),
     ("path = [1]\n" + ROD + START + END, "path[0] must be a table", "got 1"),
@@ -687,6 +719,20 @@ MISTAKES = [
         "end.turns is not allowed together with path",
         "end.spin",
     ),
+    # obstacles
+    (
+        ROD + START + END + FLOOR,
+        "rod must have a radius where there are obstacles",
+        "got None",
+    ),
+    (
+        THICK + START + END + FLOOR.replace("plane", "floor"),
+        "obstacles[0].kind must be",
+        "plane, sphere, capsule, pipe, cylinder, box, union",
+    ),
+    (THICK + START + END + '[[obstacles]]\nkind = "mesh"\nfile = "a.stl"\n', "obstacles[0].kind must be", "union"),
+    (THICK + START + END + FLOOR.replace("normal", "up"), "obstacles[0].up is not allowed", "point, normal"),
+    (THICK + START + END + FLOOR.replace("0, 1]", "0, 0]"), "obstacles[0].normal must be a direction", "zero vector"),
 ]
 
 

@@ -35,13 +35,7 @@ A complete example; quantities are as in scene files, a number and any unit of t
     energy = "1 J"
     stability = "0.1 N"            # least stiffness of the softest motion
 
-The keys of an obstacle, besides its kind and name:
-
-- "plane": point, normal; "sphere": center, radius; "capsule" and "cylinder": start, end, radius
-- "pipe", with bends, or another cable: points = "[[0, 0, 0], [100, 0, 0], [100, 80, 0]] mm", radius
-- "box": center, size [frame = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], its columns along the edges]
-- "mesh": file = "engine.stl", in a folder as seen from this file [unit = "1 mm", that of the file; without it metres]
-- "union": parts, a list of obstacles without names
+Obstacles are as in `rodjax.obstacle_tables`, with a name; here they push nothing: those of a scene file do.
 
 What `rodjax route` varies, and a report of the scene as it is leaves aside:
 
@@ -82,13 +76,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
-from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.obstacle_tables import kind_of, obstacle
+from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     OF_TABLES,
     QUANTITIES,
     SceneFileError,
     check_keys,
-    choice,
     in_file,
     named,
     si_value,
@@ -99,18 +93,8 @@ from rodjax.routing.limits import Limits
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned, Variable, checked_variables
 from rodjax.scene_file import SCENE_TABLES, SceneFile, SceneReader, read_scene_file, read_text, toml_tables
-from rodjax.triangle_mesh import Mesh
 
-# What makes an obstacle, and the keys that it must and may have.
-OBSTACLES: dict[str, tuple[Callable[..., Obstacle], tuple[str, ...], tuple[str, ...]]] = {
-    "plane": (Plane, ("point", "normal"), ()),
-    "sphere": (Sphere, ("center", "radius"), ()),
-    "capsule": (Capsule, ("start", "end", "radius"), ()),
-    "pipe": (Pipe, ("points", "radius"), ()),
-    "cylinder": (Cylinder, ("start", "end", "radius"), ()),
-    "box": (Box, ("center", "size"), ("frame",)),
-}
-KINDS = [*OBSTACLES, "mesh", "union"]
+# What makes a variable, and the keys that it must have.
 VARIABLES: dict[str, tuple[Callable[..., Variable], tuple[str, ...]]] = {
     "between": (Between, ("lower", "upper")),
     "line": (OnLine, ("start", "end")),
@@ -180,7 +164,7 @@ def _starts(content: dict[str, Any]) -> int | None:
 
 
 def _cables(content: dict[str, Any], path: Path) -> dict[str, SceneFile]:
-    tables = {key: content[key] for keys in SCENE_TABLES for key in keys if key in content}
+    tables = {key: content[key] for keys in SCENE_TABLES for key in keys if key in content and key not in OF_A_ROUTE}
     with in_file(path):
         given = [key for key in ("scene", "cables") if key in content] + [", ".join(tables)] * bool(tables)
         if len(given) != 1:
@@ -217,7 +201,7 @@ def _obstacles(tables: Any, folder: Path) -> tuple[tuple[str, ...], tuple[Obstac
     names, obstacles = [], []
     for k, table in enumerate(table_list(tables, "obstacles")):
         where = f"obstacles[{k}]"
-        obstacles.append(_obstacle(table, where, folder, ("name",)))
+        obstacles.append(obstacle(table, where, folder, ("name",)))
         name = table.get("name", f"obstacle {k}")
         if not isinstance(name, str) or not name:
             raise SceneFileError(f"{where}.name must be a text, got {shown(name)}")
@@ -225,46 +209,6 @@ def _obstacles(tables: Any, folder: Path) -> tuple[tuple[str, ...], tuple[Obstac
             raise SceneFileError(f"{where}.name must differ from those of other obstacles, got {shown(name)} again")
         names.append(name)
     return tuple(names), tuple(obstacles)
-
-
-def _obstacle(table: Any, where: str, folder: Path, other: tuple[str, ...]) -> Obstacle:
-    kind = _kind(table, where, KINDS)
-    if kind == "mesh":
-        return _mesh(table, where, folder, other)
-    if kind == "union":
-        check_keys(table, where, (), ("kind", "parts", *other))
-        parts = table_list(table.get("parts", []), f"{where}.parts")
-        if not parts:
-            raise SceneFileError(f'{where}.parts must be a list of obstacles, such as {{ kind = "sphere", ... }}')
-        return Union(*(_obstacle(part, f"{where}.parts[{k}]", folder, ()) for k, part in enumerate(parts)))
-    make, required, optional = OBSTACLES[kind]
-    values = si_values(table, where, required, optional, other=("kind", *other))
-    with named(where):
-        return make(**values)
-
-
-def _kind(table: Any, where: str, allowed: list[str]) -> str:
-    kind = choice(table, where, "kind", allowed)
-    if kind is None:
-        raise SceneFileError(f"{where}.kind is missing; allowed are {', '.join(allowed)}")
-    return kind
-
-
-def _mesh(table: dict[str, Any], where: str, folder: Path, other: tuple[str, ...]) -> Obstacle:
-    values = si_values(table, where, (), ("unit",), other=("kind", "file", *other))
-    file = table.get("file")
-    if not isinstance(file, str) or not file or "\0" in file:
-        got = shown(file) if "file" in table else "none"
-        raise SceneFileError(f'{where}.file must be the name of an STL file, such as "engine.stl", got {got}')
-    unit = float(values.get("unit", np.ones(())))
-    if not unit > 0:
-        raise SceneFileError(f"{where}.unit must be positive, got {shown(table['unit'])}")
-    try:
-        return Mesh.from_stl(folder / file, unit)
-    except OSError as error:
-        raise SceneFileError(f"{where}.file: {shown(str(folder / file))} cannot be read: {error.strerror}") from None
-    except (ValueError, ImportError) as error:
-        raise SceneFileError(f"{where}.file: {str(error).removeprefix('path ')}") from None
 
 
 def _limits(table: Any, obstacles: tuple[Obstacle, ...]) -> Limits:
@@ -304,7 +248,7 @@ def _variables(tables: Any) -> tuple[Variable, ...]:
 
 
 def _variable(table: Any, where: str) -> Variable:
-    kind = _kind(table, where, list(VARIABLES))
+    kind = kind_of(table, where, list(VARIABLES))
     make, required = VARIABLES[kind]
     for key in ("key", *required):
         if isinstance(table, dict) and key not in table:

@@ -188,6 +188,28 @@ class Model:
         ]
 
 
+def kept_beyond(route: rj.Route, model: Model) -> tuple[int, int, int]:
+    """Of how many starts the designs, solved from the library's own start, come to the same equilibrium, and keep to
+    the limits on a mesh twice as fine, and in the continuum.
+    """
+    variables = model.problem.variables
+    offsets = np.concatenate([variable.offsets() for variable in variables])
+    scales = np.concatenate([variable.scales() for variable in variables])
+    scenes = scenes_of(model.problem, jnp.asarray((route.starts.designs - offsets) / scales))
+    coarse = rj.solve_batch(scenes, segments=SEGMENTS)
+    objective = coarse.elastic_energy + coarse.scene.rod.length
+    same = np.abs(objective - route.starts.objective) < 1e-6 * route.starts.objective
+    fine = rj.solve_batch(scenes, segments=2 * SEGMENTS, guess=coarse)
+    obstacles = list(OBSTACLES.values())
+    on_mesh = np.all(np.asarray(rj.margins(fine, LIMITS, obstacles).margin) >= 0, axis=1)
+    in_continuum = 0
+    for k in range(len(on_mesh)):
+        here = jax.tree.map(lambda leaf, k=k: leaf[k], fine)
+        exact = rj.solve_continuum(here.scene, guess=here)
+        in_continuum += bool(exact.converged) and bool(np.all(rj.margins(exact, LIMITS, obstacles).margin >= 0))
+    return int(np.sum(same)), int(np.sum(on_mesh)), in_continuum
+
+
 def drawn(count: int, model: Model) -> np.ndarray:
     """Random designs as `route` draws them: with rod enough between held places."""
     designs = np.random.default_rng(0).random((64 * count, model.count))
@@ -264,6 +286,10 @@ def compared(route: rj.Route, seconds: float, *, most: float, differences: int =
         ("iterations by gradients, a start", f"{np.mean(starts.iterations):.1f}"),
     ]
     model = Model(64)
+    same, on_mesh, in_continuum = kept_beyond(route, model)
+    rows.append(("the same equilibrium from a cold start", f"{same}"))
+    rows.append(("limits kept on a mesh twice as fine", f"{on_mesh}"))
+    rows.append(("limits kept in the continuum", f"{in_continuum}"))
     with_differences = np.sum(starts.solves) + model.count * np.sum(starts.iterations)
     rows.append(("the same with differences", f"{with_differences / np.sum(starts.solves):.1f} times as many"))
     each = [by_differences(start, model) for start in drawn(differences, model)]

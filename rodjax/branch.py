@@ -78,14 +78,15 @@ def scene_at(scenes: Scene, segment: Int[Array, ""], parameter: Float[Array, ""]
     fraction = parameter - segment.astype(parameter.dtype)
     mixed = between(scene, other, fraction)
     # As `between` has them, but smooth where the frames are the same.
-    pairs = zip(_held_frames(scene), _held_frames(other), strict=True)
+    ends = [name for name in ("start", "end") if isinstance(getattr(scene, name), Clamp)]
+    clips = [k for k, clip in enumerate(scene.clips) if clip.frame is not None]
+
+    def held(scene: Scene) -> list[Float[Array, "3 3"]]:
+        return [getattr(scene, name).frame for name in ends] + [scene.clips[k].frame for k in clips]
+
+    pairs = zip(held(scene), held(other), strict=True)
     frames = [rotate(frame, fraction * rotation_vector(frame, next_frame)) for frame, next_frame in pairs]
-    return eqx.tree_at(_held_frames, mixed, frames) if frames else mixed
-
-
-def _held_frames(scene: Scene) -> list[Float[Array, "3 3"]]:
-    ends = [end.frame for end in (scene.start, scene.end) if isinstance(end, Clamp)]
-    return ends + [clip.frame for clip in scene.clips if clip.frame is not None]
+    return eqx.tree_at(held, mixed, frames) if frames else mixed
 
 
 def rotation_vector(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:

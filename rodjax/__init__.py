@@ -19,7 +19,8 @@ from rodjax.path import solve_path
 from rodjax.result import Equilibrium, NotConvergedWarning, describe
 from rodjax.rod import Law, Rod
 from rodjax.scene import Scene
-from rodjax.scene_file import SceneFileError, read_scene, write_scene
+from rodjax.scene_file import SceneFileError, read_scene
+from rodjax.scene_writing import write_scene
 from rodjax.sensitivity import end_stiffness, sensitivities
 from rodjax.solvers.line_search import LineSearch
 from rodjax.solvers.newton import Newton

@@ -96,16 +96,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.along import Along, Smooth, Steps
-from rodjax.atomic_write import replace_file
-from rodjax.checks import file_path, instance, is_known, leaf, shown, whole_number
-from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
+from rodjax.checks import file_path, leaf, shown, whole_number
+from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_options, checked_rtol
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
-from rodjax.obstacle_tables import obstacle, written_obstacle
+from rodjax.obstacle_tables import obstacle
 from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     LISTS,
     SceneFileError,
-    assignment,
     check_keys,
     choice,
     flag,
@@ -138,8 +136,8 @@ _SECTIONS = {
 }
 # The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
 _VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", "radius", *_REST)
-_PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
-_DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
+PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
+DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
 # The keys that a support must have, may have, and may change along a path.
 _SUPPORTS = {
     "clamp": (("position",), ("frame", "tangent", "d2", "spin"), ("position", "tangent", "d2", "spin")),
@@ -193,81 +191,6 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     path = file_path(path, "path")
     with in_file(path):
         return SceneReader().read(toml_tables(read_text(path)))
-
-
-def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None = None) -> None:
-    """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
-
-    The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, for a rod of
-    `Rod.from_centerline` or with a law, and for meshes and obstacles of one's own, which a file cannot hold; `OSError`
-    where it cannot be written.
-
-    Of the loads along the rod the file keeps the order among the forces and among the couples.
-    """
-    instance(scene, "scene", Scene)
-    path = file_path(path, "path")
-    if not is_known(scene):
-        raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
-    if scene.rod.length.ndim:
-        raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
-    if scene.rod.law is not None:
-        raise ValueError("scene.rod.law must be None to be written: a law is code, which a scene file cannot hold")
-    if scene.rod.rest_centerline is not None:
-        raise ValueError(
-            "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
-            "its rest_centerline; save writes them with a result"
-        )
-    lines = ["[rod]", *_written_rod(scene.rod)]
-    for name, end in (("start", scene.start), ("end", scene.end)):
-        lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']
-        lines += _written(end, ("position", "force", "moment", "frame" if isinstance(end, Clamp) else "tangent"))
-        lines += _written_follower(end)
-    lines += _written(scene, ("turns",))
-    if scene.gravity is not None:
-        lines += ["", "[loads]", *_written(scene, ("gravity",))]
-    for force in scene.point_forces:
-        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
-    for kind in dict.fromkeys(type(load) for load in scene.distributed):
-        name, key = next((name, key) for name, (of_name, key) in _DISTRIBUTED.items() if of_name is kind)
-        for load in scene.distributed:
-            if isinstance(load, kind):
-                lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
-    for clip in scene.clips:
-        lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
-        lines += ["sliding = true"] if clip.sliding else []
-    for k, one in enumerate(scene.obstacles):
-        lines += ["", "[[obstacles]]", *written_obstacle(one, f"scene.obstacles[{k}]")]
-    if segments is not None:
-        lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
-    replace_file(path, "\n".join([*lines, ""]).encode())
-
-
-def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[str]:
-    """Lines of TOML for those of the keys that the module has."""
-    values = {key: getattr(module, key, None) for key in keys}
-    return [assignment(key, value, quantity(key, where)[0]) for key, value in values.items() if value is not None]
-
-
-def _written_rod(rod: Rod) -> list[str]:
-    lines = _written(rod, ("length",))
-    for name in ("radius", "EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
-        value = getattr(rod, name)
-        values = zip(_PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
-        lines += [_written_value(key, value) for key, value in values if value is not None]
-    return lines
-
-
-def _written_value(key: str, value: Array | Along) -> str:
-    unit = quantity(key)[0]
-    if not isinstance(value, Along):
-        return assignment(key, value, unit)
-    places = "jumps" if isinstance(value, Steps) else "s"
-    entries = assignment(places, getattr(value, places), "m"), assignment("values", value.values, unit)
-    return f"{key} = {{ {', '.join(entries)} }}"
-
-
-def _written_follower(module: eqx.Module) -> list[str]:
-    return ["follower = true"] if getattr(module, "follower", False) else []
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -362,6 +285,10 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
 
     scenes = [scene(values)]
+    try:
+        checked_options(scenes[0], segments, rtol, discretization, None, None, False)
+    except ValueError as error:
+        raise SceneFileError(f"solve.{error}") from None
     for where, steps, target in changes:
         _check_spin(values, target, steps, where)
         for step in range(1, steps + 1):
@@ -386,7 +313,7 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
     values |= {key: reader.part(_along, key, value) for key, value in varying.items()}
     if "EI" in optional:
         _check_bending(table)
-    for name, keys in _PAIRS.items():
+    for name, keys in PAIRS.items():
         pair = [values.pop(key) for key in keys if key in values]
         if len(pair) == 1:
             raise SceneFileError(f"rod.{keys[0]} and rod.{keys[1]} must be given both or neither, got only one of them")
@@ -413,7 +340,7 @@ def _check_bending(table: dict[str, Any]) -> None:
 
 def _by_keys(message: str) -> str:
     """A message of `Rod` about one of a pair, with the key that a file has for it."""
-    for name, keys in _PAIRS.items():
+    for name, keys in PAIRS.items():
         for k, key in enumerate(keys):
             message = message.replace(f"{name}[{k}]", key)
     return message
@@ -472,15 +399,15 @@ def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.nda
 def _loads(
     reader: SceneReader, table: Any
 ) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple]]:
-    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", *_DISTRIBUTED))
+    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", *DISTRIBUTED))
     forces = []
     for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
         where = f"loads.point_force[{k}]"
         with named(where):
             forces.append(PointForce(**reader.si_values(force, where, ("at", "force"), ())))
     distributed = []
-    for name in (name for name in table if name in _DISTRIBUTED):
-        make, key = _DISTRIBUTED[name]
+    for name in (name for name in table if name in DISTRIBUTED):
+        make, key = DISTRIBUTED[name]
         for k, load in enumerate(table_list(table[name], f"loads.{name}")):
             where = f"loads.{name}[{k}]"
             numbers = reader.si_values(load, where, (key,), (), other=("follower",))

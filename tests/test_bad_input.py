@@ -35,7 +35,8 @@ import rodjax as rj
 from rodjax.cli import main
 from rodjax.files import load, save
 from rodjax.quantities import QUANTITIES
-from rodjax.scene_file import read_scene_file, write_scene
+from rodjax.scene_file import read_scene_file
+from rodjax.scene_writing import write_scene
 from rodjax.sweep import sweep
 
 # What hypothesis keeps for itself goes beside other temporary files, not into the tree.

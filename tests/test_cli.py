@@ -11,7 +11,7 @@ import pytest
 import rodjax
 from rodjax.cli import main
 from rodjax.files import load
-from rodjax.scene_file import write_scene
+from rodjax.scene_writing import write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
 HANGING = str(SCENES / "hanging_cable.toml")

@@ -9,7 +9,7 @@ import pytest
 import rodjax as rj
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.route import _Fleet, _problem
-from rodjax.routing.search import Asked
+from rodjax.routing.search import Asked, Numbers, Search, Settings
 from rodjax.routing.variables import with_numbers
 
 RADIUS = 0.005
@@ -167,6 +167,32 @@ def test_an_error_in_one_search_ends_all():
 
     with pytest.raises(KeyboardInterrupt):
         Rounds([endless, endless], interrupted).run()
+
+
+def test_a_taut_trial_takes_no_solve():
+    """Down to 0.001 of the length too little, or twice of what there was at the start: where rod is left for a way x^2
+    of at most 0.25, the first step from 0.1 goes straight on to 1.
+    """
+
+    def spares_asked(begin: float, spare) -> np.ndarray:
+        asked = []
+
+        def evaluated(design):
+            asked.append(0.25 - design[0] ** 2)
+            return Numbers(1 - design[0], np.array([asked[-1]]), np.array([[-1.0], [-2 * design[0]]]), True)
+
+        first = evaluated(np.array([begin]))
+        settings = Settings(1.0, 1e-3, 1e-9, 20)
+        Search(np.array([begin]), first, settings, lambda asked: evaluated(asked.design), spare).run()
+        # The best is where the reserve of 0.001 is left.
+        assert asked[-1] == pytest.approx(1e-3, abs=1e-6)
+        return np.array(asked)
+
+    assert np.min(spares_asked(0.1, lambda design: np.inf)) == -0.75
+    assert np.min(spares_asked(0.1, lambda design: 0.25 - design[0] ** 2)) >= -1e-3
+    from_taut = spares_asked(0.6, lambda design: 0.25 - design[0] ** 2)
+    assert np.min(from_taut) >= -0.22
+    assert np.min(from_taut[1:]) < -1e-3
 
 
 def test_variables():

@@ -34,7 +34,8 @@ from rodjax import (
     problems,
     scene_file,
 )
-from rodjax.scene_file import SceneFileError, read_scene, read_scene_file, write_scene
+from rodjax.scene_file import SceneFileError, read_scene, read_scene_file
+from rodjax.scene_writing import write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
 
@@ -391,6 +392,13 @@ kind = "plane"
 point = "[0, 0, -1] m"
 normal = [0, 0, 1]
 """
+CLIP = """
+[[clips]]
+at = "0.5 m"
+position = "[0.4, 0, 0] m"
+tangent = [1, 0, 0]
+"""
+FINITE = '[solve]\ndiscretization = "finite_difference"\n'
 THICK = ROD + 'radius = "5 mm"\n'
 MISTAKES = [
     # syntax and tables
@@ -718,6 +726,20 @@ MISTAKES = [
         ROD + START + END + "turns = 1\n" + '[[path]]\nend.spin = "90 deg"\n',
         "end.turns is not allowed together with path",
         "end.spin",
+    ),
+    # what is solved, and how
+    (THICK + START + END + FLOOR + FINITE, "solve.discretization must be 'hermite'", "a scene with obstacles"),
+    (ROD + START + END + CLIP + "spin = 0.1\n" + FINITE, "clips[0].spin must have a unit", "90 deg"),
+    (
+        ROD + START + END + CLIP + 'spin = "9 deg"\n' + FINITE,
+        "solve.discretization must be 'hermite' for clips",
+        "that need frames",
+    ),
+    (ROD + START + END + CLIP * 2 + "[solve]\nsegments = 2\n", "clips[1].at must be larger", "0.5 m"),
+    (
+        ROD + START + END + CLIP + CLIP.replace("0.5 m", "0.7 m") + "[solve]\nsegments = 2\n",
+        "solve.segments must be a whole number from 3",
+        "got 2",
     ),
     # obstacles
     (

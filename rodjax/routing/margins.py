@@ -227,12 +227,12 @@ def _largest(
 
 def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
     is_of_elements = isinstance(equilibrium.state.shape, Curve)
-    s, at_nodes = (_both_sides(equilibrium), None) if is_of_elements else _along(equilibrium)
+    s = _both_sides(equilibrium) if is_of_elements else _along(equilibrium)[0]
     radius = radius_at(equilibrium.scene.rod, s)
     limit = 2 * multiple.astype(radius.dtype) * radius
 
     def curvature_at(equilibrium: Equilibrium, at: Int[Array, "w"]) -> Float[Array, "w"]:
-        return _curvature(equilibrium, s[at]) if at_nodes is None else _along(equilibrium)[1][at]
+        return _curvature(equilibrium, s[at]) if is_of_elements else _along(equilibrium)[1][at]
 
     # The search needs no derivatives.
     curvature = curvature_at(jax.lax.stop_gradient(equilibrium), jnp.arange(len(s)))

@@ -161,8 +161,9 @@ def route(
     that of the worst place, and jumps where another place of the same part becomes worst.
 
     Where the length, positions or arclengths vary, the rod between two held places is kept at least as long as the
-    straight way between them. A trial without an equilibrium, or where clips would not follow one another, is stepped
-    back from. A search that ends outside of the limits is led to the least violation, and goes on from there.
+    straight way between them. A trial that would pull the rod taut there is stepped back from without a solve, as is
+    one where clips would not follow one another; so is one without an equilibrium. A search that ends outside of the
+    limits is led to the least violation, and goes on from there.
 
     The same arguments give the same route to the last bit. Where no start keeps to the limits, the result is that of
     the least violation, `feasible` is False, and `str` says what is missing. Raises `ValueError` or `TypeError` for

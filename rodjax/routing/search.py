@@ -78,6 +78,7 @@ class Search:
         self._settings, self._ask, self._spare = settings, ask, spare
         self._at, self._is_usable = start, first.is_valid
         self._last = self._standing = start.tobytes(), _tempered(first)
+        self._least_spare = self._allowed(start)
         self._is_accepted = True
         self._iterations = self._spent = 0
 
@@ -106,18 +107,23 @@ class Search:
         for known, numbers in (self._last, self._standing):
             if known == key:
                 return numbers
+        if self._spare(design) < self._least_spare:
+            return self._refused()
         if self._spent >= SOLVES_PER_ITERATION * self._settings.iterations:
             raise _SpentError
         self._spent += 1
-        if self._spare(design) < min(-TAUT, 2 * self._spare(self._at)):
-            return self._refused()
         found = self._ask(Asked(design.copy(), self._is_accepted))
         self._is_accepted = False
         found = _tempered(found) if found.is_valid else self._refused()
         self._last = key, found
         return found
 
+    def _allowed(self, standing: Float[np.ndarray, "n"]) -> float:
+        """The least spare length of a trial from there."""
+        return min(-TAUT, 2 * self._spare(standing))
+
     def _refused(self) -> Numbers:
+        """Of a trial that has no equilibrium, or is known to have none worth a solve: worse than where it stands."""
         standing = self._standing[1]
         return standing._replace(objective=standing.objective + PENALTY * self._settings.scale, is_valid=False)
 
@@ -127,6 +133,7 @@ class Search:
         if found.is_valid:
             self._at = np.clip(design, 0.0, 1.0)
             self._standing = self._at.tobytes(), found
+            self._least_spare = self._allowed(self._at)
             self._is_accepted |= self._last[0] == self._standing[0]
         return found
 

@@ -400,19 +400,25 @@ def test_results_and_scenes_are_read_back(sliding, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, read, result.scene)
 
 
+BETWEEN_PINS = """
+[rod]
+length = "1 m"
+EI = "1 N m^2"
+GJ = "1 N m^2"
+EA = "1e4 N"
+[start]
+support = "pin"
+position = "[0, 0, 0] m"
+[end]
+support = "pin"
+position = "[60, 0, 0] cm"
+"""
+
+
 def test_clips_in_a_scene_file(tmp_path):
-    text = """
-    [rod]
-    length = "1 m"
-    EI = "1 N m^2"
-    GJ = "1 N m^2"
-    EA = "1e4 N"
-    [start]
-    support = "pin"
-    position = "[0, 0, 0] m"
-    [end]
-    support = "pin"
-    position = "[60, 0, 0] cm"
+    text = (
+        BETWEEN_PINS
+        + """
     [[clips]]
     at = "30 cm"
     position = "[20, 0, 1] cm"
@@ -422,6 +428,7 @@ def test_clips_in_a_scene_file(tmp_path):
     at = "0.7 m"
     position = "[0.4, 0, 0] m"
     """
+    )
     path = tmp_path / "scene.toml"
     path.write_text(text)
     first, second = rj.read_scene(path).clips

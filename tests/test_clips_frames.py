@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_clips import GRAVITY, LEVEL, ORIGIN, TIGHT, in_space, supported, three_moments, weight
+from test_clips import BETWEEN_PINS, GRAVITY, LEVEL, ORIGIN, TIGHT, in_space, supported, three_moments, weight
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, Swivel, frame, problems, rotate
@@ -494,18 +494,9 @@ def test_results_and_scenes_are_read_back(resting, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, read, resting.scene)
 
 
-SCENE_FILE = """
-[rod]
-length = "1 m"
-EI = "1 N m^2"
-GJ = "1 N m^2"
-EA = "1e4 N"
-[start]
-support = "pin"
-position = "[0, 0, 0] m"
-[end]
-support = "pin"
-position = "[60, 0, 0] cm"
+SCENE_FILE = (
+    BETWEEN_PINS
+    + """
 [[clips]]
 at = "30 cm"
 position = "[20, 0, 1] cm"
@@ -521,6 +512,7 @@ at = "0.7 m"
 position = "[0.4, 0, 0] m"
 frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
 """
+)
 
 
 def test_frames_of_clips_in_a_scene_file(tmp_path):

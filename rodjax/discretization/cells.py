@@ -11,7 +11,7 @@ Arrays have the components first, then the frames of a cell or its strain points
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -325,3 +325,16 @@ def varying(scene: Scene) -> list[Float[Array, "k"]]:
     rod = scene.rod
     values = (*rod.bending_pair, rod.GJ, rod.EA, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
     return [value.jumps for value in values if isinstance(value, Steps)]
+
+
+def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:
+    return unstacked(cells.of_cells(quaternions))
+
+
+def unstacked(by_cell: Float[Array, "c p n"]) -> tuple[Any, ...]:
+    """By the frames of a cell, then by component."""
+    return tuple(tuple(jnp.unstack(by_cell[:, k])) for k in range(by_cell.shape[1]))
+
+
+def stacked(by_frame: tuple[Any, ...]) -> Float[Array, "c p n"]:
+    return jnp.stack([jnp.stack(components) for components in by_frame], axis=1)

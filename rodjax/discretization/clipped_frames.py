@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rodjax.discretization.cells import Cells, ElementCells
-from rodjax.discretization.framed import FrameForm, FramePoint, HeldFrame, parts_of
+from rodjax.discretization.framed import FrameForm, FramePoint, HeldFrame
+from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.spans import SpannedForm, held_places, nodes_along, span_of_cells
 from rodjax.scene import Scene

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.along import Along
-from rodjax.discretization.cells import REFERENCE, Cells, ElementCells, Frames, JointCells
+from rodjax.discretization.cells import REFERENCE, Cells, Frames, of_cells, stacked, unstacked
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
+from rodjax.discretization.framed_parts import parts_of
 from rodjax.energy import Sections
 from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
@@ -442,67 +442,3 @@ class FrameForm(Form):
         stiffest = jnp.maximum(jnp.max(self.sections.EI), jnp.max(self.sections.GJ))
         eps = jnp.finfo(largest.dtype).eps
         return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * jnp.maximum(stiffest, 1.0) / self.field.finest**2)
-
-
-def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
-    """What a form by frames is made of."""
-    rest_strains, rest_ways = _at_rest(scene, field)
-    return {
-        "scene": scene,
-        "field": field,
-        "sections": field.sections(scene.rod),
-        "rest_strains": rest_strains,
-        "rest_ways": rest_ways,
-        "loads": _dead_loads(scene, field),
-    }
-
-
-def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:
-    return unstacked(cells.of_cells(quaternions))
-
-
-def unstacked(by_cell: Float[Array, "c p n"]) -> tuple[Any, ...]:
-    """By the frames of a cell, then by component."""
-    return tuple(tuple(jnp.unstack(by_cell[:, k])) for k in range(by_cell.shape[1]))
-
-
-def stacked(by_frame: tuple[Any, ...]) -> Float[Array, "c p n"]:
-    return jnp.stack([jnp.stack(components) for components in by_frame], axis=1)
-
-
-def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, Float[Array, "3 n"] | None]:
-    """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
-    rest = scene.rod.rest_shape
-    if rest is None:
-        return None, None
-    # At the nodes and between them, so that both are at hand: of finite differences the frames of the inner nodes are
-    # left out.
-    poses = rest.poses(ElementCells(cells.s).places)
-    is_joints = isinstance(cells, JointCells)
-    q = poses.quaternions
-    frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
-    strains = stacked(cells.strains(of_cells(cells, frames)))
-    ways = cells.lengths[None] * tangent(cells.of_cells(frames))
-    missing = jnp.diff(poses.positions[:, ::2], axis=1) - cells.ways(ways, jnp.zeros_like(ways[:, 0]))
-    return strains, cells.rest_of(rotated(inverse(q[:, 1::2]), missing))
-
-
-def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
-    """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
-    starts_held = isinstance(scene.start, Held)
-    s = cells.strain_places
-    forces = jnp.zeros((3, *s.shape), s.dtype)
-    if scene.gravity is not None:
-        mass = scene.rod.mass_per_length
-        before = mass.integral(s) if isinstance(mass, Along) else s
-        forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
-    for load in scene.distributed:
-        if isinstance(load, DistributedForce) and not load.follower:
-            forces += load.force[:, None, None] * (1.0 - s if starts_held else -s)[None]
-    for load in scene.point_forces:
-        before = cells.parts_before(load.at)
-        forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
-    for end, sign in ((scene.start, -1), (scene.end, 1)):
-        if isinstance(end, Free) and end.force is not None and not end.follower:
-            forces += sign * end.force[:, None, None]
-    return forces

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.cells import Cells, ElementCells, JointCells
+from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
 from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import Form
-from rodjax.discretization.framed import FrameForm, FramePoint, of_cells, stacked
+from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist

@@ -24,6 +24,8 @@ BEYOND = 0.08
 FACES_AROUND = 32
 FACES_ALONG = 12
 CELLS = 28
+# What is deeper within a pipe, by its radius, is no flat face of it.
+LEAST_DEPTH = 0.03
 # Triangles of a mesh at most; more are joined.
 MOST_TRIANGLES = 4000
 # Steps onto the surface of what has only a distance.
@@ -67,8 +69,10 @@ def _faces(obstacle: Obstacle, region: Region) -> Faces:
         has_caps = isinstance(obstacle, Capsule)
         return round_faces(obstacle.start, obstacle.end, float(obstacle.radius), region.extent, has_caps)
     if isinstance(obstacle, Pipe):
-        ends = itertools.pairwise(np.asarray(obstacle.points))
-        return np.concatenate([round_faces(*pair, float(obstacle.radius), region.extent, True) for pair in ends])
+        radius, ends = float(obstacle.radius), itertools.pairwise(np.asarray(obstacle.points))
+        faces = np.concatenate([round_faces(*pair, radius, region.extent, has_caps=True) for pair in ends])
+        # Not those of one straight part within the next.
+        return faces[np.asarray(obstacle.distance(faces.mean(axis=1))) > -LEAST_DEPTH * radius]
     if isinstance(obstacle, Box):
         return _box(obstacle, region.extent)
     if isinstance(obstacle, Mesh):

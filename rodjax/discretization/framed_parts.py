@@ -1,0 +1,64 @@
+"""What a form by frames is made of besides its unknowns: what resists, what the rod is at rest, and dead loads."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.along import Along
+from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
+from rodjax.loads import DistributedForce
+from rodjax.rotations import inverse, rotated, tangent
+from rodjax.scene import Scene
+from rodjax.supports import Free, Held
+
+
+def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
+    """The fields of a `framed.FrameForm`."""
+    rest_strains, rest_ways = _at_rest(scene, field)
+    return {
+        "scene": scene,
+        "field": field,
+        "sections": field.sections(scene.rod),
+        "rest_strains": rest_strains,
+        "rest_ways": rest_ways,
+        "loads": _dead_loads(scene, field),
+    }
+
+
+def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, Float[Array, "3 n"] | None]:
+    """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
+    rest = scene.rod.rest_shape
+    if rest is None:
+        return None, None
+    # At the nodes and between them, so that both are at hand: of finite differences the frames of the inner nodes are
+    # left out.
+    poses = rest.poses(ElementCells(cells.s).places)
+    is_joints = isinstance(cells, JointCells)
+    q = poses.quaternions
+    frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
+    strains = stacked(cells.strains(of_cells(cells, frames)))
+    ways = cells.lengths[None] * tangent(cells.of_cells(frames))
+    missing = jnp.diff(poses.positions[:, ::2], axis=1) - cells.ways(ways, jnp.zeros_like(ways[:, 0]))
+    return strains, cells.rest_of(rotated(inverse(q[:, 1::2]), missing))
+
+
+def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
+    """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
+    starts_held = isinstance(scene.start, Held)
+    s = cells.strain_places
+    forces = jnp.zeros((3, *s.shape), s.dtype)
+    if scene.gravity is not None:
+        mass = scene.rod.mass_per_length
+        before = mass.integral(s) if isinstance(mass, Along) else s
+        forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
+    for load in scene.distributed:
+        if isinstance(load, DistributedForce) and not load.follower:
+            forces += load.force[:, None, None] * (1.0 - s if starts_held else -s)[None]
+    for load in scene.point_forces:
+        before = cells.parts_before(load.at)
+        forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
+    for end, sign in ((scene.start, -1), (scene.end, 1)):
+        if isinstance(end, Free) and end.force is not None and not end.follower:
+            forces += sign * end.force[:, None, None]
+    return forces

@@ -239,7 +239,27 @@ def checked_obstacles(obstacles: Any, least: int = 1) -> tuple[Obstacle, ...]:
         raise ValueError("obstacles must hold at least one Obstacle, got none")
     for k, obstacle in enumerate(obstacles):
         instance(obstacle, f"obstacles[{k}]", Obstacle)
+        leaves, structure = jax.tree.flatten(obstacle)
+        found = _shape_of_distance(
+            structure, tuple((leaf.shape, leaf.dtype) if hasattr(leaf, "dtype") else leaf for leaf in leaves)
+        )
+        if found != ():
+            raise ValueError(
+                f"obstacles[{k}] must give one number for a point, got numbers of shape {found}, as from a stack of "
+                "obstacles: of stacked scenes take one, such as jax.tree.map(lambda leaf: leaf[0], obstacle)"
+            )
     return obstacles
+
+
+@functools.lru_cache
+def _shape_of_distance(structure: Any, leaves: tuple[Any, ...]) -> tuple[int, ...]:
+    """Of one point from an obstacle of these leaves, plain numbers or shapes and types of arrays."""
+    arrays = [jax.ShapeDtypeStruct(*leaf) if isinstance(leaf, tuple) else leaf for leaf in leaves]
+    dtypes = [leaf[1] for leaf in leaves if isinstance(leaf, tuple)]
+    point = jax.ShapeDtypeStruct((3,), dtypes[0] if dtypes else jnp.zeros(()).dtype)
+    return jnp.shape(
+        jax.eval_shape(lambda obstacle, point: obstacle.at(point), jax.tree.unflatten(structure, arrays), point)
+    )
 
 
 def squared_distance_to_segment(

@@ -16,6 +16,7 @@ import trimesh
 from hypothesis import given, settings
 
 import rodjax as rj
+from rodjax.obstacles import checked_obstacles
 
 FRAME = np.asarray(rj.frame((1, 2, 3), (0, 1, 1)))
 CENTER, SIZE = np.array([0.3, -0.2, 0.1]), np.array([0.8, 0.5, 0.3])
@@ -387,3 +388,15 @@ def test_clearance_of_a_rod_whose_radius_varies(radius, thickest, s):
 def test_bad_obstacles_are_refused(make, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make()
+
+
+def test_a_stack_of_obstacles_is_told_from_one():
+    """As users have JAX, which would broadcast it."""
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf, leaf]), SPHERE)
+    with (
+        jax.numpy_rank_promotion("allow"),
+        pytest.raises(
+            ValueError, match=r"obstacles\[0\] must give one number for a point, got numbers of shape \(3,\)"
+        ),
+    ):
+        checked_obstacles([stack])

@@ -1,6 +1,8 @@
 """Settings of every test: double precision, strict dtype and rank promotion, a compilation cache kept between runs."""
 
+import gc
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -16,6 +18,8 @@ if not IS_OPTIMIZED:
     # As `rodjax.compilation.QUICK`, also for the programs in which tests use solves.
     if jax.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+# A test process holds millions of objects that stay, which each full collection would look through again.
+gc.set_threshold(100_000, 50, 100)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -23,11 +27,19 @@ rodjax.enable_compilation_cache()
 
 
 def pytest_addoption(parser):
-    parser.addoption("--slow", action="store_true", default=bool(os.environ.get("CI")), help="run the slow tests too")
+    parser.addoption("--slow", action="store_true", help="run the slow tests too")
 
 
+# Files whose tests share nothing: with `--dist loadgroup` each of their tests goes to the worker that is free first, at
+# the end. Those of all other files stay together, as their fixtures and programs are in the memory of one worker.
+APART = ("test_experiments", "test_validation", "test_readme")
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     for item in items:
+        if item.path.stem not in APART:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
         if "optimized" in item.keywords and not IS_OPTIMIZED:
             item.add_marker(
                 pytest.mark.skip(reason="two programs are the same to the last bit only as users have them")
@@ -35,7 +47,7 @@ def pytest_collection_modifyitems(config, items):
     if not config.getoption("--slow"):
         skip = pytest.mark.skip(reason="slow: run with --slow")
         for item in items:
-            if "slow" in item.keywords:
+            if "slow" in item.keywords or "exhaustive" in item.keywords:
                 item.add_marker(skip)
 
 
@@ -50,6 +62,18 @@ def _few_compiled_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+
+
+_COMPILED: list[float] = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: _COMPILED.append(seconds) if event.endswith("backend_compile_duration") else None
+)
+
+
+@pytest.fixture
+def compiled_programs() -> Callable[[], int]:
+    """How many programs this process has compiled so far, those from the cache on disk too."""
+    return lambda: len(_COMPILED)
 
 
 @pytest.fixture(scope="session")

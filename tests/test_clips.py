@@ -54,8 +54,15 @@ def three_moments(spans: list[float], load: float, *, clamped: bool) -> tuple[np
     return moments, reactions
 
 
-@pytest.mark.parametrize("discretization", ["hermite", pytest.param("finite_difference", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("clamped", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("clamped", "discretization"),
+    [
+        (True, "hermite"),
+        pytest.param(False, "finite_difference", marks=pytest.mark.slow),
+        pytest.param(False, "hermite", marks=pytest.mark.exhaustive),
+        pytest.param(True, "finite_difference", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_a_continuous_beam_is_that_of_three_moments(clamped, discretization):
     load, spans = 1e-3, [0.25, 0.375, 0.375]
     rod = Rod(1.0, 1.0, 1.0, 1e6, mass_per_length=1.0)
@@ -101,8 +108,15 @@ def test_a_clip_steadies_a_strut():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("discretization", ["hermite", "finite_difference"])
-@pytest.mark.parametrize("with_tangent", [False, True])
+@pytest.mark.parametrize(
+    ("with_tangent", "discretization"),
+    [
+        (True, "hermite"),
+        (False, "finite_difference"),
+        pytest.param(False, "hermite", marks=pytest.mark.exhaustive),
+        pytest.param(True, "finite_difference", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_a_clip_where_the_rod_lies_does_nothing(with_tangent, discretization):
     scene = in_space()
     options = {"segments": 16, "discretization": discretization, "solver": TIGHT}
@@ -125,14 +139,14 @@ def test_a_clip_where_the_rod_lies_does_nothing(with_tangent, discretization):
 @pytest.mark.parametrize(
     ("discretization", "start", "end", "tangent"),
     [
-        ("hermite", None, None, None),
+        pytest.param("hermite", None, None, None, marks=pytest.mark.exhaustive),
         ("hermite", Pin(ORIGIN), None, (1.0, 0.3, 0.4)),
         ("hermite", None, Free(), None),
         ("hermite", Free(), None, (1.0, 0.3, 0.4)),
-        ("finite_difference", None, None, (1.0, 0.3, 0.4)),
-        ("finite_difference", Pin(ORIGIN), None, None),
+        pytest.param("finite_difference", None, None, (1.0, 0.3, 0.4), marks=pytest.mark.exhaustive),
+        pytest.param("finite_difference", Pin(ORIGIN), None, None, marks=pytest.mark.exhaustive),
         ("finite_difference", None, Free(), (1.0, 0.3, 0.4)),
-        ("finite_difference", Free(), None, None),
+        pytest.param("finite_difference", Free(), None, None, marks=pytest.mark.exhaustive),
     ],
 )
 def test_supports_carry_the_weight_and_hold_what_they_say(discretization, start, end, tangent):
@@ -198,9 +212,9 @@ def axial_forces(result: rj.Equilibrium) -> list[float]:
 @pytest.mark.parametrize(
     ("discretization", "tangent", "sliding"),
     [
-        ("hermite", None, (True, True)),
+        pytest.param("hermite", None, (True, True), marks=pytest.mark.exhaustive),
         ("hermite", (1.0, 0.3, 0.4), (False, True)),
-        ("finite_difference", None, (False, True)),
+        pytest.param("finite_difference", None, (False, True), marks=pytest.mark.exhaustive),
         ("finite_difference", (1.0, 0.3, 0.4), (True, True)),
     ],
 )
@@ -246,7 +260,8 @@ def test_a_sliding_clip_is_where_the_energy_is_least():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("discretization", "sizes", "order"), [("hermite", (16, 32), 4), ("finite_difference", (64, 128), 2)]
+    ("discretization", "sizes", "order"),
+    [("hermite", (16, 32), 4), pytest.param("finite_difference", (64, 128), 2, marks=pytest.mark.exhaustive)],
 )
 def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
     """The clip slides to a place of its own on each mesh, which the estimate knows."""
@@ -268,7 +283,7 @@ def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
 @pytest.mark.parametrize(
     ("discretization", "end", "sliding"),
     [
-        ("hermite", None, (False, False)),
+        pytest.param("hermite", None, (False, False), marks=pytest.mark.exhaustive),
         ("hermite", Free(), (False, False)),
         ("hermite", None, (False, True)),
         ("finite_difference", None, (False, False)),
@@ -383,7 +398,7 @@ def test_a_tolerance_is_met():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sliding", [(False, False), (True, False)])
+@pytest.mark.parametrize("sliding", [pytest.param((False, False), marks=pytest.mark.exhaustive), (True, False)])
 def test_results_and_scenes_are_read_back(sliding, tmp_path):
     scene = in_space((1.0, 0.3, 0.4), sliding=sliding)
     result = rj.solve(scene, segments=8)

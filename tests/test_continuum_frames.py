@@ -79,7 +79,7 @@ def spring() -> Rod:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Pin, Swivel])
+@pytest.mark.parametrize("kind", [pytest.param(Pin, marks=pytest.mark.exhaustive), Swivel])
 def test_a_curve_in_space_between_supports_that_let_it_spin(kind):
     """No clamp fixes the spin: the shape at rest and the loads do."""
     rod = spring()

@@ -46,33 +46,42 @@ def largest_difference(a: rj.Equilibrium, b: rj.Equilibrium, fields=FIELDS) -> f
     return max(differences)
 
 
-def compare(scene, discretization: str, segments: int, tolerance: float) -> None:
+def compare(scene, discretization: str, segments: int, tolerance: float, has_estimate: bool = False) -> None:
     plain = rj.solve(scene(isotropic(False)), segments=segments, discretization=discretization)
     framed = rj.solve(scene(isotropic(True)), segments=segments, discretization=discretization)
     assert plain.converged
     assert framed.converged
     assert plain.stable == framed.stable
     assert largest_difference(plain, framed) < tolerance
-    # Of the mesh, the same; both estimates are good to some percent.
-    assert framed.error_estimate == pytest.approx(float(plain.error_estimate), rel=0.5)
+    if has_estimate:
+        # Of the mesh, the same; both estimates are good to some percent.
+        assert framed.error_estimate == pytest.approx(float(plain.error_estimate), rel=0.5)
 
 
 def test_equal_stiffnesses_give_the_rod_of_one():
     # The same finite differences in other unknowns, to the solver's tolerance of 1e-8 EI/L^2.
-    compare(SCENES["clamps"], "finite_difference", 12, 1e-8)
+    compare(SCENES["clamps"], "finite_difference", 12, 1e-8, has_estimate=True)
+
+
+def cases(names: list[str], in_ci: set[str]) -> list:
+    return [pytest.param(name, marks=() if name in in_ci else pytest.mark.exhaustive) for name in names]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENES if not name.startswith("moment")])
+@pytest.mark.parametrize(
+    "name", cases([name for name in SCENES if not name.startswith("moment")], {"turns", "pins", "free start"})
+)
 def test_equal_stiffnesses_give_the_rod_of_one_by_differences(name):
-    compare(SCENES[name], "finite_difference", 20, 1e-8)
+    compare(SCENES[name], "finite_difference", 12, 1e-8)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENES if name != "turns"])
+@pytest.mark.parametrize(
+    "name", cases([name for name in SCENES if name != "turns"], {"clamps", "swivel", "pins", "free start", "moment"})
+)
 def test_equal_stiffnesses_give_the_rod_of_one_by_elements(name):
     # Other elements, both of fourth order: 32 of them are off by some 1e-7.
-    compare(SCENES[name], "hermite", 32, 2e-6)
+    compare(SCENES[name], "hermite", 32, 2e-6, has_estimate=name == "clamps")
 
 
 # --- stiffness, derivatives and stability, beside the rod of one stiffness -------------------------------------------
@@ -176,7 +185,7 @@ def test_the_45_degree_bend():
         # The reference has GJ = EI = 8.3333e5 in the place of E/12.
         np.testing.assert_allclose(result.nodes[-1] - tip, displacement, rtol=1e-5)
         assert result.stable
-    tips = [np.asarray(rj.solve(bend(600), segments=n).nodes[-1]) for n in (8, 16, 64)]
+    tips = [np.asarray(rj.solve(bend(600), segments=n).nodes[-1]) for n in (8, 16, 32)]
     errors = [np.linalg.norm(reached - tips[2]) for reached in tips[:2]]
     assert 3.5 < math.log2(errors[0] / errors[1]) < 4.5
 

@@ -90,7 +90,12 @@ SCENES = {"cantilever": lambda rod: problems.cantilever(rod=rod), "hanging": han
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "in space" else pytest.mark.slow) for name in SCENES]
+    "name",
+    [
+        pytest.param("cantilever", marks=pytest.mark.exhaustive),
+        pytest.param("hanging", marks=pytest.mark.slow),
+        "in space",
+    ],
 )
 def test_fourth_order_at_any_slenderness(name):
     found = []
@@ -222,7 +227,9 @@ def test_an_element_stiffens_without_bound_towards_a_fold():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("segments", [2, 3, 4, 5])
+@pytest.mark.parametrize(
+    "segments", [2, pytest.param(3, marks=pytest.mark.exhaustive), 4, pytest.param(5, marks=pytest.mark.exhaustive)]
+)
 def test_coarse_meshes_stay_sensible(segments):
     """No fold and no spurious minimum at the end of Fig. 1's path, whose exact energy is 19.970 EI/L."""
     result = figure_1(problems.cable(), segments)
@@ -352,7 +359,13 @@ def supports() -> dict[str, Scene]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", supports())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.exhaustive if name in {"clamp-free", "pin-swivel", "free-swivel"} else ())
+        for name in supports()
+    ],
+)
 def test_every_pair_of_supports(name, tmp_path):
     """The signs of forces, moments and frames are those of the finite differences; a restart is at rest."""
     scene = supports()[name]
@@ -431,7 +444,7 @@ print(float(result.nodes[8, 2]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("segments", [8, 100, 1000])
+@pytest.mark.parametrize("segments", [8, pytest.param(100, marks=pytest.mark.exhaustive), 1000])
 def test_the_rounding_floor_is_stated_only_where_it_is_above_the_tolerance(segments):
     scene = problems.hanging_cable()
     result = solve(scene, segments)

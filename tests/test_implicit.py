@@ -55,8 +55,8 @@ def fields(result: rj.Equilibrium, EI: float) -> jax.Array:
     [
         ("cantilever", "finite_difference"),
         pytest.param("clamps", "finite_difference", marks=pytest.mark.slow),
-        pytest.param("clamps", "hermite", marks=pytest.mark.slow),
-        pytest.param("pins", "hermite", marks=pytest.mark.slow),
+        pytest.param("clamps", "hermite", marks=pytest.mark.exhaustive),
+        pytest.param("pins", "hermite", marks=pytest.mark.exhaustive),
         pytest.param("start moment", "hermite", marks=pytest.mark.slow),
     ],
 )
@@ -110,7 +110,13 @@ def test_second_derivatives_and_batches():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("clamps", "pins", "end moment") else pytest.mark.exhaustive)
+        for name in SCENES
+    ],
+)
 def test_second_derivatives_forward_and_reverse(name):
     """Of a nonlinear function of a result, on a scene of each kind, along two changes of its numbers."""
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), changes(6), changes(7))

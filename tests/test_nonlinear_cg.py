@@ -16,7 +16,7 @@ def figure_1(segments: int, solver: rj.NonlinearCG) -> rj.Equilibrium:
 
 
 @pytest.mark.parametrize(
-    "segments", [10, 50, pytest.param(200, marks=pytest.mark.slow), pytest.param(500, marks=pytest.mark.slow)]
+    "segments", [10, 50, pytest.param(200, marks=pytest.mark.slow), pytest.param(500, marks=pytest.mark.exhaustive)]
 )
 def test_preconditioned_iterations_do_not_depend_on_the_mesh(segments):
     path = figure_1(segments, rj.NonlinearCG())

@@ -22,7 +22,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, load, save
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
 from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
@@ -173,19 +173,21 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SUFFIX,))
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
     file = read_scene_file(arguments.scene)
-    settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("always", OverstretchedWarning)
         if file.is_path:
-            result = rodjax.solve_path(file.scenes, **settings, progress=sys.stderr.isatty())
+            result = rodjax.solve_path(file.scenes, **file.settings, progress=sys.stderr.isatty())
         else:
-            result = rodjax.solve(file.scenes[0], **settings)
+            result = rodjax.solve(file.scenes[0], **file.settings)
     print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
     if arguments.output:
         save(result, arguments.output)
     if arguments.plot:
         _plot(jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result, arguments.plot)
+    for warning in caught:
+        print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
         return 0
     steps = f"steps {', '.join(map(str, np.flatnonzero(~np.asarray(result.converged))))}: " if file.is_path else ""
@@ -324,6 +326,7 @@ def _route(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {} if starts is None else {"starts": starts}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
+        warnings.simplefilter("ignore", OverstretchedWarning)
         try:
             route = rodjax.route(
                 scene.scenes[0],
@@ -355,8 +358,8 @@ def _solved(file: SceneFile) -> Equilibrium:
     with warnings.catch_warnings():
         # Said in the report.
         warnings.simplefilter("ignore", NotConvergedWarning)
-        settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
-        return rodjax.solve(file.scenes[0], **settings)
+        warnings.simplefilter("ignore", OverstretchedWarning)
+        return rodjax.solve(file.scenes[0], **file.settings)
 
 
 def _last(path: Path) -> Equilibrium:

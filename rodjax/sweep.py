@@ -51,7 +51,7 @@ from rodjax.batch import solve_batch
 from rodjax.checks import file_path, whole_number
 from rodjax.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.files import FIELDS
-from rodjax.result import NotConvergedWarning
+from rodjax.result import NotConvergedWarning, OverstretchedWarning
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
 from rodjax.scene_keys import unit_of
@@ -179,6 +179,7 @@ def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
         return manifest._replace(segments=first.segments, discretization=first.discretization or "hermite")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # as a case of the sweep it is counted
+        warnings.simplefilter("ignore", OverstretchedWarning)
         result = solve(first.scenes[0], rtol=first.rtol, discretization=first.discretization)
     return manifest._replace(segments=result.s.shape[-1] - 1, discretization=result.discretization)
 
@@ -375,8 +376,10 @@ def _solved(reader: CaseReader, manifest: Manifest, cases: Int[np.ndarray, "k"])
     scenes += scenes[-1:] * (manifest.chunk - len(cases))
     stacked = _stacked(scenes)
     settings: Any = dict(segments=manifest.segments, discretization=manifest.discretization)
+    settings |= {"strain_limit": reader.first.strain_limit}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # said in the end, for all together
+        warnings.simplefilter("ignore", OverstretchedWarning)
         result = solve_batch(stacked, **settings)
     parameters = {f"parameters/{key}": values for key, values in reader.cases.of(cases).items()}
     return {"case": cases} | {name: np.asarray(getattr(result, name))[: len(cases)] for name in RESULTS} | parameters

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.identification.setup import name_of
-from rodjax.status import Status
+from rodjax.result import DEFAULT_STRAIN_LIMIT
+from rodjax.status import CONVERGED, Status
 
 if TYPE_CHECKING:
     from rodjax.identification.result import Fit
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
 UNDERSTATED = 1.5
 # Correlations beyond this are told in words.
 CORRELATED = 0.95
-# What a solve ends with where there is an equilibrium.
-FOUND = (Status.CONVERGED, Status.ROUNDING_FLOOR)
 # Rows of the table of experiments; of more the worst.
 MOST_ROWS = 30
 LEVEL = 0.95
@@ -106,9 +105,13 @@ def _remarks(fit: "Fit") -> list[str]:
                     f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
                 )
     told += fit.held
-    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in FOUND]
+    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in CONVERGED]
     if lost:
         told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
+    taut = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status == Status.OVERSTRETCHED]
+    if taut:
+        shown = f"{', '.join(taut[:10])}{', ...' if len(taut) > 10 else ''}"
+        told.append(f"strained by more than {100 * DEFAULT_STRAIN_LIMIT:g} %: {shown}")
     return [f"- {remark}" for remark in told]
 
 

@@ -263,7 +263,8 @@ class _Fleet:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConvergedWarning)
             scenes = scenes_of(self._problem, jnp.asarray(designs))
-            return solve_batch(scenes, segments=self._problem.segments, solver=self._problem.solver)
+            options: dict[str, Any] = dict(segments=self._problem.segments, solver=self._problem.solver)
+            return solve_batch(scenes, **options, strain_limit=None)
 
     def search(self, tolerance: float, iterations: int, reserve: float) -> list[Outcome]:
         """How the searches ended."""

@@ -108,7 +108,7 @@ class Scattering(eqx.Module):
             with warnings.catch_warnings():
                 # How many did not converge is what the caller is told.
                 warnings.simplefilter("ignore", NotConvergedWarning)
-                rods = solve_batch(_scenes(self, zs[which]), guess=self.equilibrium, **options)
+                rods = solve_batch(_scenes(self, zs[which]), guess=self.equilibrium, strain_limit=None, **options)
             found = Quantities(*(np.asarray(x)[:count] for x in _quantities(self, rods)))
             yield found, np.asarray(rods.converged)[:count]
 

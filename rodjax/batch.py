@@ -36,6 +36,7 @@ from rodjax.equilibrium import (
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.path import path_from, stack_scenes
+from rodjax.ranges import check_ranges, with_ranges
 from rodjax.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -86,6 +87,37 @@ def solve_batch(
     is marked, and all others are not affected.
     """
     stacked = _stacked(scenes)
+    check_ranges(*not_differentiated(stacked))
+    return solve_stack(
+        stacked,
+        segments=segments,
+        rtol=rtol,
+        discretization=discretization,
+        solver=solver,
+        guess=guess,
+        planar=planar,
+        find=find,
+        strain_limit=strain_limit,
+        mesh=mesh,
+        progress=progress,
+    )
+
+
+def solve_stack(
+    stacked: Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+) -> Equilibrium:
+    """The same of stacked scenes of which some may have supports that are too far apart, as in a search."""
     instance(progress, "progress", bool)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -103,7 +135,7 @@ def solve_batch(
         begin = guess if last is None or last.s.ndim > 2 else last
         return _in_chunks(given, begin, strain_limit, options, mesh, progress)
 
-    result = refined_together(solve, options, rtol)
+    result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
         warn_if_not_converged(result)
         warn_if_overstretched(result, strain_limit)

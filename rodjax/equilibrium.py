@@ -31,6 +31,7 @@ from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import Guess, first_shape
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
+from rodjax.ranges import check_ranges, with_ranges
 from rodjax.refinement import SAFETY, SIZES, Depth, first_size, graded, next_size, shares
 from rodjax.result import (
     DEFAULT_STRAIN_LIMIT,
@@ -138,12 +139,16 @@ def solve(
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
     fixed_scene, guess = not_differentiated(scene, guess)
+    if fixed_scene is not scene:  # it was made of numbers that nobody knew
+        check_ranges(fixed_scene)
     check_single(guess)
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if rtol is not None and is_known(result):
         result = _refined(result, options, rtol, strain_limit)
+    if fixed_scene is not scene:
+        result = with_ranges(fixed_scene, result)
     warn_if_not_converged(result)
     warn_if_overstretched(result, strain_limit)
     return differentiable(scene, result)

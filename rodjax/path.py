@@ -27,6 +27,7 @@ from rodjax.equilibrium import (
 )
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
+from rodjax.ranges import check_ranges, with_ranges
 from rodjax.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -88,6 +89,8 @@ def solve_path(
     stacked = stack_scenes(scenes)
     instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)
+    if isinstance(scenes, Scene) or fixed_scenes is not stacked:
+        check_ranges(fixed_scenes)
     check_single(guess)
     options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
@@ -98,7 +101,7 @@ def solve_path(
     def solve(options: Options, _: Equilibrium | None) -> Equilibrium:
         return path_from(fixed_scenes, guess, strain_limit, options, progress)
 
-    path = refined_together(solve, options, rtol)
+    path = with_ranges(fixed_scenes, refined_together(solve, options, rtol))
     warn_if_not_converged(path)
     warn_if_overstretched(path, strain_limit)
     if at_critical == "stop":

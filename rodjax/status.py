@@ -22,6 +22,7 @@ class Status(enum.IntEnum):
     NOT_PLANAR = 7
     COLLAPSED = 8
     OVERSTRETCHED = 9
+    OUT_OF_RANGE = 12
 
     @property
     def message(self) -> str:
@@ -36,6 +37,8 @@ class Status(enum.IntEnum):
             Status.NOT_PLANAR: "not converged: planar is True, but supports, loads or twist leave the plane",
             Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
+            Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
+            "positive or an arclength beyond the rod",
         }[self]
 
 

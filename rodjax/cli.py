@@ -218,14 +218,21 @@ def _merge(arguments: argparse.Namespace) -> int:
 
 def _swept(path: Path, summary: Summary) -> int:
     """Says what a sweep gave."""
-    failed = len(summary.failed)
-    converged = f"{summary.cases - failed} of {summary.cases} cases converged"
+    converged = f"{summary.cases - len(summary.failed)} of {summary.cases} cases converged"
+    converged += f", {len(summary.missed)} of them not to rtol = {summary.rtol:g}" if summary.missed else ""
     print(f"{path}: {converged}, error of the shape up to about {summary.error:.0e} of the length")
-    if not failed:
-        return 0
-    first = ", ".join(map(str, summary.failed[:10])) + (", ..." if failed > 10 else "")
-    print(f"rodjax: {path}: {failed} of {summary.cases} cases not converged: {first}", file=sys.stderr)
-    return 3
+
+    def tell(cases: list[int], what: str) -> None:
+        first = ", ".join(map(str, cases[:10])) + (", ..." if len(cases) > 10 else "")
+        print(f"rodjax: {path}: {len(cases)} of {summary.cases} cases {what}: {first}", file=sys.stderr)
+
+    if summary.failed:
+        tell(summary.failed, "not converged")
+    if summary.missed:
+        tell(summary.missed, f"above rtol = {summary.rtol:g} on the finest mesh")
+    if summary.overstretched:
+        tell(summary.overstretched, "strained by more than strain_limit")
+    return 3 if summary.failed or summary.missed else 0
 
 
 def _fit(arguments: argparse.Namespace) -> int:

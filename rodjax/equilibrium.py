@@ -198,7 +198,8 @@ def refined_together(
         error = float(np.max(sizes[converged], initial=0.0))
         sinks = depth.lacking(errors, options.segments, converged)
         if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
-            _warn_if_inaccurate(error, rtol, options)
+            missed = int(np.sum(converged & ~(sizes <= rtol)))
+            _warn_if_inaccurate(error, rtol, options, f" in {missed} of {sizes.size} cases")
             break
         lacking = max(error, sinks * rtol / SAFETY)
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
@@ -215,11 +216,11 @@ def _is_finest(options: Options) -> bool:
     return options.segments >= SIZES[options.discretization][-1]
 
 
-def _warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
+def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
     if not error <= rtol:
         warnings.warn(
-            f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh, of {options.segments} "
-            "segments",
+            f"the estimated error {error:.1e} is above rtol = {rtol:g}{where} on the finest mesh, of "
+            f"{options.segments} segments",
             NotConvergedWarning,
             stacklevel=4,
         )

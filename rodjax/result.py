@@ -200,7 +200,7 @@ class Equilibrium(eqx.Module):
             length = float(np.min(self.s[..., -1]))
             if np.any(s < 0) or np.any(s > length):
                 raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
-        return _positions_at(self, s)
+        return positions_at(self, s)
 
 
 class Found(eqx.Module):
@@ -379,7 +379,7 @@ def beside_nodes(equilibrium: Equilibrium) -> Sides:
 
 
 @over_leading_axes
-def _positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
     units = equilibrium.state.units
     form, point = form_and_point(equilibrium)
     if isinstance(form, FrameForm):

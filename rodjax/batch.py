@@ -254,7 +254,9 @@ def _solve_here(
 
     starts = jax.vmap(state, in_axes)(scenes, guess)
     if not isinstance(options.solver, Newton) or slides(scenes) or scenes.obstacles:
-        return jax.vmap(lambda scene, start: result(scene, solve_from(scene, *start, options)))(scenes, starts)
+        return jax.vmap(lambda scene, start: result(scene, solve_from(scene, start[0], start[1], options)))(
+            scenes, starts
+        )
     searches = _mapped(search, scenes, starts)
     ends = _ends(searches, counts[0], options.solver, options.find)
     return _mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)

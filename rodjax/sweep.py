@@ -423,7 +423,8 @@ def _refined(
             return arrays
         segments, cases = factor * segments, cases[which]
         scenes, result = _rows((scenes, result), which)
-        result = solve_batch(scenes, guess=result, **(settings | {"segments": segments}))
+        settings = settings | {"segments": segments}
+        result = solve_batch(scenes, guess=result, **settings)
         found = {name: np.asarray(getattr(result, name)) for name in RESULTS if name != "nodes"}
         found |= {"nodes": _nodes_at(result, s[cases]), "segments": np.full(len(cases), segments)}
         # What does not converge on a finer mesh stays as it was, above `rtol`.
@@ -601,7 +602,7 @@ def summary(path: Path) -> Summary:
     with _opened(path) as file:
         names = ("case", "converged", "error_estimate", "status")
         case, converged, error, status = (np.asarray(file[name]) for name in names)
-        rtol = float(file.attrs["rtol"])
+        rtol = Manifest.of(file.attrs, path).rtol
     return Summary(
         cases=len(case),
         failed=case[~converged].tolist(),

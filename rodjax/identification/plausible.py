@@ -42,7 +42,7 @@ def _check(measured: Centerline, scene: Scene, name: str, sought: set[str]) -> N
     assert isinstance(held, Held), "a scene holds at least one position"
     points = measured.lifted(np.asarray(held.position))
     if "scale" not in sought:
-        _check_units(points, measured.s, length, name)
+        _check_units(points, None if measured.s is None else np.asarray(measured.s), length, name)
     if measured.s is not None and not sought & {"scale", "turn", "offset", "shift", "place"}:
         _check_order(measured, scene, length, name)
 

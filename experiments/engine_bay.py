@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import differential_evolution, minimize
 
 import rodjax as rj
-from rodjax.batch import solve_first
+from rodjax.batch import solve_first, solve_stack
 from rodjax.equilibrium import checked_options
 from rodjax.result import Equilibrium
 from rodjax.routing.problem import Problem, arranged, scenes_of, spare_lengths, valued
@@ -168,7 +168,7 @@ class Model:
         padded = jnp.asarray(np.pad(designs, ((0, self.size - len(designs)), (0, 0)), mode="edge"))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rj.NotConvergedWarning)  # counted as not valid
-            results = rj.solve_batch(scenes_of(self.problem, padded), segments=SEGMENTS)
+            results = solve_stack(scenes_of(self.problem, padded), segments=SEGMENTS, strain_limit=None)
         return self._values(padded, results, len(designs)), results
 
     def warm(self, design: np.ndarray, guess: Equilibrium) -> tuple[Values, Equilibrium]:

@@ -16,7 +16,7 @@ from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
 from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.path import solve_path
-from rodjax.result import Equilibrium, NotConvergedWarning, describe
+from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, describe
 from rodjax.rod import Law, Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene
@@ -96,6 +96,7 @@ __all__ = [
     "OnLine",
     "OnPatch",
     "OnSurface",
+    "OverstretchedWarning",
     "Pin",
     "Pipe",
     "Plane",

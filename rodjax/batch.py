@@ -26,6 +26,7 @@ from rodjax.equilibrium import (
     Search,
     Solver,
     checked_options,
+    checked_strain_limit,
     first_state,
     in_units_of,
     is_here,
@@ -35,7 +36,16 @@ from rodjax.equilibrium import (
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.path import path_from, stack_scenes
-from rodjax.result import Equilibrium, SolverState, equilibrium, warn_if_not_converged
+from rodjax.ranges import check_ranges, with_ranges
+from rodjax.result import (
+    DEFAULT_STRAIN_LIMIT,
+    Equilibrium,
+    Found,
+    SolverState,
+    equilibrium,
+    warn_if_not_converged,
+    warn_if_overstretched,
+)
 from rodjax.scene import Scene, slides
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
 
@@ -56,6 +66,7 @@ def solve_batch(
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
     find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     progress: bool = False,
 ) -> Equilibrium:
@@ -69,13 +80,44 @@ def solve_batch(
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `progress`: show a progress bar.
-    - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`: as for `rodjax.solve`. All scenes have one mesh:
-        where the estimated error of any is above `rtol`, all are solved on a finer one.
+    - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
+        scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
     is marked, and all others are not affected.
     """
     stacked = _stacked(scenes)
+    check_ranges(*not_differentiated(stacked))
+    return solve_stack(
+        stacked,
+        segments=segments,
+        rtol=rtol,
+        discretization=discretization,
+        solver=solver,
+        guess=guess,
+        planar=planar,
+        find=find,
+        strain_limit=strain_limit,
+        mesh=mesh,
+        progress=progress,
+    )
+
+
+def solve_stack(
+    stacked: Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+) -> Equilibrium:
+    """The same of stacked scenes of which some may have supports that are too far apart, as in a search."""
     instance(progress, "progress", bool)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -86,15 +128,17 @@ def solve_batch(
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
     options, rtol = checked_options(given, segments, rtol, discretization, solver, guess, planar, find)
+    strain_limit = checked_strain_limit(strain_limit)
 
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
         # A path has one guess, for its first scene.
         begin = guess if last is None or last.s.ndim > 2 else last
-        return _in_chunks(given, begin, options, mesh, progress)
+        return _in_chunks(given, begin, strain_limit, options, mesh, progress)
 
-    result = refined_together(solve, options, rtol)
+    result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
         warn_if_not_converged(result)
+        warn_if_overstretched(result, strain_limit)
     return differentiable(stacked, result)
 
 
@@ -112,7 +156,12 @@ def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Sce
 
 
 def _in_chunks(
-    scenes: Scene, guess: Guess | Equilibrium | None, options: Options, mesh: Mesh | None, progress: bool
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+    mesh: Mesh | None,
+    progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     each = _is_stack(guess)
@@ -128,7 +177,7 @@ def _in_chunks(
             )
         chunk = share
     if is_traced:
-        return _solve_many(scenes, guess, jnp.full(devices, share), options, mesh)
+        return _solve_many(scenes, guess, jnp.full(devices, share), strain_limit, options, mesh)
     parts = []
     for first in tqdm(range(0, count, chunk * devices), disable=not progress, unit="chunk"):
         last = min(first + chunk * devices, count)
@@ -140,7 +189,7 @@ def _in_chunks(
             whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
             places = (sharding, sharding if each else whole, sharding)
             inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, places, strict=True))
-        parts.append(_solve_many(*inputs, options, mesh))
+        parts.append(_solve_many(*inputs, strain_limit, options, mesh))
     if count == chunk * devices:
         return parts[0]
     return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *parts)
@@ -159,7 +208,7 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
 
 def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
     """The first `count` of stacked scenes, each from its guess, without derivatives; of the others nothing of use."""
-    return _solve_many(scenes, guesses, np.array([count]), options, None)
+    return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None)
 
 
 @functools.partial(compiled, static_argnames=("options", "mesh"))
@@ -167,25 +216,32 @@ def _solve_many(
     scenes: Scene,
     guess: Guess | Equilibrium | None,
     counts: Int[Array, "devices"],
+    strain_limit: Float[Array, ""] | float,
     options: Options,
     mesh: Mesh | None,
 ) -> Equilibrium:
     """The first of the scenes, as many as `counts` tells each device; of the rest something without meaning."""
     solve = functools.partial(_solve_here, options=options)
     if mesh is None:
-        return solve(scenes, guess, counts)
+        return solve(scenes, guess, counts, strain_limit)
     # Not `jit` with sharded inputs, which would ask all devices in each turn whether all are done.
     shared = PartitionSpec(mesh.axis_names[0])
-    specs = (shared, shared if _is_stack(guess) else PartitionSpec(), shared)
-    return jax.shard_map(solve, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)(scenes, guess, counts)
+    specs = (shared, shared if _is_stack(guess) else PartitionSpec(), shared, PartitionSpec())
+    many = jax.shard_map(solve, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
+    return many(scenes, guess, counts, jnp.asarray(strain_limit))
 
 
 def _solve_here(
-    scenes: Scene, guess: Guess | Equilibrium | None, counts: Int[Array, "1"], options: Options
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    counts: Int[Array, "1"],
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
 ) -> Equilibrium:
     in_axes = (0, 0 if _is_stack(guess) else None)
     if scenes.rod.length.ndim == 2:
-        return jax.vmap(functools.partial(path_from, options=options), in_axes)(scenes, guess)
+        path = functools.partial(path_from, strain_limit=strain_limit, options=options)
+        return jax.vmap(path, in_axes)(scenes, guess)
 
     def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, Float[Array, ""]]:
         return first_state(scene, guess, options)
@@ -193,16 +249,17 @@ def _solve_here(
     def search(scene: Scene, start: tuple[SolverState, Float[Array, ""]]) -> Search:
         return Search.of(*in_units_of(scene, start[0]), start[1], options)
 
-    once = jnp.ones((), int)
+    def result(scene: Scene, found: Found) -> Equilibrium:
+        return equilibrium(scene, found, jnp.ones((), int), strain_limit)
+
     starts = jax.vmap(state, in_axes)(scenes, guess)
     if not isinstance(options.solver, Newton) or slides(scenes) or scenes.obstacles:
-        results = jax.vmap(
-            lambda scene, start: equilibrium(scene, solve_from(scene, start[0], start[1], options), once)
+        return jax.vmap(lambda scene, start: result(scene, solve_from(scene, start[0], start[1], options)))(
+            scenes, starts
         )
-        return results(scenes, starts)
     searches = _mapped(search, scenes, starts)
     ends = _ends(searches, counts[0], options.solver, options.find)
-    return _mapped(lambda scene, search, end: equilibrium(scene, search.found(end), once), scenes, searches, ends)
+    return _mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)
 
 
 def _mapped(function: Callable, *stacks: Any) -> Any:

@@ -21,6 +21,8 @@ Numbers = Array | np.ndarray
 
 # Characters of a value in a message; more of it would hide what the message says.
 MOST_SHOWN = 200
+# Loose enough for frames typed in with 6 digits or held in float32, tight enough to catch a left-handed one.
+ROTATION_TOLERANCE = 1e-5
 
 
 def is_known(*values: Any) -> bool:
@@ -128,12 +130,10 @@ def rotation(value: Any, name: str) -> Float[Numbers, "3 3"]:
     """`value` as a right-handed orthonormal matrix."""
     array = number_array(value, name, (3, 3))
     if is_known(array):
-        # Loose enough for frames typed in with 6 digits or held in float32, tight enough to catch a left-handed one.
-        tolerance = 1e-5
         matrix = np.asarray(array)
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.max(np.abs(matrix.T @ matrix - np.eye(3)))
-        if not error <= tolerance:
+        if not error <= ROTATION_TOLERANCE:
             raise ValueError(
                 f"{name} must be a rotation (columns d1, d2, t of unit length at right angles), "
                 f"got one that is off by {error:.1e}; tangent and d2 make one, in Python by rodjax.frame(tangent, d2)"

@@ -22,7 +22,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, load, save
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
 from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
@@ -173,19 +173,21 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SUFFIX,))
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
     file = read_scene_file(arguments.scene)
-    settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("always", OverstretchedWarning)
         if file.is_path:
-            result = rodjax.solve_path(file.scenes, **settings, progress=sys.stderr.isatty())
+            result = rodjax.solve_path(file.scenes, **file.settings, progress=sys.stderr.isatty())
         else:
-            result = rodjax.solve(file.scenes[0], **settings)
+            result = rodjax.solve(file.scenes[0], **file.settings)
     print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
     if arguments.output:
         save(result, arguments.output)
     if arguments.plot:
         _plot(jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result, arguments.plot)
+    for warning in caught:
+        print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
         return 0
     steps = f"steps {', '.join(map(str, np.flatnonzero(~np.asarray(result.converged))))}: " if file.is_path else ""
@@ -216,14 +218,21 @@ def _merge(arguments: argparse.Namespace) -> int:
 
 def _swept(path: Path, summary: Summary) -> int:
     """Says what a sweep gave."""
-    failed = len(summary.failed)
-    converged = f"{summary.cases - failed} of {summary.cases} cases converged"
+    converged = f"{summary.cases - len(summary.failed)} of {summary.cases} cases converged"
+    converged += f", {len(summary.missed)} of them not to rtol = {summary.rtol:g}" if summary.missed else ""
     print(f"{path}: {converged}, error of the shape up to about {summary.error:.0e} of the length")
-    if not failed:
-        return 0
-    first = ", ".join(map(str, summary.failed[:10])) + (", ..." if failed > 10 else "")
-    print(f"rodjax: {path}: {failed} of {summary.cases} cases not converged: {first}", file=sys.stderr)
-    return 3
+
+    def tell(cases: list[int], what: str) -> None:
+        first = ", ".join(map(str, cases[:10])) + (", ..." if len(cases) > 10 else "")
+        print(f"rodjax: {path}: {len(cases)} of {summary.cases} cases {what}: {first}", file=sys.stderr)
+
+    if summary.failed:
+        tell(summary.failed, "not converged")
+    if summary.missed:
+        tell(summary.missed, f"above rtol = {summary.rtol:g} on the finest mesh")
+    if summary.overstretched:
+        tell(summary.overstretched, "strained by more than strain_limit")
+    return 3 if summary.failed or summary.missed else 0
 
 
 def _fit(arguments: argparse.Namespace) -> int:
@@ -324,6 +333,7 @@ def _route(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {} if starts is None else {"starts": starts}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
+        warnings.simplefilter("ignore", OverstretchedWarning)
         try:
             route = rodjax.route(
                 scene.scenes[0],
@@ -355,8 +365,8 @@ def _solved(file: SceneFile) -> Equilibrium:
     with warnings.catch_warnings():
         # Said in the report.
         warnings.simplefilter("ignore", NotConvergedWarning)
-        settings: dict[str, Any] = dict(segments=file.segments, rtol=file.rtol, discretization=file.discretization)
-        return rodjax.solve(file.scenes[0], **settings)
+        warnings.simplefilter("ignore", OverstretchedWarning)
+        return rodjax.solve(file.scenes[0], **file.settings)
 
 
 def _last(path: Path) -> Equilibrium:

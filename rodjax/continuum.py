@@ -150,7 +150,7 @@ def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
     with warnings.catch_warnings():
         # Whether the continuum converges from there is what the caller is told.
         warnings.simplefilter("ignore", NotConvergedWarning)
-        return solve(scene, rtol=GUESS_RTOL, discretization="hermite", guess=guess)
+        return solve(scene, rtol=GUESS_RTOL, discretization="hermite", guess=guess, strain_limit=None)
 
 
 class Piece(eqx.Module):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import typing
 import warnings
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.checks import instance, is_known, one_of, positive, whole_number
+from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
 from rodjax.discretization.clipped_frames import ClippedFrameForm
@@ -30,8 +31,10 @@ from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import Guess, first_shape
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
+from rodjax.ranges import check_ranges, with_ranges
 from rodjax.refinement import SAFETY, SIZES, Depth, first_size, graded, next_size, shares
 from rodjax.result import (
+    DEFAULT_STRAIN_LIMIT,
     Equilibrium,
     Found,
     NotConvergedWarning,
@@ -39,6 +42,7 @@ from rodjax.result import (
     equilibrium,
     estimated_errors,
     warn_if_not_converged,
+    warn_if_overstretched,
 )
 from rodjax.scene import (
     Scene,
@@ -98,6 +102,7 @@ def solve(
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
     find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
 ) -> Equilibrium:
     """The equilibrium of a scene.
 
@@ -121,6 +126,8 @@ def solve(
     - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that would
         rather leave its plane, is left along it, always to the same side. `"equilibrium"`: what the steps of Newton's
         method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there.
+    - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
+        beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
@@ -132,16 +139,22 @@ def solve(
             "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
         )
     fixed_scene, guess = not_differentiated(scene, guess)
+    if fixed_scene is not scene:  # it was made of numbers that nobody knew
+        check_ranges(fixed_scene)
     check_single(guess)
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
-    result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), options)
+    strain_limit = checked_strain_limit(strain_limit)
+    result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if rtol is not None and is_known(result):
-        result = _refined(result, options, rtol)
+        result = _refined(result, options, rtol, strain_limit)
+    if fixed_scene is not scene:
+        result = with_ranges(fixed_scene, result)
     warn_if_not_converged(result)
+    warn_if_overstretched(result, strain_limit)
     return differentiable(scene, result)
 
 
-def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
+def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: Float[Array, ""] | float) -> Equilibrium:
     """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`, and
     contacts press the rod in between its nodes no deeper than at them.
     """
@@ -159,7 +172,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
             defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
         lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
-        finer = _solve(result.scene, _finer(result, defects, options), result.total_twist, options)
+        finer = _solve(result.scene, _finer(result, defects, options), result.total_twist, strain_limit, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
             finer,
@@ -185,7 +198,8 @@ def refined_together(
         error = float(np.max(sizes[converged], initial=0.0))
         sinks = depth.lacking(errors, options.segments, converged)
         if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
-            _warn_if_inaccurate(error, rtol, options)
+            missed = int(np.sum(converged & ~(sizes <= rtol)))
+            _warn_if_inaccurate(error, rtol, options, f" in {missed} of {sizes.size} cases")
             break
         lacking = max(error, sinks * rtol / SAFETY)
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
@@ -202,11 +216,11 @@ def _is_finest(options: Options) -> bool:
     return options.segments >= SIZES[options.discretization][-1]
 
 
-def _warn_if_inaccurate(error: float, rtol: float, options: Options) -> None:
+def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
     if not error <= rtol:
         warnings.warn(
-            f"the estimated error {error:.1e} is above rtol = {rtol:g} on the finest mesh, of {options.segments} "
-            "segments",
+            f"the estimated error {error:.1e} is above rtol = {rtol:g}{where} on the finest mesh, of "
+            f"{options.segments} segments",
             NotConvergedWarning,
             stacklevel=4,
         )
@@ -329,6 +343,14 @@ def checked_rtol(rtol: Any) -> float:
     if not LEAST_RTOL <= value <= 1.0:
         raise ValueError(f"rtol must lie in {LEAST_RTOL:g} to 1, got {rtol!r}")
     return value
+
+
+def checked_strain_limit(strain_limit: Any) -> Float[Array, ""] | float:
+    """The largest |axial strain| that is allowed: infinite for `None`."""
+    if strain_limit is None or (isinstance(strain_limit, float) and strain_limit == math.inf):
+        return math.inf
+    value = positive(strain_limit, "strain_limit")
+    return float(value) if is_known(value) else jax.lax.stop_gradient(leaf(value))
 
 
 def _discretization(
@@ -562,8 +584,14 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
 @functools.partial(compiled, static_argnames=("options",))
-def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Equilibrium:
-    return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int))
+def _solve(
+    scene: Scene,
+    state: SolverState,
+    twist: Float[Array, ""],
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+) -> Equilibrium:
+    return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int), strain_limit)
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:

@@ -4,7 +4,7 @@ import functools
 import math
 import typing
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -20,13 +20,23 @@ from rodjax.equilibrium import (
     Solver,
     check_single,
     checked_options,
+    checked_strain_limit,
     first_state,
     refined_together,
     solve_from,
 )
 from rodjax.guess import Guess
 from rodjax.implicit import differentiable, not_differentiated
-from rodjax.result import Equilibrium, Found, SolverState, equilibrium, warn_if_not_converged
+from rodjax.ranges import check_ranges, with_ranges
+from rodjax.result import (
+    DEFAULT_STRAIN_LIMIT,
+    Equilibrium,
+    Found,
+    SolverState,
+    equilibrium,
+    warn_if_not_converged,
+    warn_if_overstretched,
+)
 from rodjax.scene import Scene, between, has_potential, nondimensional, slides
 from rodjax.solvers.newton import Find
 from rodjax.status import Outcome, is_converged
@@ -52,6 +62,7 @@ def solve_path(
     guess: Guess | Equilibrium | None = None,
     planar: bool = False,
     find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     at_critical: AtCritical = "jump",
     progress: bool = False,
 ) -> Equilibrium:
@@ -69,26 +80,30 @@ def solve_path(
     A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
     step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
 
-    - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`, `find`: as for `rodjax.solve`. The guess is for
-        the first scene; where the estimated error of any step is above `rtol`, the whole path is solved on a finer mesh
-        of equal segments.
+    - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`.
+        The guess is for the first scene; where the estimated error of any step is above `rtol`, the whole path is
+        solved on a finer mesh of equal segments.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene.
     """
     stacked = stack_scenes(scenes)
     instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)
+    if isinstance(scenes, Scene) or fixed_scenes is not stacked:
+        check_ranges(fixed_scenes)
     check_single(guess)
     options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar, find)
+    strain_limit = checked_strain_limit(strain_limit)
     one_of(at_critical, "at_critical", typing.get_args(AtCritical))
     if at_critical == "stop":
         _check_stop(fixed_scenes)
 
     def solve(options: Options, _: Equilibrium | None) -> Equilibrium:
-        return path_from(fixed_scenes, guess, options, progress)
+        return path_from(fixed_scenes, guess, strain_limit, options, progress)
 
-    path = refined_together(solve, options, rtol)
+    path = with_ranges(fixed_scenes, refined_together(solve, options, rtol))
     warn_if_not_converged(path)
+    warn_if_overstretched(path, strain_limit)
     if at_critical == "stop":
         count = _before_critical(fixed_scenes, path)
         stacked, path = jax.tree.map(lambda leaf: leaf[:count], (stacked, path))
@@ -151,7 +166,12 @@ def _structure(scene: Scene) -> str:
 
 @functools.partial(compiled, static_argnames=("options", "progress"))
 def _solve_path(
-    scenes: Scene, state: SolverState, twist: Float[Array, ""], options: Options, progress: bool
+    scenes: Scene,
+    state: SolverState,
+    twist: Float[Array, ""],
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+    progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
@@ -170,15 +190,19 @@ def _solve_path(
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return jax.vmap(equilibrium)(scenes, found, substeps)
+    return jax.vmap(equilibrium, (0, 0, 0, None))(scenes, found, substeps, strain_limit)
 
 
 def path_from(
-    scenes: Scene, guess: Guess | Equilibrium | None, options: Options, progress: bool = False
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+    progress: bool = False,
 ) -> Equilibrium:
     """A path on one mesh; the guess is for its first scene."""
     first = jax.tree.map(lambda leaf: leaf[0], scenes)
-    return _solve_path(scenes, *first_state(first, guess, options), options, progress)
+    return _solve_path(scenes, *first_state(first, guess, options), strain_limit, options, progress)
 
 
 class _Station(eqx.Module):

@@ -42,16 +42,22 @@ from rodjax.linalg import factor
 from rodjax.scene import Scene, has_potential, nondimensional, slid, slides
 from rodjax.sliding import slide
 from rodjax.stability import examined
-from rodjax.status import Outcome, Status, is_converged
+from rodjax.status import Outcome, Status, is_converged, with_strain
 from rodjax.units import Units
 from rodjax.vectors import dot, root
 
 # A rod deeper within an obstacle than this part of its radius is so by forces beyond all loads on it, as in a jam.
 MOST_PENETRATION = 1e-4
+# Beyond this |axial strain| a cable or hose is damaged, and stiffnesses that are constant are no longer those it has.
+DEFAULT_STRAIN_LIMIT = 0.05
 
 
 class NotConvergedWarning(UserWarning):
     """A solve ended without an equilibrium; the message says why."""
+
+
+class OverstretchedWarning(UserWarning):
+    """An equilibrium is strained by more than `strain_limit`; the message says by how much, and where."""
 
 
 class SolverState(eqx.Module):
@@ -91,7 +97,8 @@ class Equilibrium(eqx.Module):
       when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
       just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node
-    - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`
+    - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
+      whose largest |axial_strain| is above the `strain_limit` of the solve
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
       (dead moments, couples along the rod, follower loads) this is not examined and False, and
       `rodjax.squared_frequencies` tells
@@ -193,7 +200,7 @@ class Equilibrium(eqx.Module):
             length = float(np.min(self.s[..., -1]))
             if np.any(s < 0) or np.any(s > length):
                 raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
-        return _positions_at(self, s)
+        return positions_at(self, s)
 
 
 class Found(eqx.Module):
@@ -205,8 +212,10 @@ class Found(eqx.Module):
     is_stable: Bool[Array, ""]
 
 
-def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilibrium:
-    """What a solver found, in SI units."""
+def equilibrium(
+    scene: Scene, found: Found, substeps: Int[Array, ""], strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT
+) -> Equilibrium:
+    """What a solver found, in SI units; infinite where no strain is too large."""
     if found.state.places is not None:
         scene = slid(scene, found.state.places * scene.rod.length)
     scaled, units = nondimensional(scene)
@@ -219,6 +228,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
     converged = is_converged(outcome.status)
     axial_strain = results.axial_strain
     is_collapsed = ~converged & (jnp.min(axial_strain) <= -1)
+    status = jnp.where(is_collapsed, Status.COLLAPSED, with_strain(outcome.status, axial_strain, strain_limit))
     return Equilibrium(
         s=form.field.s * scene.rod.length,
         nodes=units.origin[None] + units.length * nodes,
@@ -236,7 +246,7 @@ def equilibrium(scene: Scene, found: Found, substeps: Int[Array, ""]) -> Equilib
         end_moment=results.end_moment * units.energy,
         converged=converged,
         stable=converged & found.is_stable,
-        status=jnp.where(is_collapsed, Status.COLLAPSED, outcome.status),
+        status=status,
         iterations=outcome.iterations,
         evaluations=outcome.evaluations,
         substeps=substeps,
@@ -369,7 +379,7 @@ def beside_nodes(equilibrium: Equilibrium) -> Sides:
 
 
 @over_leading_axes
-def _positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
     units = equilibrium.state.units
     form, point = form_and_point(equilibrium)
     if isinstance(form, FrameForm):
@@ -406,9 +416,25 @@ def describe(equilibrium: Equilibrium) -> str:
         > MOST_PENETRATION,
     }
     counts = {remark: int(np.sum(np.asarray(holds) & converged)) for remark, holds in remarks.items()}
+    strain = [_largest_strain(equilibrium)] if np.any(_is_overstretched(equilibrium)) else []
     if converged.ndim == 0:
-        return "; ".join([_outcome(equilibrium), *(remark for remark, count in counts.items() if count)])
-    return "\n".join([_outcome(equilibrium), *(f"{count} {remark}" for remark, count in counts.items() if count)])
+        return "; ".join([_outcome(equilibrium), *strain, *(remark for remark, count in counts.items() if count)])
+    special = (f"{count} {remark}" for remark, count in counts.items() if count)
+    return "\n".join([_outcome(equilibrium), *strain, *special])
+
+
+def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:
+    return np.asarray(equilibrium.status) == Status.OVERSTRETCHED
+
+
+def _largest_strain(equilibrium: Equilibrium) -> str:
+    """The largest |axial strain| among the overstretched rods, and where it is."""
+    strain = np.asarray(equilibrium.axial_strain)
+    size = np.where(_is_overstretched(equilibrium)[..., None], np.abs(strain), 0.0)
+    *case, node = np.unravel_index(np.argmax(size), size.shape)
+    place = f"{100 * strain[(*case, node)]:+.3g} % at s = {float(np.asarray(equilibrium.s)[(*case, node)]):.4g} m"
+    numbers = ", ".join(str(int(k)) for k in case)
+    return f"largest axial strain {place}" + (f" of case {numbers}" if case else "")
 
 
 def _outcome(equilibrium: Equilibrium) -> str:
@@ -424,3 +450,16 @@ def _outcome(equilibrium: Equilibrium) -> str:
 def warn_if_not_converged(equilibrium: Equilibrium) -> None:
     if is_known(equilibrium.converged) and not np.all(equilibrium.converged):
         warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)
+
+
+def warn_if_overstretched(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float) -> None:
+    """Of a limit and statuses that are known."""
+    if not is_known(equilibrium.status, strain_limit) or not np.any(_is_overstretched(equilibrium)):
+        return
+    count = int(np.sum(_is_overstretched(equilibrium)))
+    rods = "the rod is" if not equilibrium.status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
+    warnings.warn(
+        f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}",
+        OverstretchedWarning,
+        stacklevel=3,
+    )

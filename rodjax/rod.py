@@ -29,6 +29,8 @@ from rodjax.units import Units
 
 # Of St-Venant's series, which falls like k^-5: 13 digits.
 TORSION_TERMS = 200
+# By the length: so far may the arclengths of what varies along a rod end from those of its ends.
+ARCLENGTH_TOLERANCE = 1e-6
 
 
 class Law(eqx.Module):
@@ -472,5 +474,5 @@ def _check_arclengths(rod: Rod) -> None:
                 raise ValueError(f"{name}.jumps must lie inside 0 to {length:g} m, got {value.jumps.tolist()}")
             if isinstance(value, Smooth):
                 reached = np.array([value.s[0], value.s[-1]])
-                if not np.allclose(reached, [0, length], rtol=0, atol=1e-6 * length):
+                if not np.allclose(reached, [0, length], rtol=0, atol=ARCLENGTH_TOLERANCE * length):
                     raise ValueError(f"{name}.s must run from 0 to {length:g} m, got {reached[0]:g} to {reached[1]:g}")

@@ -53,6 +53,7 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
     discretization = "hermite"     # or "finite_difference"
+    strain_limit = 0.05            # |axial strain| above which the result is remarked on; inf: never
 
     [[path]]                       # any number of these, one after another
     steps = 10                     # from what came before to these values in equal steps; 1 where it is not given
@@ -97,7 +98,13 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Along, Smooth, Steps
 from rodjax.checks import file_path, leaf, shown, whole_number
-from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_options, checked_rtol
+from rodjax.equilibrium import (
+    MAX_SEGMENTS,
+    Discretization,
+    checked_options,
+    checked_rtol,
+    checked_strain_limit,
+)
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.obstacle_tables import obstacle
 from rodjax.obstacles import Obstacle
@@ -114,6 +121,7 @@ from rodjax.quantities import (
     si_values,
     table_list,
 )
+from rodjax.result import DEFAULT_STRAIN_LIMIT
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Clip, Free, Pin, Support, Swivel, frame
@@ -175,6 +183,13 @@ class SceneFile(NamedTuple):
     segments: int | None
     rtol: float | None
     discretization: Discretization | None
+    strain_limit: float = DEFAULT_STRAIN_LIMIT
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of the solve, of one scene or a path."""
+        names = ("segments", "rtol", "discretization", "strain_limit")
+        return {name: getattr(self, name) for name in names}
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
@@ -259,13 +274,14 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     clips = part(_clips, content.get("clips", []))
     obstacles = part(_obstacles, content.get("obstacles", []))
     values["loads"] = dict(loads)
-    solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization"))
+    solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization", "strain_limit"))
     discretization = cast(
         Discretization | None, choice(solve, "solve", "discretization", list(get_args(Discretization)))
     )
     with named("solve"):
         segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if "segments" in solve else None
         rtol = checked_rtol(solve["rtol"]) if "rtol" in solve else None
+        strain_limit = float(checked_strain_limit(solve.get("strain_limit", DEFAULT_STRAIN_LIMIT)))
     if segments is not None and rtol is not None:
         raise SceneFileError("solve.rtol is not allowed together with solve.segments: it chooses the segments")
     turns = values["end"].pop("turns", None)
@@ -295,7 +311,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             scenes.append(scene(_between(values, target, step / steps, where), where))
             _check_frames(scenes[-2], scenes[-1], f"{where}steps: step {step} of {steps}")
         values = _between(values, target, 1.0, where)
-    return SceneFile(scenes, bool(changes), segments, rtol, discretization)
+    return SceneFile(scenes, bool(changes), segments, rtol, discretization, strain_limit)
 
 
 def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:

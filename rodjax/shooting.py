@@ -25,9 +25,9 @@ from rodjax.along import Along
 from rodjax.discretization.shape import Shape
 from rodjax.energy import dead_load_energy
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.result import Equilibrium, SolverState
+from rodjax.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState
 from rodjax.scene import Scene, held_at_both_ends, nondimensional, slid
-from rodjax.status import Status, is_converged
+from rodjax.status import Status, is_converged, with_strain
 from rodjax.supports import Clamp, Free, Held, Support, Swivel
 from rodjax.units import Units
 
@@ -304,6 +304,7 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     residual = jnp.max(jnp.abs(ravel_pytree(reached.missed)[0]))
     status = jnp.where(residual < TOLERANCE, Status.CONVERGED, Status.MAX_ITERATIONS)
     status = jnp.where(jnp.isfinite(residual), status, Status.NOT_FINITE)
+    status = with_strain(status, reached.axial_strain, DEFAULT_STRAIN_LIMIT)
     # Potentials are zero at the global origin, not at that of the units.
     from_origin = sections.position + (units.origin / units.length)[None]
     energy = reached.elastic_energy + reached.load_energy + _energy_at(scaled, start, from_origin)

@@ -1,8 +1,11 @@
 """How a solve ended, in numbers that survive `jit` and `vmap`, and in words."""
 
 import enum
+import functools
+import operator
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -18,6 +21,8 @@ class Status(enum.IntEnum):
     SADDLE = 6
     NOT_PLANAR = 7
     COLLAPSED = 8
+    OVERSTRETCHED = 9
+    OUT_OF_RANGE = 12
 
     @property
     def message(self) -> str:
@@ -31,7 +36,14 @@ class Status(enum.IntEnum):
             Status.SADDLE: "not converged: an equilibrium was found that is not a minimum, and no way down from it",
             Status.NOT_PLANAR: "not converged: planar is True, but supports, loads or twist leave the plane",
             Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
+            Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
+            Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
+            "positive or an arclength beyond the rod",
         }[self]
+
+
+# The codes of an equilibrium.
+CONVERGED = (Status.CONVERGED, Status.ROUNDING_FLOOR, Status.OVERSTRETCHED)
 
 
 class Outcome(eqx.Module):
@@ -45,4 +57,14 @@ class Outcome(eqx.Module):
 
 def is_converged(status: Int[Array, "..."]) -> Bool[Array, "..."]:
     """Whether a code, or each of an array of them, stands for an equilibrium."""
-    return (status == Status.CONVERGED) | (status == Status.ROUNDING_FLOOR)
+    first, *others = (status == code for code in CONVERGED)
+    return functools.reduce(operator.or_, others, first)
+
+
+def with_strain(
+    status: Int[Array, ""], axial_strain: Float[Array, "n"], strain_limit: Float[Array, ""] | float
+) -> Int[Array, ""]:
+    """The code of an equilibrium, `OVERSTRETCHED` where its largest |axial strain| is above `strain_limit`."""
+    limit = jnp.asarray(strain_limit, axial_strain.dtype)
+    is_over = is_converged(status) & (jnp.max(jnp.abs(axial_strain)) > limit)
+    return jnp.where(is_over, Status.OVERSTRETCHED, status)

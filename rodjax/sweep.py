@@ -12,13 +12,14 @@ grid is TOML; its cases are the product of all keys, the last key fastest:
     "rod.EA" = { from = "80 N", to = "8 kN", count = 3, spacing = "log" }        # equal factors
 
 A table is CSV: a header of keys, then one row a case. Cases count from 0. All are solved on the mesh of
-`[solve] segments`; without it, on as many equal segments as the first case needs for `[solve] rtol`.
+`[solve] segments`; without it, on as many equal segments as the first case needs for `[solve] rtol`, and those that
+need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the finest is counted.
 
 **The result**, HDF5, first axis the case: `case` its number, `status`, `converged`, `stable`, `iterations`, `residual`,
 `error_estimate` of the mesh, `energy`, `elastic_energy`, `total_twist`, `start_force`, `start_moment`, `end_force`,
-`end_moment`, `nodes` (cases, segments + 1, 3), as in `rodjax.Equilibrium`, and `parameters/<key>` in SI units; each has
-the attributes `units` and `description`. Attributes of the file: the texts `scene` and `over`, and what is in
-`Manifest`, with its `fingerprint`.
+`end_moment`, `nodes` (cases, segments + 1, 3), as in `rodjax.Equilibrium`, `segments` of the mesh of each case (its
+`nodes` are those that the coarsest mesh has), and `parameters/<key>` in SI units; each has the attributes `units` and
+`description`. Attributes of the file: the texts `scene` and `over`, and what is in `Manifest`, with its `fingerprint`.
 
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
 solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
@@ -44,22 +45,24 @@ import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from rodjax.atomic_write import has_seal, replace_file, seal
 from rodjax.batch import solve_batch
 from rodjax.checks import file_path, whole_number
 from rodjax.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.files import FIELDS
-from rodjax.result import NotConvergedWarning
+from rodjax.refinement import ORDERS, SAFETY, SIZES
+from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, positions_at
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
 from rodjax.scene_keys import unit_of
+from rodjax.status import Status
 from rodjax.sweep_cases import MAX_CASES, CaseReader, SweepError
 
 SUFFIX = ".h5"
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.
-FORMAT = 1
+FORMAT = 2
 # Cases of a chunk: as many as `solve_batch` takes in one call, for which it needs 200 MB at 50 segments.
 DEFAULT_CHUNK = 1024
 
@@ -70,7 +73,12 @@ RESULTS = (
 DESCRIPTIONS = FIELDS | {
     "case": ("1", "number of the case, from 0"),
     "error_estimate": ("1", "of the mesh: largest distance of a node from the continuum, by the length"),
+    "segments": ("1", "of the mesh on which the case was solved"),
 }
+
+INTEGERS = ("case", "status", "iterations", "segments")
+# Arclengths that differ by less than this part of the length are the same.
+SAME_PLACE = 1e-9
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -79,7 +87,9 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Manifest(NamedTuple):
-    """All that the result depends on. `scene_sha256` and `over_sha256` are of the texts; `shard` is i/n."""
+    """All that the result depends on. `scene_sha256` and `over_sha256` are of the texts; `shard` is i/n; `rtol` is 0
+    where the mesh is given.
+    """
 
     scene_sha256: str
     over_sha256: str
@@ -87,6 +97,7 @@ class Manifest(NamedTuple):
     chunk: int
     shard: str
     segments: int
+    rtol: float
     discretization: str
     precision: str
     format: int
@@ -164,6 +175,7 @@ def _manifest(reader: CaseReader, shard: tuple[int, int], chunk: int | None) -> 
         chunk=min(DEFAULT_CHUNK if chunk is None else chunk, count),
         shard=f"{shard[0]}/{shard[1]}",
         segments=0,
+        rtol=0.0 if reader.first.segments is not None else reader.first.rtol or DEFAULT_RTOL,
         discretization="",
         precision=str(jnp.zeros(()).dtype),
         format=FORMAT,
@@ -179,7 +191,8 @@ def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
         return manifest._replace(segments=first.segments, discretization=first.discretization or "hermite")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # as a case of the sweep it is counted
-        result = solve(first.scenes[0], rtol=first.rtol, discretization=first.discretization)
+        warnings.simplefilter("ignore", OverstretchedWarning)
+        result = solve(first.scenes[0], rtol=manifest.rtol, discretization=first.discretization)
     return manifest._replace(segments=result.s.shape[-1] - 1, discretization=result.discretization)
 
 
@@ -188,11 +201,18 @@ def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """What a file holds: number of cases, numbers of those that did not converge, largest error of the others."""
+    """What a file holds: number of cases, numbers of those that did not converge, largest error of the others.
+
+    `missed`: numbers of cases that converged, but not to `rtol`, which is 0 where none was asked for; `overstretched`:
+    of those strained by more than `strain_limit`.
+    """
 
     cases: int
     failed: list[int]
     error: float
+    rtol: float
+    missed: list[int]
+    overstretched: list[int]
 
 
 def sweep(
@@ -314,7 +334,7 @@ def _begin(reader: CaseReader, manifest: Manifest, parts: Path, say: Callable[[s
     # cases at once would take minutes.
     reader.scenes(np.array(reader.cases.extremes()))
     manifest = _with_mesh(manifest, reader.first)
-    wanted = "" if reader.first.segments else f", as case 0 needs for rtol = {reader.first.rtol or DEFAULT_RTOL:g}"
+    wanted = f", as case 0 needs for rtol = {manifest.rtol:g}; cases that need more get them" if manifest.rtol else ""
     say(f"{_chunks(manifest)}, {manifest.segments} segments ({manifest.discretization}){wanted}")
     # Without a manifest nobody knows what is in a folder.
     if parts.exists():
@@ -375,11 +395,62 @@ def _solved(reader: CaseReader, manifest: Manifest, cases: Int[np.ndarray, "k"])
     scenes += scenes[-1:] * (manifest.chunk - len(cases))
     stacked = _stacked(scenes)
     settings: Any = dict(segments=manifest.segments, discretization=manifest.discretization)
+    settings |= {"strain_limit": reader.first.strain_limit}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # said in the end, for all together
+        warnings.simplefilter("ignore", OverstretchedWarning)
         result = solve_batch(stacked, **settings)
+        arrays = {name: np.asarray(getattr(result, name))[: len(cases)] for name in RESULTS}
+        arrays["segments"] = np.full(len(cases), manifest.segments)
+        if manifest.rtol:
+            arrays = _refined(arrays, stacked, result, manifest, settings)
     parameters = {f"parameters/{key}": values for key, values in reader.cases.of(cases).items()}
-    return {"case": cases} | {name: np.asarray(getattr(result, name))[: len(cases)] for name in RESULTS} | parameters
+    return {"case": cases} | arrays | parameters
+
+
+def _refined(
+    arrays: Arrays, scenes: Scene, result: Equilibrium, manifest: Manifest, settings: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    """With the cases whose estimated error is above `rtol` solved again, on finer meshes, each from the last one."""
+    arrays = {name: values.copy() for name, values in arrays.items()}
+    segments, rtol, finest = manifest.segments, manifest.rtol, SIZES[manifest.discretization][-1]
+    s, cases = np.asarray(result.s), np.arange(len(arrays["segments"]))
+    while True:
+        error = arrays["error_estimate"][cases]
+        which = np.flatnonzero(arrays["converged"][cases] & ~(error <= rtol))
+        factor = _growth(error[which], manifest, finest // segments) if len(which) else 1
+        if factor < 2:
+            return arrays
+        segments, cases = factor * segments, cases[which]
+        scenes, result = _rows((scenes, result), which)
+        settings = settings | {"segments": segments}
+        result = solve_batch(scenes, guess=result, **settings)
+        found = {name: np.asarray(getattr(result, name)) for name in RESULTS if name != "nodes"}
+        found |= {"nodes": _nodes_at(result, s[cases]), "segments": np.full(len(cases), segments)}
+        # What does not converge on a finer mesh stays as it was, above `rtol`.
+        better = np.flatnonzero(found["converged"])
+        for name, values in found.items():
+            arrays[name][cases[better]] = values[better]
+        cases, (scenes, result) = cases[better], _rows((scenes, result), better)
+
+
+def _rows(stacks: tuple[Scene, Equilibrium], which: Int[np.ndarray, "k"]) -> tuple[Scene, Equilibrium]:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[which], stacks)
+
+
+def _growth(errors: Float[np.ndarray, "k"], manifest: Manifest, most: int) -> int:
+    """How many times as fine the next mesh is, 4, 2, or 1 where none may be."""
+    lacking = SAFETY * float(np.max(errors)) / manifest.rtol
+    wanted = 4 if lacking > 2 ** ORDERS[manifest.discretization] else 2
+    return max(factor for factor in (1, 2, 4) if factor <= min(wanted, most))
+
+
+def _nodes_at(result: Equilibrium, s: Float[np.ndarray, "k n+1"]) -> Float[np.ndarray, "k n+1 3"]:
+    """The centerlines at other arclengths, of each case its own: at nodes, unless clips have moved these."""
+    every = (result.s.shape[-1] - 1) // (s.shape[-1] - 1)
+    if np.allclose(result.s[:, ::every], s, rtol=0, atol=SAME_PLACE * np.max(s)):
+        return np.asarray(result.nodes[:, ::every])
+    return np.asarray(jax.vmap(positions_at)(result, jnp.asarray(s)))
 
 
 def _stacked(scenes: list[Scene]) -> Scene:
@@ -466,7 +537,7 @@ def _arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> di
 
     with _opened(path) as file:
         file.visititems(add)
-    missing = [name for name in ("case", *RESULTS) if name not in arrays]
+    missing = [name for name in ("case", "segments", *RESULTS) if name not in arrays]
     if missing:
         raise SweepError(f"{path} is damaged: it lacks {', '.join(missing)}")
     if not np.array_equal(arrays["case"], cases):
@@ -482,7 +553,7 @@ def _kind_and_shape(name: str, values: np.ndarray, manifest: Manifest) -> tuple[
     """What NumPy calls the numbers of a dataset, and their shape for each case."""
     if name.startswith("parameters/"):
         return "f", values.shape[1:]
-    kind = "b" if name in ("converged", "stable") else "i" if name in ("case", "status", "iterations") else "f"
+    kind = "b" if name in ("converged", "stable") else "i" if name in INTEGERS else "f"
     if name == "nodes":
         return kind, (manifest.segments + 1, 3)
     return kind, (3,) if name.endswith(("_force", "_moment")) else ()
@@ -529,6 +600,14 @@ def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.
 
 def summary(path: Path) -> Summary:
     with _opened(path) as file:
-        case, converged, error = (np.asarray(file[name]) for name in ("case", "converged", "error_estimate"))
-    largest = float(np.max(error[converged], initial=0.0))
-    return Summary(len(case), case[~converged].tolist(), largest)
+        names = ("case", "converged", "error_estimate", "status")
+        case, converged, error, status = (np.asarray(file[name]) for name in names)
+        rtol = Manifest.of(file.attrs, path).rtol
+    return Summary(
+        cases=len(case),
+        failed=case[~converged].tolist(),
+        error=float(np.max(error[converged], initial=0.0)),
+        rtol=rtol,
+        missed=case[converged & ~(error <= rtol)].tolist() if rtol else [],
+        overstretched=case[status == Status.OVERSTRETCHED].tolist(),
+    )

@@ -172,7 +172,7 @@ if processes == 1:
     options = batch.checked_options(scenes[0], 8, None, "finite_difference", None, None, False)[0]
     counts = np.full(jax.device_count(), len(scenes) // jax.device_count())
     program = jax.jit(batch._solve_many, static_argnames=("options", "mesh"))
-    text = program.lower(stacked, None, counts, options=options, mesh=mesh).compile().as_text()
+    text = program.lower(stacked, None, counts, 0.05, options=options, mesh=mesh).compile().as_text()
     assert "while(" in text
     for collective in ("all-reduce", "all-gather", "all-to-all", "collective-permute"):
         assert collective + "(" not in text, collective

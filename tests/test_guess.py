@@ -41,6 +41,7 @@ def test_a_cold_start_finds_an_equilibrium_between_random_frames():
         gravity = (0, 0, -unit * 10 ** rng.uniform(-1, 2.5))
         result = rj.solve(
             Scene(rod, Clamp((0, 0, 0), start), Clamp(position, end), gravity),
+            strain_limit=None,
             segments=20,
             discretization="finite_difference",
         )

@@ -342,6 +342,12 @@ def test_a_route_that_is_not_found_exits_with_3(found, files, capsys):
     [
         ("brake_line.toml", 'scene = "scene.toml"', 'cables = { a = "scene.toml" }', "cables is not allowed where"),
         ("scene.toml", "[rod]", "[solve]\nrtol = 1e-3\n[rod]", "solve.rtol and finite differences are not allowed"),
+        (
+            "scene.toml",
+            "[rod]",
+            "[solve]\nstrain_limit = 0.1\n[rod]",
+            "solve.strain_limit is not allowed where",
+        ),
         ("brake_line.toml", 'key = "clips.0.at"', 'key = "clips.7.at"', "'clips.7.at' is no number of this scene"),
     ],
 )

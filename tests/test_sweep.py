@@ -18,6 +18,7 @@ import pytest
 
 import rodjax
 from rodjax.cli import main
+from rodjax.refinement import SIZES
 from rodjax.scene_file import read_scene
 from rodjax.sweep import merge, summary, sweep
 from rodjax.sweep_cases import CaseReader, SweepError, read_cases
@@ -384,6 +385,18 @@ def test_cases_that_do_not_converge_are_counted(files, capsys, monkeypatch):
     assert summary(Path("out.h5")).failed == [0, 1, 2, 3, 4]
 
 
+def test_cases_that_are_strained_too_much_are_told(files, capsys):
+    Path("scene.toml").write_text(SCENE + "strain_limit = 1e-5\n")
+    assert main(["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", "4"]) == 0
+    out, err = capsys.readouterr()
+    assert "10 of 10 cases converged" in out
+    # The weight of 1 N on EA = 785 N strains all of them by 1e-4 and more.
+    assert (
+        err == f"rodjax: out.h5: 10 of 10 cases strained by more than strain_limit: {', '.join(map(str, range(10)))}\n"
+    )
+    np.testing.assert_array_equal(contents("out.h5")["status"], 10 * [rodjax.Status.OVERSTRETCHED])
+
+
 def test_without_segments_the_first_case_decides_on_the_mesh(files, whole, capsys, monkeypatch):
     Path("scene.toml").write_text(SCENE.replace("segments = 4", "rtol = 0.1"))
     asked = []
@@ -407,6 +420,46 @@ def test_the_mesh_of_the_first_case_serves_cases_like_it(files):
     assert found["attribute discretization"] == "hermite"
     assert found["nodes"].shape == (10, found["attribute segments"] + 1, 3)
     assert np.all(found["error_estimate"] < 2e-3)
+
+
+# At 4 segments the last two of five cases have estimated errors of 0.012 and 0.34, the others at most 0.009.
+ROUGH = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "rtol = 0.01")
+SHARP = '"end.position.0" = [0.9, 0.8, 0.6, 0.4, 0.2]\n'
+
+
+@pytest.mark.slow
+def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
+    Path("scene.toml").write_text(ROUGH)
+    Path("grid.toml").write_text(SHARP)
+    command = ["sweep", "scene.toml", "--over", "grid.toml", "-o"]
+    assert main([*command, "out.h5"]) == 0
+    out, err = capsys.readouterr()
+    assert "5 of 5 cases converged, error of the shape" in out
+    assert err == ""
+    found = contents("out.h5")
+    assert np.all(found["error_estimate"] <= 0.01)
+    np.testing.assert_array_equal(found["segments"], [4, 4, 4, 16, 16])
+    assert found["nodes"].shape == (5, 5, 3)
+    # What is written of the finer meshes is theirs: the last case as solved on 16 segments, to the solver's tolerance.
+    scenes = CaseReader(Path("scene.toml"), Path("grid.toml")).scenes(np.arange(5))
+    fine = rodjax.solve_batch(scenes, segments=16, guess=rodjax.solve_batch(scenes, segments=4))
+    np.testing.assert_allclose(found["nodes"][4], fine.nodes[4, ::4], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found["energy"][4], fine.energy[4], rtol=1e-6)
+    # In chunks, which are the same whatever the shard, and without a finer mesh.
+    for k in (1, 2):
+        assert main([*command, f"{k}.h5", "--chunk", "3", "--shard", f"{k}/2"]) == 0
+    assert main(["merge", "1.h5", "2.h5", "-o", "merged.h5"]) == 0
+    np.testing.assert_array_equal(contents("merged.h5")["segments"], found["segments"])
+    capsys.readouterr()
+    monkeypatch.setitem(SIZES, "hermite", (4,))
+    assert main([*command, "rough.h5"]) == 3
+    out, err = capsys.readouterr()
+    assert "5 of 5 cases converged, 2 of them not to rtol = 0.01, error of the shape up to about 3e-01" in out
+    assert err == "rodjax: rough.h5: 2 of 5 cases above rtol = 0.01 on the finest mesh: 3, 4\n"
+    assert summary(Path("rough.h5")).missed == [3, 4]
+    # A batch is solved on one mesh, and says how many cases miss the tolerance there.
+    with pytest.warns(rodjax.NotConvergedWarning, match=r"error 3.4e-01 is above rtol = 0.01 in 2 of 5 cases on the"):
+        rodjax.solve_batch(scenes, rtol=0.01)
 
 
 @pytest.mark.slow

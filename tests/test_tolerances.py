@@ -74,7 +74,7 @@ def test_rods_that_do_not_come_to_rest_are_left_out(monkeypatch):
         parts = rods.converged.at[0].set(False), rods.nodes.at[0].set(np.nan), rods.start_force.at[0].set(np.nan)
         return eqx.tree_at(lambda rods: (rods.converged, rods.nodes, rods.start_force), rods, parts)
 
-    monkeypatch.setattr(scatter, "solve_batch", solved)
+    monkeypatch.setattr(scatter, "solve_stack", solved)
     few = rj.tolerances(wire(), OF_WIRE, limits=LIMITS)
     many = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=2000)
     # The first of each call, of which there are one and two.

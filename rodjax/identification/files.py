@@ -29,10 +29,10 @@ A complete example of the first; quantities are as in scene files, a number and 
     gap = "end.position.0"
 
 Names of unknowns are those of `rodjax.Unknown`: "rod.EI.0" of a pair, "end.position.2", "gravity.1",
-"point_forces.0.at", a clamp's turn "start.frame.1", a rig's scale "measured.0.scale"; there and in `rodjax.fit` is what
-scales, priors and losses mean. Without standard deviations all measurements must be of one kind;
-with any, those of all kinds that are measured must be given. What `[fit]` does not say of mesh and discretization,
-`[solve]` of the scene does.
+"point_forces.0.at", a clamp's turn from the nominal frame "start.frame.1", a rig's scale "measured.0.scale"; there and
+in `rodjax.fit` is what scales, priors and losses mean. Without standard deviations all measurements must be of one
+kind; with any, those of all kinds that are measured must be given. What `[fit]` does not say of mesh and
+discretization, `[solve]` of the scene does.
 
 The table has a header and one row for each measured point. Columns are, with a unit in brackets or in SI units:
 

@@ -20,7 +20,7 @@ from rodjax.identification.refits import Profile
 from rodjax.identification.result import Fit
 from rodjax.identification.setup import name_of
 from rodjax.identification.unknowns import with_values
-from rodjax.status import Status
+from rodjax.status import CONVERGED
 
 # Panels of shapes, and lines in a panel of residuals; of more centerlines those with the largest deviations.
 MOST_PANELS, MOST_LINES = 12, 60
@@ -32,7 +32,6 @@ MOST_NAMED = 10
 # Of the legend that fit beside each other, where each name has the place of 8 for its line.
 CHARACTERS = 100
 COLOR_MAP = "viridis"
-SOLVED = (Status.CONVERGED, Status.ROUNDING_FLOOR)
 # Height of a panel by its width, where a straight rod would be seen in a slit, or a hanging one fill the page.
 LEAST_HEIGHT, LARGEST_HEIGHT = 0.35, 1.2
 
@@ -217,7 +216,7 @@ def _drawn(fit: Fit) -> list[Place]:
         (k, j)
         for k, (experiment, status) in enumerate(zip(fit.setup.experiments, fit.statuses, strict=True))
         for j, measured in enumerate(experiment.measured)
-        if isinstance(measured, Centerline) and status in SOLVED
+        if isinstance(measured, Centerline) and status in CONVERGED
     ]
 
 

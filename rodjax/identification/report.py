@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.identification.setup import name_of
-from rodjax.status import Status
+from rodjax.result import DEFAULT_STRAIN_LIMIT
+from rodjax.status import CONVERGED, Status
+from rodjax.supports import Clamp
 
 if TYPE_CHECKING:
     from rodjax.identification.result import Fit
@@ -16,8 +18,10 @@ if TYPE_CHECKING:
 UNDERSTATED = 1.5
 # Correlations beyond this are told in words.
 CORRELATED = 0.95
-# What a solve ends with where there is an equilibrium.
-FOUND = (Status.CONVERGED, Status.ROUNDING_FLOOR)
+# GJ/EI beyond these is told in words, with what other whole numbers of turns would make it, of so many experiments.
+USUAL_RATIO = 0.1, 2.0
+OTHER_TURNS = (-1, 1, -2, 2, -3, 3)
+MOST_UNUSUAL = 3
 # Rows of the table of experiments; of more the worst.
 MOST_ROWS = 30
 LEVEL = 0.95
@@ -106,10 +110,67 @@ def _remarks(fit: "Fit") -> list[str]:
                     f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
                 )
     told += fit.held
-    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in FOUND]
+    told += _of_turns(fit) + _of_frames(fit)
+    lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in CONVERGED]
     if lost:
         told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
+    taut = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status == Status.OVERSTRETCHED]
+    if taut:
+        shown = f"{', '.join(taut[:10])}{', ...' if len(taut) > 10 else ''}"
+        told.append(f"strained by more than {100 * DEFAULT_STRAIN_LIMIT:g} %: {shown}")
     return [f"- {remark}" for remark in told]
+
+
+def _of_turns(fit: "Fit") -> list[str]:
+    """What is odd about a torsional stiffness, which shapes tell by the torque alone: GJ times the twist."""
+    names = {name for unknown in (*fit.setup.shared, *fit.setup.own) for name in unknown.names}
+    results = [result for result in fit.found.evaluation.results if result.scene.rod.is_plain]
+    if not names & {"rod.EI", "rod.GJ"} or len(results) < len(fit.found.evaluation.results):
+        return []
+    ratios = np.concatenate([np.asarray(result.scene.rod.GJ / result.scene.rod.EI) for result in results])
+    twists = np.concatenate([np.asarray(result.total_twist) for result in results])
+    are_clamps = [
+        isinstance(result.scene.start, Clamp) and isinstance(result.scene.end, Clamp)
+        for result in results
+        for _ in np.asarray(result.total_twist)
+    ]
+    is_unusual = ~((ratios >= USUAL_RATIO[0]) & (ratios <= USUAL_RATIO[1]))
+    unusual = [row for row in np.flatnonzero(is_unusual) if fit.statuses[fit.setup.order[row]] in CONVERGED]
+    return [
+        _of_ratio(name_of(fit.setup, fit.setup.order[row]), float(ratios[row]), float(twists[row]), are_clamps[row])
+        for row in unusual[:MOST_UNUSUAL]
+    ]
+
+
+def _of_ratio(name: str, ratio: float, twist: float, is_between_clamps: bool) -> str:
+    told = (
+        f"GJ/EI = {ratio:.3g} of {name} is unusual: round sections of one material have 0.67 to 1, cables seldom less "
+        f"than {USUAL_RATIO[0]:g} or more than {USUAL_RATIO[1]:g}"
+    )
+    others = {turns: ratio * twist / (twist + 2 * math.pi * turns) for turns in OTHER_TURNS}
+    usual = [
+        f"{turns:+d} turn{'s' if abs(turns) > 1 else ''} would make it {other:.3g}"
+        for turns, other in others.items()
+        if USUAL_RATIO[0] <= other <= USUAL_RATIO[1]
+    ]
+    if not (is_between_clamps and usual):
+        return told
+    return (
+        f"{told}; shapes tell the torque, GJ times the twist, which is {math.degrees(twist):.4g} deg here: at the same "
+        f"torque {', '.join(usual)}; look at turns, end.frame and guess"
+    )
+
+
+def _of_frames(fit: "Fit") -> list[str]:
+    labels = [
+        unknown.label
+        for unknown in (*fit.setup.shared, *fit.setup.own)
+        if any(f".{part}." in name for name in unknown.names for part in ("frame", "tangent"))
+    ]
+    if not labels:
+        return []
+    turns = "is a turn" if len(labels) == 1 else "are turns"
+    return [f"{', '.join(labels)} {turns} about a global axis from the nominal direction, which is 0"]
 
 
 def _names(fit: "Fit") -> list[str]:

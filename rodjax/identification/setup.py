@@ -20,6 +20,7 @@ from rodjax.guess import Guess
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import THRESHOLDS, Loss
 from rodjax.identification.measurements import Centerline, CriticalValue, Experiment
+from rodjax.identification.plausible import check_points
 from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
 from rodjax.path import stack_scenes
@@ -83,7 +84,7 @@ def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setu
     kinds: dict[Any, list[int]] = {}
     for k, one in enumerate(measured):
         kinds.setdefault(_kind(one), []).append(k)
-    return Setup(
+    setup = Setup(
         measured,
         critical,
         tuple(unknown for unknown in unknowns if unknown.per == "all"),
@@ -91,6 +92,9 @@ def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setu
         tuple(k for members in kinds.values() for k in members),
         _has_sd(measured, critical),
     )
+    if needs_all:  # of what is yet to be measured the numbers do not matter
+        check_points(measured, [name_of(setup, k) for k in range(len(measured))], names)
+    return setup
 
 
 def _one_scene(value: CriticalValue) -> Any:

@@ -89,6 +89,7 @@ from rodjax.quantities import (
     si_values,
     table_list,
 )
+from rodjax.result import DEFAULT_STRAIN_LIMIT
 from rodjax.routing.limits import Limits
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned, Variable, checked_variables
@@ -292,6 +293,10 @@ def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], v
         raise SceneFileError(
             "solve.rtol and finite differences are not allowed where a route is sought, which is on one mesh of "
             "elements: solve.segments"
+        )
+    if scene.strain_limit != DEFAULT_STRAIN_LIMIT:
+        raise SceneFileError(
+            "solve.strain_limit is not allowed where a route is sought: limits.strain is what it keeps"
         )
 
 

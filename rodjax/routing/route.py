@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
-from rodjax.batch import solve_batch, solve_first
+from rodjax.batch import solve_first, solve_stack
 from rodjax.checks import instance, positive, whole_number
 from rodjax.equilibrium import Options, Solver, checked_options, solve
 from rodjax.result import Equilibrium, NotConvergedWarning
@@ -263,7 +263,8 @@ class _Fleet:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConvergedWarning)
             scenes = scenes_of(self._problem, jnp.asarray(designs))
-            return solve_batch(scenes, segments=self._problem.segments, solver=self._problem.solver)
+            options: dict[str, Any] = dict(segments=self._problem.segments, solver=self._problem.solver)
+            return solve_stack(scenes, **options, strain_limit=None)
 
     def search(self, tolerance: float, iterations: int, reserve: float) -> list[Outcome]:
         """How the searches ended."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.batch import CHUNKS, LANES, solve_batch
+from rodjax.batch import CHUNKS, LANES, solve_stack
 from rodjax.checks import Numbers
 from rodjax.compilation import compiled
 from rodjax.identification.unknowns import nominal, with_values
@@ -108,7 +108,7 @@ class Scattering(eqx.Module):
             with warnings.catch_warnings():
                 # How many did not converge is what the caller is told.
                 warnings.simplefilter("ignore", NotConvergedWarning)
-                rods = solve_batch(_scenes(self, zs[which]), guess=self.equilibrium, **options)
+                rods = solve_stack(_scenes(self, zs[which]), guess=self.equilibrium, strain_limit=None, **options)
             found = Quantities(*(np.asarray(x)[:count] for x in _quantities(self, rods)))
             yield found, np.asarray(rods.converged)[:count]
 

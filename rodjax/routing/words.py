@@ -9,6 +9,7 @@ import numpy as np
 from rodjax.result import Equilibrium
 from rodjax.routing.findings import Cable, Fact, Gradients
 from rodjax.routing.reactions import Reaction
+from rodjax.status import Status
 
 if TYPE_CHECKING:
     from rodjax.routing.report import Report
@@ -49,7 +50,17 @@ def verdict(report: "Report") -> str:
     shaky = [cable for cable in report.cables if is_unstable(cable.equilibrium)]
     names = f" of {', '.join(cable.name for cable in shaky)}" if len(report.cables) > 1 else ""
     remark = f"; but the equilibrium{names} is NOT stable" if shaky else ""
+    taut = [cable for cable in report.cables if _is_overstretched(cable)]
+    names = f" in {', '.join(cable.name for cable in taut)}" if len(report.cables) > 1 else ""
+    strain = max((float(np.max(np.abs(cable.equilibrium.axial_strain))) for cable in taut), default=0.0)
+    remark += f"; but the axial strain{names} reaches {100 * strain:.3g} %, which has no limit here" if taut else ""
     return _kept_or_not(report) + remark
+
+
+def _is_overstretched(cable: Cable) -> bool:
+    """Whether it is strained by more than its solve takes without a remark, and no limit of the report says so."""
+    has_limit = cable.limits is not None and cable.limits.strain is not None
+    return int(cable.equilibrium.status) == Status.OVERSTRETCHED and not has_limit
 
 
 def is_unstable(equilibrium: Equilibrium) -> bool:

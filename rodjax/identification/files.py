@@ -69,6 +69,7 @@ from rodjax.checks import file_path, shown, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.identification.loss import Loss
 from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
+from rodjax.identification.measured_table import UNITS as MEASURED
 from rodjax.identification.measurements import Centerline, EndForce, EndMoment, Experiment, Measurement, orthographic
 from rodjax.identification.unknowns import Per, Scale, Unknown, known_names, target
 from rodjax.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
@@ -263,6 +264,9 @@ def _column_names(table: Any) -> dict[str, str]:
     """The keys of the scene by the names of the columns that hold them."""
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table.values()):
         raise SceneFileError(f'experiments must be a table such as gap = "end.position.0", got {shown(table)}')
+    for name in table:
+        if name in ("experiment", "cluster", *MEASURED):
+            raise SceneFileError(f"experiments.{name} must have another name: columns {name} are of what was measured")
     if table:
         try:
             check_scene_keys(list(table.values()))

@@ -109,6 +109,8 @@ LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
     "jumps": ("m", (None,), '"[0.5] m"'),
     "s": ("m", (None,), '"[0, 0.5, 1] m"'),
 }
+# Keys whose vectors get the length 1.
+DIRECTIONS = ("tangent", "d2", "normal")
 NUMBER = r"[-+]?(?:nan|inf|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?)"
 NUMBER_AND_UNIT = re.compile(rf"\s*(\[.*\]|{NUMBER})\s*(.*?)\s*", re.I | re.S)
 # A unit has names, exponents of them, signs of products and quotients, and the 1 of "1/m". Other numbers, signs and
@@ -246,7 +248,7 @@ def si_value(value: Any, key: str, si: str, shape: tuple[int | None, ...], examp
         array = np.array(math.inf)
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{key} must be finite, got {shown(value)}")
-    if key not in ("tangent", "d2"):
+    if key not in DIRECTIONS:
         return array
     if not np.any(array):
         raise ValueError(f"{key} must be a direction, got the zero vector")

@@ -90,8 +90,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast, get_args
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -99,7 +97,7 @@ from rodjax.along import Along, Smooth, Steps
 from rodjax.checks import file_path, leaf, shown, whole_number
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_options, checked_rtol
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
-from rodjax.obstacle_tables import obstacle
+from rodjax.obstacle_tables import obstacle, with_direction
 from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     LISTS,
@@ -427,9 +425,8 @@ def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
                 f"{where}.tangent is not allowed together with {where}.frame, whose third column it is"
             )
         with named(where):
-            clips.append(
-                Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
-            )
+            clip = Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
+            clips.append(clip if clip.tangent is None else with_direction(clip, "tangent", values))
     return clips
 
 
@@ -484,9 +481,7 @@ def _support(
             placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
             return Clamp(values["position"], _spun(placed, float(values["spin"])))
         if kind == "swivel":
-            swivel = Swivel(**values)
-            # Swivel divides by the length once more, which may change the last bit of what write_scene wrote.
-            return eqx.tree_at(lambda swivel: swivel.tangent, swivel, jnp.asarray(values["tangent"]))
+            return with_direction(Swivel(**values), "tangent", values)
         return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import random_scenes
 
 import rodjax
 from rodjax import (
@@ -163,6 +164,14 @@ def test_loads_that_follow_come_back_to_the_last_bit(tmp_path):
         write_scene(scene, path)
         assert_same(read_scene(path), scene)
         scene = Scene(rod, Free(None, y, follower), clamp, distributed=loads[::-1])
+        write_scene(scene, path)
+        assert_same(read_scene(path), scene)
+
+
+def test_random_scenes_of_every_class_come_back_to_the_last_bit(tmp_path):
+    path, rng = tmp_path / "scene.toml", np.random.default_rng(2)
+    for _ in range(40):
+        scene = random_scenes.scene(rng, for_text=True)
         write_scene(scene, path)
         assert_same(read_scene(path), scene)
 

@@ -408,7 +408,10 @@ def _save_figure(figure: "Figure", path: Path, **options: Any) -> None:
 
 def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:
     scene = file.scenes[0]
-    supports = f"{type(scene.start).__name__} to {type(scene.end).__name__}".lower()
+    supports = " to ".join(
+        "clamp fitted without torsion" if name in file.unclocked else type(end).__name__.lower()
+        for name, end in (("start", scene.start), ("end", scene.end))
+    )
     scenes = f", {len(file.scenes)} scenes" if file.is_path else ""
     mesh = f"{result.s.shape[-1] - 1} segments"
     if file.segments is None:  # otherwise the estimate would be a program more to compile

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Along, Pair, Smooth, Steps, Value, scaled
 from rodjax.checks import (
+    DEFAULT_D2,
     Numbers,
     instance,
     is_known,
@@ -192,7 +193,7 @@ class Rod(eqx.Module):
         mass_per_length: Any = 0.0,
         radius: Any = None,
         *,
-        d2: Any = (0.0, 1.0, 0.0),
+        d2: Any = DEFAULT_D2,
         frames: Any = None,
         law: Law | None = None,
     ) -> "Rod":

@@ -66,6 +66,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
+from rodjax.clocking import check_clocked
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.identification.loss import Loss
 from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
@@ -112,7 +113,7 @@ def read_fit_files(fit: str | os.PathLike[str], data: str | os.PathLike[str]) ->
         _check_deviations(deviations, table)
     experiments, file = _experiments(table, scene, data, deviations)
     with in_file(fit):
-        _check_names(tables, experiments)
+        _check_names(tables, experiments, file.unclocked)
         unknowns = [_unknown(one, where) for where, one in tables.items()]
     if "rtol" not in settings and "segments" not in settings:
         settings |= {"rtol": file.rtol, "segments": file.segments}
@@ -189,11 +190,14 @@ def _prior(value: Any, key: str, unknown: Unknown) -> tuple[float, float]:
     return _number(value["value"], f"{key}.value", unknown.unit), _number(value["sd"], f"{key}.sd", unit)
 
 
-def _check_names(tables: Mapping[str, dict[str, Any]], experiments: Sequence[Experiment]) -> None:
+def _check_names(
+    tables: Mapping[str, dict[str, Any]], experiments: Sequence[Experiment], unclocked: Sequence[str]
+) -> None:
     # Before anything else, as the name tells which units are right.
     sought: dict[str, str] = {}
     for where, table in tables.items():
         for name in _names(table, where):
+            check_clocked(name, unclocked, where)
             if all(target(name, experiment) is None for experiment in experiments):
                 allowed = ", ".join(known_names(experiments[0]))
                 raise SceneFileError(f"{where}: there is no number {shown(name)}; allowed are {allowed}")

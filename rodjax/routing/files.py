@@ -76,6 +76,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
+from rodjax.clocking import check_clocked
 from rodjax.identification.unknowns import unit_of
 from rodjax.obstacle_tables import kind_of, obstacle
 from rodjax.obstacles import Obstacle
@@ -290,6 +291,8 @@ def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], v
 
 
 def _check_variables(variables: tuple[Variable, ...], file: SceneFile) -> None:
+    for k, variable in enumerate(variables):
+        check_clocked(variable.key, file.unclocked, f"variables[{k}]")
     try:
         checked_variables(variables, file.scenes[0])
     except (TypeError, ValueError) as error:

@@ -48,9 +48,9 @@ def rod(rng: np.random.Generator, kind: str) -> rj.Rod:
     if kind == "plain":
         return rj.Rod(LENGTH, *rng.random(4) + 0.1, radius=0.01)
     pair = (along(rng), along(rng))
-    rest = dict(rest_curvature=(along(rng), along(rng)), rest_twist=along(rng)) if kind == "rest" else {}
+    rest = ((along(rng), along(rng)), along(rng)) if kind == "rest" else (None, None)
     stiffness = along(rng) if kind == "along" else pair
-    found = rj.Rod(LENGTH, stiffness, along(rng), along(rng), along(rng), along(rng), **rest)
+    found = rj.Rod(LENGTH, stiffness, along(rng), along(rng), along(rng), along(rng), *rest)
     if kind != "curve":
         return found
     size = int(rng.integers(4, 30))

@@ -43,21 +43,8 @@ def scene(rod=HOSE, start=START, end=END, loads=GRAVITY, **others):
 
 # --- in any place of space -------------------------------------------------------------------------------------------
 
-VECTORS = (
-    "position",
-    "tangent",
-    "d2",
-    "force",
-    "couple",
-    "gravity",
-    "point",
-    "normal",
-    "center",
-    "start",
-    "end",
-    "points",
-)
-PLACES = ("position", "point", "center", "start", "end", "points")
+PLACES = ("position", "point", "points")
+VECTORS = (*PLACES, "tangent", "d2", "force", "moment", "couple", "gravity", "normal")
 
 
 def moved(value, turn, shift, key=""):
@@ -96,7 +83,9 @@ SCENES = {
     "clips": scene(clips=CLIPS),
     "a clip with a frame": scene(clips=HELD),
     "one stated": scene(start=START | LEVEL),
-    "moment on a free end": scene(end=FREE | dict(moment="[1e-3, 2e-3, 1e-3] N m")),
+    "moment on a free end": scene(
+        end=FREE | dict(moment="[1e-3, 2e-3, 1e-3] N m", force="[0, 4e-3, 2e-3] N"), loads={}
+    ),
     "couples on one clamp": scene(end=PIN, loads=GRAVITY | dict(distributed_couple=[dict(couple="[1e-3, 0, 1e-3] N")])),
     "strip": scene(STRIP, START | LEVEL, END | dict(d2=[0, 0.2, 1])),
     "curved": scene(CENTERLINE, START | LEVEL, END | dict(d2=[0, 0.2, 1])),

@@ -206,7 +206,9 @@ def test_scenes_of_every_class_come_back_whatever_their_sizes(single, tmp_path):
         save(result, tmp_path / "rod.vtkhdf")
         assert_same(load(tmp_path / "rod.vtkhdf"), result)
         with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:
-            file["rodjax"].visititems(look)
+            group = file["rodjax"]
+            assert isinstance(group, h5py.Group)
+            group.visititems(look)
     kinds = {name for name, kind in KINDS.items() if not issubclass(kind, Polyline | Curve | FramedCurve)}
     assert seen >= kinds | {place for place in FIELDS if place.startswith("scene/clips")}
 

@@ -14,6 +14,7 @@ import pytest
 from rodjax.identification.files import read_fit_files
 from rodjax.quantities import LISTS, OF_TABLES, QUANTITIES, SceneFileError, is_unit, number_in, si_value, si_values
 from rodjax.routing.files import read_route_file
+from rodjax.routing.variables import Between
 from rodjax.scene_file import read_scene_file
 from rodjax.sweep_cases import SweepError, read_cases
 
@@ -250,7 +251,9 @@ def test_variables_of_loads_along_the_rod_are_forces_per_length(tmp_path):
     variable = '\n[[variables]]\nkind = "between"\nkey = "distributed.0.force.2"\nlower = "0 N{0}"\nupper = "1 N{0}"\n'
     text = path.read_text()
     path.write_text(text + variable.format("/m"))
-    assert float(read_route_file(path).variables[-1].upper) == 1.0
+    varied = read_route_file(path).variables[-1]
+    assert isinstance(varied, Between)
+    assert float(varied.upper) == 1.0
     path.write_text(text + variable.format(""))
     with pytest.raises(SceneFileError, match=r"variables\[5\]\.lower must be in N/m"):
         read_route_file(path)

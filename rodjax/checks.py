@@ -115,6 +115,10 @@ def vector(value: Any, name: str) -> Float[Numbers, "3"]:
     return number_array(value, name, (3,))
 
 
+# Where a second axis is not given: told by identity from one that is.
+DEFAULT_D2 = (0.0, 1.0, 0.0)
+
+
 def direction(value: Any, name: str) -> Float[Numbers, "3"]:
     """`value` as a unit vector."""
     array = vector(value, name)

@@ -1,7 +1,8 @@
 """The command `rodjax`.
 
-Exit codes: 0 all converged; 2 bad input, one line on stderr; 3 something did not converge, or no route was found within
-limits, which stderr names. A report of limits that are not kept is a report, and exits with 0.
+Exit codes: 0 all converged, and all limits are kept where there are any; 2 bad input, one line on stderr; 3 something
+did not converge, a cable that is reported does not keep to a limit, or no route was found within limits: stderr names
+what.
 """
 
 import argparse
@@ -118,7 +119,9 @@ def _add_fit(commands: Any) -> None:
 
 
 def _add_report(commands: Any) -> None:
-    report = commands.add_parser("report", help="tell whether a cable keeps to limits, with pictures and a web page")
+    report = commands.add_parser(
+        "report", help="tell whether a cable keeps to limits, with pictures and a web page; exits with 3 where not"
+    )
     report.add_argument("file", metavar="FILE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     report.add_argument(
         "--result",
@@ -316,9 +319,9 @@ def _report(arguments: argparse.Namespace) -> int:
     print(report, flush=True)
     print(f"\nwritten: {', '.join(map(str, report.save(arguments.out)))}")
     lost = [f"{cable.name}: {cable.outcome}" for cable in report.cables if not cable.converged]
-    if not lost:
+    if not lost and report.kept is not False:
         return 0
-    print(f"rodjax: {arguments.file}: {'; '.join(lost)}", file=sys.stderr)
+    print(f"rodjax: {arguments.file}: {'; '.join(lost) or f'limits: {report.verdict}'}", file=sys.stderr)
     return 3
 
 
@@ -415,7 +418,10 @@ def _save_figure(figure: "Figure", path: Path, **options: Any) -> None:
 
 def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:
     scene = file.scenes[0]
-    supports = f"{type(scene.start).__name__} to {type(scene.end).__name__}".lower()
+    supports = " to ".join(
+        "clamp fitted without torsion" if name in file.unclocked else type(end).__name__.lower()
+        for name, end in (("start", scene.start), ("end", scene.end))
+    )
     scenes = f", {len(file.scenes)} scenes" if file.is_path else ""
     mesh = f"{result.s.shape[-1] - 1} segments"
     if file.segments is None:  # otherwise the estimate would be a program more to compile

@@ -348,6 +348,8 @@ def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...])
     *leading, nodes = shape or (0,)
     # "m": nodes and middles of elements, or two ends and the middles between nodes; of other names any size.
     sizes = {"n+1": (nodes,), "n": (nodes - 1,), "m": (2 * nodes - 1, nodes + 1), "3": (3,), "4": (4,)}
+    if str(dataset.name).startswith("/rodjax/scene/"):  # made without a mesh: its names are sizes of its own
+        sizes = {name: allowed for name, allowed in sizes.items() if name.isdigit()}
     names = [name for name in kind.dim_str.split() if name != "..."]
     wanted = [*((size,) for size in leading), *(sizes.get(name) for name in names)]
     shape_there = dataset.shape or ()  # of an empty dataset None

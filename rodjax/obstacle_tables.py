@@ -15,10 +15,12 @@ The keys besides the kind (optional ones in brackets):
 - "union": parts, a list of obstacles
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from rodjax.checks import shown
@@ -36,6 +38,7 @@ OBSTACLES: dict[str, tuple[Callable[..., Obstacle], tuple[str, ...], tuple[str, 
     "box": (Box, ("center", "size"), ("frame",)),
 }
 KINDS = [*OBSTACLES, "mesh", "union"]
+M = TypeVar("M", bound=eqx.Module)
 
 
 def obstacle(table: Any, where: str, folder: Path | None, other: tuple[str, ...] = ()) -> Obstacle:
@@ -52,7 +55,17 @@ def obstacle(table: Any, where: str, folder: Path | None, other: tuple[str, ...]
     make, required, optional = OBSTACLES[kind]
     values = si_values(table, where, required, optional, other=("kind", *other))
     with named(where):
-        return make(**values)
+        return with_direction(make(**values), "normal", values)
+
+
+def with_direction(module: M, key: str, values: Mapping[str, np.ndarray]) -> M:
+    """A module with its direction as the file has it, where it has one there.
+
+    Constructors divide by the length once more, which may change the last bit of what `write_scene` wrote.
+    """
+    if key not in values:
+        return module
+    return eqx.tree_at(lambda module: getattr(module, key), module, jnp.asarray(values[key]))
 
 
 def kind_of(table: Any, where: str, allowed: list[str]) -> str:

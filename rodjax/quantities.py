@@ -109,9 +109,17 @@ LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
     "jumps": ("m", (None,), '"[0.5] m"'),
     "s": ("m", (None,), '"[0, 0.5, 1] m"'),
 }
-NUMBER_AND_UNIT = re.compile(r"\s*(\[.*\]|[-+]?(?:nan|inf|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?))\s*(.*?)\s*", re.I | re.S)
-
-
+# Keys whose vectors get the length 1.
+DIRECTIONS = ("tangent", "d2", "normal")
+NUMBER = r"[-+]?(?:nan|inf|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?)"
+NUMBER_AND_UNIT = re.compile(rf"\s*(\[.*\]|{NUMBER})\s*(.*?)\s*", re.I | re.S)
+# A unit has names, exponents of them, signs of products and quotients, and the 1 of "1/m". Other numbers, signs and
+# commas are of a second number, or of one with a decimal comma.
+_EXPONENT = re.compile(r"(?:\^|\*\*)\s*(?:[-+]?[0-9]+|\(\s*[-+]?[0-9]+(?:\s*/\s*[0-9]+)?\s*\))")
+_NAME = re.compile(r"[^\W\d]\w*|[°%]")
+_NAMES = re.compile(r"(?:1\s*/)?[\s()*/·⋅×u]*u[\s()*/·⋅×u]*")
+# No unit is longer.
+MOST_OF_A_UNIT = 100
 # A power of a number is no unit, and one such as 9**9**9 would take forever.
 NUMBER_TO_A_POWER = re.compile(r"[\d⁰¹²³⁴-⁹]\s*(\*\*|\^|[⁰¹²³⁴-⁹])")
 
@@ -224,9 +232,10 @@ def si_value(value: Any, key: str, si: str, shape: tuple[int | None, ...], examp
         if match is None:
             raise mistake("be a number and a unit")
         numbers, unit = _parsed(match[1]), match[2]
-    if not _has_shape(numbers, shape):
+    if not _has_shape(numbers, shape) or (unit and not is_unit(unit)):
         kind = _described(shape)
-        raise mistake(f"be {kind} {'and a unit' if si else 'without quotes or unit'}")
+        point = ", with a decimal point" if isinstance(value, str) and "," in unit else ""
+        raise mistake(f"be {kind} {'and a unit' if si else 'without quotes or unit'}{point}")
     if si and not unit:
         raise mistake("have a unit")
     factor = _factor(unit, si)
@@ -239,11 +248,21 @@ def si_value(value: Any, key: str, si: str, shape: tuple[int | None, ...], examp
         array = np.array(math.inf)
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{key} must be finite, got {shown(value)}")
-    if key not in ("tangent", "d2"):
+    if key not in DIRECTIONS:
         return array
     if not np.any(array):
         raise ValueError(f"{key} must be a direction, got the zero vector")
     return _unit_vector(array)
+
+
+def number_in(text: str) -> float | None:
+    """The number that a text is, without a unit; `None` where it is not one."""
+    return float(text) if re.fullmatch(rf"\s*{NUMBER}\s*", text, re.I) else None
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is written as a unit, known or not: not as a second number, or the rest of a decimal comma."""
+    return len(text) <= MOST_OF_A_UNIT and _NAMES.fullmatch(_NAME.sub("u", _EXPONENT.sub(" ", text))) is not None
 
 
 def _parsed(numbers: str) -> Any:
@@ -280,6 +299,7 @@ def _unit_vector(vector: np.ndarray) -> Float[np.ndarray, "3"]:
     return vector if np.allclose(vector, unit, rtol=0, atol=rounding) else unit
 
 
+@functools.lru_cache(maxsize=1024)
 def _factor(unit: str, si: str) -> float | None:
     """How many SI units a unit is; `None` where it is no unit of this dimension."""
     if unit == si:
@@ -288,9 +308,26 @@ def _factor(unit: str, si: str) -> float | None:
         return None
     units = _unit_registry()
     try:
-        return float(units.Quantity(1.0, units.Unit(unit)).to(units.Unit(si)).magnitude)
+        given, wanted = units.Unit(unit), units.Unit(si)
+        return float(units.Quantity(1.0, given).to(wanted).magnitude) if _is_like(units, given, wanted) else None
     except Exception:  # pint raises anything, down to AssertionError, for what it cannot parse.
         return None
+
+
+def _is_like(units: Any, given: Any, wanted: Any) -> bool:
+    """Whether units of one dimension measure the same: of those without a dimension only angles do, as angles.
+
+    A percent, a decibel or a count is no angle and no factor of a length. Of what is per length the radian may be left
+    out or added: curvatures and twists go by either.
+    """
+    for name in given._units:
+        one = units.Unit(name)
+        if one.dimensionless and set(units.get_root_units(one)[1]._units) != {"radian"}:
+            return False
+    ratio = dict((units.get_root_units(given)[1] / units.get_root_units(wanted)[1])._units)
+    radians = ratio.pop("radian", 0)
+    per_length = wanted.dimensionality == units.Unit("1/m").dimensionality
+    return not ratio and (radians == 0 or (per_length and abs(radians) == 1))
 
 
 @functools.cache

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.along import Pair, Spline, Steps, Value, scaled, value_at
-from rodjax.checks import direction, is_known, number_array, rotation, vector
+from rodjax.checks import DEFAULT_D2, direction, is_known, number_array, rotation, vector
 from rodjax.rotations import carried, columns, continuous, from_frame, inverse, product, rotated, screw, unit
 from rodjax.vectors import cross, dot
 
@@ -139,6 +139,8 @@ class SpaceCurve(eqx.Module):
             first = jnp.cross(across, t)
             size = jnp.sqrt(jnp.sum(first**2))
             if is_known(size) and not float(size) > 1e-6:
+                if d2 is DEFAULT_D2:
+                    raise ValueError("d2 must be given: its default (0, 1, 0) is parallel to the first tangent")
                 raise ValueError(f"d2 must not be parallel to the first tangent, got {d2}")
             d1 = _carried(first / size, tangents)
         return SpaceCurve(points, s / s[-1], d1.T), s[-1]

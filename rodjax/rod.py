@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Along, Pair, Smooth, Steps, Value, scaled
 from rodjax.checks import (
+    DEFAULT_D2,
     Numbers,
     instance,
     is_known,
@@ -194,7 +195,7 @@ class Rod(eqx.Module):
         mass_per_length: Any = 0.0,
         radius: Any = None,
         *,
-        d2: Any = (0.0, 1.0, 0.0),
+        d2: Any = DEFAULT_D2,
         frames: Any = None,
         law: Law | None = None,
     ) -> "Rod":
@@ -333,12 +334,17 @@ class Rod(eqx.Module):
         *,
         stick: Any,
     ) -> "Rod":
-        """A first estimate of a bundle of parallel round wires in the closest packing about the middle one.
+        """A first estimate of a bundle of parallel round wires in the closest packing; the centerline is its centroid.
 
         - `wires`: how many, `wire_radius` [m] each; other arguments as for `Rod.circular`, of one wire.
         - `stick`: 0, where every wire slips along its neighbours: EI and GJ are the sums over the wires, the lower
-          bound; 1, where all stick together as one section, the upper bound; in between in proportion. Of seven wires
-          the upper bound of EI is 7.9 times the lower one.
+          bound; 1, where all stick together as one section, the upper bound: of seven wires its EI is 7.9 times the
+          lower one. In between in proportion.
+
+        The wires lie about the first of them, the nearest places first and those of one distance side by side, and d1
+        along the longest direction of the section. Of two wires, of four, and of others whose section is not the same
+        all around, EI is a pair: EI1 of two wires, which lie along d1, is the same whether they stick or slip.
+        `radius` is that of the circle about the centroid around all wires.
         """
         wires = whole_number(wires, "wires", 1, 10_000)
         radius = positive(wire_radius, "wire_radius")
@@ -346,12 +352,15 @@ class Rod(eqx.Module):
         if is_known(stick) and not 0 <= float(stick) <= 1:
             raise ValueError(f"stick must lie in 0 (all slip) to 1 (all stick), got {float(stick):g}")
         bending, torsion, EA, mass = _ring(radius, 0.0 * radius, youngs_modulus, shear_modulus, poisson_ratio, density)
-        squared = _packed(wires) * radius**2
-        offsets = stick * float(np.sum(_packed(wires))) * radius**2
-        # The sections further from the middle bend by stretch and twist by shear: E A d^2 and G A d^2.
-        EI = wires * bending + EA * offsets / 2
-        GJ = wires * torsion + torsion * 2 / radius**2 * offsets
-        return Rod(length, EI, GJ, wires * EA, wires * mass, radius=radius + np.max(squared) ** 0.5)
+        offsets = _packed(wires)
+        along_d1, along_d2 = np.sum(offsets**2, axis=0).tolist()
+        # Sections away from the centroid bend by stretch and twist by shear: E A d^2 and G A d^2, G A = 2 GJ/radius^2.
+        stuck = stick * radius**2
+        EI1, EI2 = (wires * bending + EA * stuck * squares for squares in (along_d2, along_d1))
+        GJ = wires * torsion + 2 * torsion / radius**2 * stuck * (along_d1 + along_d2)
+        is_round = math.isclose(along_d1, along_d2, rel_tol=1e-9, abs_tol=1e-9)
+        around = radius * (1 + float(np.max(np.linalg.norm(offsets, axis=1))))
+        return Rod(length, EI1 if is_round else (EI1, EI2), GJ, wires * EA, wires * mass, radius=around)
 
 
 def _round_section(
@@ -395,11 +404,19 @@ def torsion_constant(width: Float[Numbers, ""], height: Float[Numbers, ""]) -> F
     return long * short**3 * (1 / 3 - 64 / math.pi**5 * short / long * sum(terms[1:], terms[0]))
 
 
-def _packed(wires: int) -> np.ndarray:
-    """Squared distances of the wires of the closest packing from the middle one, in radii of a wire."""
+def _packed(wires: int) -> Float[np.ndarray, "wires 2"]:
+    """Places of the wires from their centroid along the principal axes of the section, the longer one first, in radii
+    of a wire.
+    """
     reach = math.ceil(wires**0.5) + 1
-    i, j = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
-    return np.sort(4.0 * (i * i + i * j + j * j), axis=None)[:wires]
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    places = np.stack([2.0 * i + j, math.sqrt(3.0) * j], axis=1)
+    angles = np.round(np.arctan2(places[:, 1], places[:, 0]) % (2 * math.pi), 9)
+    # Squared distances are whole numbers, so that those of one ring are told from rounding.
+    places = places[np.lexsort((angles, i * i + i * j + j * j))][:wires]
+    places = places - np.mean(places, axis=0)
+    _, axes = np.linalg.eigh(places.T @ places)
+    return places @ axes[:, ::-1]
 
 
 def _shear_modulus(E: Float[Numbers, ""], shear_modulus: Any, poisson_ratio: Any) -> Float[Numbers, ""]:

@@ -15,13 +15,15 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     support = "clamp"              # also "swivel": position, tangent; "pin": position; "free": optional force, moment
                                    # and follower = true where these turn with the end
     position = "[0, 0, 0] m"
-    tangent = [1, 0, 0]            # or a 3x3 frame, its columns d1, d2, t; optional d2 = [0, 1, 0] is a second axis
+    tangent = [1, 0, 0]            # with d2 a 3x3 frame, its columns d1, d2, t; or frame = [[0, 0, 1], [0, 1, 0], ...]
+    d2 = [0, 1, 0]                 # optional: the clocking, see below
 
     [end]
     support = "clamp"
     position = "[80, 0, 0] cm"
     tangent = [1, 0, 0]
-    spin = "0 deg"                 # optional: turns the frame of a clamp about its own tangent
+    d2 = [0, 1, 0]
+    spin = "0 deg"                 # optional: turns the frame of a clamp with a clocking about its own tangent
     # turns = 1                    # optional: whole extra turns of the end frame, for two clamps and no path
 
     [loads]                        # optional
@@ -41,8 +43,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # at = "0.4 m"
     # position = "[0.3, 0, -0.05] m"
     # tangent = [1, 0, 0]          # optional: where the clip holds the direction of the rod, too
-    # d2 = [0, 1, 0]               # optional, with tangent or spin: where it holds the twist, too, as a clamp does; or
-    # spin = "90 deg"              # frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]] with or without spin
+    # d2 = [0, 1, 0]               # optional, with tangent: where it holds the twist, too, as a clamp does; or
+    # spin = "90 deg"              # frame = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]; with either optionally spin
     # sliding = true               # optional: where the rod slides through; the search for its place begins at `at`
 
     # [[obstacles]]                # any number of these, see `rodjax.obstacle_tables`: they push the rod back
@@ -71,12 +73,20 @@ The keys of a rod, besides its section (optional ones in brackets; all but those
 - "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist]
 - "bundle": wires = 7, wire_radius, stick = 0.2, material
 - "layered": radii = "[0, 2, 3] mm", youngs_moduli = "[1, 50] MPa", poisson_ratios or shear_moduli [densities]
-- "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, EI, or EI1 and EI2, GJ, EA [d2,
-  mass_per_length, radius]
+- "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, d2 = [0, 1, 0], EI, or EI1 and EI2,
+  GJ, EA [mass_per_length, radius]
 
 material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
 twist, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps, EI = {
 jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
+
+A clamp with a tangent alone says nothing of its clocking, the angle about that tangent. Such an end is fitted without
+torsion: its frame follows the rod, which is a swivel in energy. Where one clamp alone resists a moment about the
+tangent, of a free end or of couples along the rod, it does so, as any clocking then gives the same. Where the clocking
+counts it must be stated, by d2 or frame: of all clamps of a rod whose section or shape without stress is not the same
+all around (EI1 and EI2, strips, some bundles, rest curvatures, "centerline"), for `spin` and `turns`, which are of both
+ends, for loads that follow the rod, and for couples along a rod between two clamps. So does d2 of "centerline", of the
+first of its frames. No result depends on how the scene lies in space, or on what it does not say.
 
 The main tables are the first scene of a path. Along it may change: position, tangent, d2, spin, force, moment of the
 two ends, and loads.gravity. Tangents and d2 go along great circles, all else linearly. A step turns an end by less than
@@ -91,13 +101,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast, get_args
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.along import Along, Smooth, Steps
 from rodjax.checks import file_path, leaf, shown, whole_number
+from rodjax.clocking import Clocking, Values, is_unclocked
 from rodjax.equilibrium import (
     MAX_SEGMENTS,
     Discretization,
@@ -106,7 +115,7 @@ from rodjax.equilibrium import (
     checked_strain_limit,
 )
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
-from rodjax.obstacle_tables import obstacle
+from rodjax.obstacle_tables import obstacle, with_direction
 from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     LISTS,
@@ -165,18 +174,19 @@ _SCENE_KEYS = {
     "": "start.support, end.support: ",
 }
 
+_SPIN_NEEDS_D2 = "{0}.d2 or {0}.frame is needed for {0}.spin, which turns it from there"
 # Those that a file must have, and may have.
 SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles", "solve", "path")
 # What is read of so many tables a reader keeps at most, about 10 MB.
 MAX_KEPT = 10_000
 
-# SI values of the tables start, end and loads, by table and key.
-Values = dict[str, dict[str, Float[np.ndarray, "..."]]]
 Part = TypeVar("Part")
 
 
 class SceneFile(NamedTuple):
-    """What a file holds: `scenes`, one or those of a path; whether it `is_path`; settings of the solve or `None`."""
+    """What a file holds: `scenes`, one or those of a path; whether it `is_path`; settings of the solve or `None`;
+    `unclocked`: "start" and "end" where they are clamps that do not say where their d2 points.
+    """
 
     scenes: list[Scene]
     is_path: bool
@@ -184,6 +194,7 @@ class SceneFile(NamedTuple):
     rtol: float | None
     discretization: Discretization | None
     strain_limit: float = DEFAULT_STRAIN_LIMIT
+    unclocked: tuple[str, ...] = ()
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -285,14 +296,22 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     if segments is not None and rtol is not None:
         raise SceneFileError("solve.rtol is not allowed together with solve.segments: it chooses the segments")
     turns = values["end"].pop("turns", None)
-    changes = _changes(content["path"], kinds, values) if "path" in content else []
+    unclocked = tuple(name for name, kind in kinds.items() if kind == "clamp" and is_unclocked(values[name]))
+    changes = _changes(content["path"], kinds, values, unclocked) if "path" in content else []
     if changes and turns is not None:
         raise SceneFileError("end.turns is not allowed together with path: turn the end along the path by end.spin")
+
+    resists = False
+    if unclocked:
+        spun = {name for name in kinds if "spin" in content[name]}
+        along = [target for _, _, target in changes]
+        resists = Clocking(kinds, unclocked, rod, clips, distributed, values, along, followers, spun, turns).check()
 
     def scene(values: Values, where: str = "") -> Scene:
         gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
         start, end = (
-            part(_support, kind, values[name], f"{where}{name}", followers[name]) for name, kind in kinds.items()
+            part(_support, kind, values[name], f"{where}{name}", followers[name], resists)
+            for name, kind in kinds.items()
         )
         try:
             return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles)
@@ -311,7 +330,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             scenes.append(scene(_between(values, target, step / steps, where), where))
             _check_frames(scenes[-2], scenes[-1], f"{where}steps: step {step} of {steps}")
         values = _between(values, target, 1.0, where)
-    return SceneFile(scenes, bool(changes), segments, rtol, discretization, strain_limit)
+    return SceneFile(scenes, bool(changes), segments, rtol, discretization, strain_limit, unclocked)
 
 
 def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:
@@ -322,6 +341,10 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
     check_keys(table, "rod", required, (*optional, "section"))
+    if section == "centerline" and "d2" not in table:
+        raise SceneFileError(
+            "rod.d2 is missing: where d2 of the first frame along the centerline points, for example d2 = [0, 1, 0]"
+        )
     # Not the radius from which the stiffnesses of a circular section come.
     may_vary = [key for key in _VARYING if key != "radius" or key in optional]
     varying = {key: value for key, value in table.items() if key in may_vary and isinstance(value, dict)}
@@ -394,6 +417,12 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
+        if is_unclocked(values):
+            if "spin" in values:
+                raise SceneFileError(
+                    f"{where}.d2 or {where}.frame is needed for {where}.spin, which turns it from there"
+                )
+            return values
         values = _frame_values(values, where)
         if abs(values["spin"]) > math.pi:
             raise SceneFileError(
@@ -404,12 +433,12 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
 
 
 def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
-    """With what is left out of a frame, or of a tangent that makes one."""
+    """With the spin of a frame, or of the tangent and d2 that make one."""
     if "frame" in values and "d2" in values:
         raise SceneFileError(
             f"{where}.d2 is not allowed together with {where}.frame, which has d2 as its second column"
         )
-    return {"spin": np.zeros(())} | ({} if "frame" in values else {"d2": np.array([0.0, 1.0, 0.0])}) | values
+    return {"spin": np.zeros(())} | values
 
 
 def _loads(
@@ -443,9 +472,8 @@ def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
                 f"{where}.tangent is not allowed together with {where}.frame, whose third column it is"
             )
         with named(where):
-            clips.append(
-                Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
-            )
+            clip = Clip(values["at"], values["position"], sliding=sliding, **_clip_direction(reader, values, where))
+            clips.append(clip if clip.tangent is None else with_direction(clip, "tangent", values))
     return clips
 
 
@@ -459,6 +487,8 @@ def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: s
         return {"tangent": values["tangent"]} if "tangent" in values else {}
     if "frame" not in values and "tangent" not in values:
         raise SceneFileError(f"{where}.tangent or {where}.frame is needed where {where} has d2 or spin")
+    if is_unclocked(values):
+        raise SceneFileError(_SPIN_NEEDS_D2.format(where))
     values = _frame_values(values, where)
     if abs(values["spin"]) > math.pi:
         raise SceneFileError(
@@ -468,7 +498,9 @@ def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: s
     return {"frame": _spun(placed, float(values["spin"]))}
 
 
-def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[str, int, Values]]:
+def _changes(
+    tables: Any, kinds: dict[str, str], values: Values, unclocked: tuple[str, ...]
+) -> list[tuple[str, int, Values]]:
     """Where each table of the path is, its steps and new values; adds to `values` the zero loads that it changes."""
     changes = []
     for k, table in enumerate(table_list(tables, "path")):
@@ -481,6 +513,11 @@ def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[s
             keys = _SUPPORTS[kinds[name]][2] if name in kinds else ("gravity",)
             if "frame" in values[name]:
                 keys = ("position", "spin")
+            if name in unclocked:
+                for key in {"spin", "d2"} & set(table.get(name, ())):
+                    raise SceneFileError(
+                        f"{where}{name}.{key} needs {name}.d2 or {name}.frame, from which the clamp turns"
+                    )
             target[name] = si_values(table.get(name, {}), f"{where}{name}", (), keys)
             values[name] = {key: np.zeros(3) for key in target[name] if key not in values[name]} | values[name]
         if not any(target.values()):
@@ -493,16 +530,19 @@ def _changes(tables: Any, kinds: dict[str, str], values: Values) -> list[tuple[s
 
 
 def _support(
-    reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str, follower: bool = False
+    reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str, follower: bool, resists: bool
 ) -> Support:
     with named(where):
+        if kind == "clamp" and is_unclocked(values):
+            if resists:  # any clocking gives the same
+                across = np.eye(3)[np.argmin(np.abs(values["tangent"]))]
+                return Clamp(values["position"], reader.part(_frame, values["tangent"], across))
+            return with_direction(Swivel(values["position"], values["tangent"]), "tangent", values)
         if kind == "clamp":
             placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
             return Clamp(values["position"], _spun(placed, float(values["spin"])))
         if kind == "swivel":
-            swivel = Swivel(**values)
-            # Swivel divides by the length once more, which may change the last bit of what write_scene wrote.
-            return eqx.tree_at(lambda swivel: swivel.tangent, swivel, jnp.asarray(values["tangent"]))
+            return with_direction(Swivel(**values), "tangent", values)
         return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
 
 

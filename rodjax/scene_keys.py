@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import line, shown
-from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, quantity, si_values
+from rodjax.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, number_in, quantity, si_values
 from rodjax.scene_file import SceneFile, SceneReader
 
 Place = tuple[str | int, ...]
@@ -120,10 +120,9 @@ def si_number(value: Any, key: str) -> Float[np.ndarray, "..."]:
 
 def cell(text: str) -> Any:
     """A plain number or list as such, anything else as text with a unit."""
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    number = number_in(text)
+    if number is not None:
+        return number
     try:
         return json.loads(text, parse_int=float) if text.startswith("[") else text
     except (ValueError, RecursionError):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import direction, instance, is_known, leaf, namespace, positive, rotation, shown, vector
+from rodjax.checks import DEFAULT_D2, direction, instance, is_known, leaf, namespace, positive, rotation, shown, vector
 from rodjax.units import Units
 
 
@@ -173,18 +173,22 @@ def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
     return turned + a * (cross @ turned) + b * (cross @ (cross @ turned))
 
 
-def frame(tangent: Any, d2: Any = (0.0, 1.0, 0.0)) -> Float[Array, "3 3"]:
+def frame(tangent: Any, d2: Any = DEFAULT_D2) -> Float[Array, "3 3"]:
     """The frame with columns (d1, d2, t): t along `tangent`, d2 the part of `d2` at right angles to it.
 
-    `tangent`, `d2`: (3,), any length. Raises `ValueError` where they are parallel.
+    `tangent`, `d2`: (3,), any length. Without d2, along global y, frames of several tangents are turned about these
+    against one another. Raises `ValueError` where the two are parallel.
     """
     t = direction(tangent, "tangent")
+    is_default = d2 is DEFAULT_D2
     d2 = direction(d2, "d2")
     xp = namespace(t, d2)
     across = d2 - xp.dot(d2, t) * t
     length = xp.linalg.norm(across)
     # Below this the direction of d2 is mostly rounding of the input.
     if is_known(length) and not length > 1e-6:
+        if is_default:
+            raise ValueError(f"d2 must be given: its default (0, 1, 0) is parallel to the tangent, got tangent = {t}")
         raise ValueError(f"d2 must not be parallel to the tangent, got d2 = {d2} and tangent = {t}")
     d2 = across / length
     return leaf(xp.stack([xp.cross(d2, t), d2, t], axis=-1))

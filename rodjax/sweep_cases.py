@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from rodjax.checks import shown
+from rodjax.checks import line, shown
 from rodjax.quantities import SceneFileError
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile, read_text, toml_tables
@@ -99,12 +99,17 @@ def _grid(content: dict[str, Any]) -> list[Parameter]:
 
 def _flat(table: dict[str, Any], prefix: str) -> dict[str, Any]:
     """TOML makes tables of dotted keys without quotes: these are put together again."""
-    values = {}
+    values: dict[str, Any] = {}
     for key, value in table.items():
-        if isinstance(value, dict) and not {"from", "to", "count"} & set(value):
-            values |= _flat(value, f"{prefix}{key}.")
-        else:
-            values[f"{prefix}{key}"] = value
+        name = f"{prefix}{key}"
+        is_table = isinstance(value, dict) and not {"from", "to", "count"} & set(value)
+        if is_table and not value:
+            raise SceneFileError(f"{line(name)} is an empty table; give it values, or leave it out")
+        for found, given in (_flat(value, f"{name}.") if is_table else {name: value}).items():
+            # "rod.EI" in quotes and the EI of a table rod are two keys of TOML, but one here.
+            if found in values:
+                raise SceneFileError(f"{line(found)} is given twice, in quotes and as a table")
+            values[found] = given
     return values
 
 

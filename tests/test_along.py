@@ -124,6 +124,36 @@ def test_a_bundle_between_slip_and_stick():
     assert float(stick.radius) == pytest.approx(3e-3, rel=1e-12)
 
 
+def test_two_and_three_wires_that_stick_bend_about_their_centroid():
+    """Parallel axes: each wire adds E A d^2 = 4 E I (d/r)^2 to EI about an axis at the distance d, and to GJ G A d^2 =
+    2 G J (d/r)^2, r the radius of a wire. Two wires: d = r about d2, 0 about d1. Three in a triangle: d = 2 r/sqrt(3)
+    from the centroid. Four in a rhombus: halves of its diagonals r and sqrt(3) r.
+    """
+    root = 3**0.5
+    wire = rj.Rod.circular(1.0, 1e-3, 1e9, poisson_ratio=0.3)
+    for wires, bending, torsion, radius in (
+        (1, 1, 1, 1),
+        (2, (2, 2 + 2 * 4), 2 + 2 * 2, 2),
+        (3, 3 + 4 * 3 * (4 / 3) / 2, 3 + 2 * 3 * (4 / 3), 1 + 2 / root),
+        (4, (4 + 4 * 2, 4 + 4 * 2 * 3), 4 + 2 * 8, 1 + root),
+        (7, 7 + 4 * 24 / 2, 7 + 2 * 24, 3),
+        (19, 19 + 4 * 192 / 2, 19 + 2 * 192, 5),
+    ):
+        for stick in (0.0, 0.25, 1.0):
+            rod = rj.Rod.bundle(1.0, wires, 1e-3, 1e9, poisson_ratio=0.3, stick=stick)
+            mixed = wires + stick * (np.array(bending) - wires)
+            assert rod.is_plain == (np.ndim(bending) == 0)
+            # Sums of a few rounded products.
+            np.testing.assert_allclose(np.array(rod.EI) / wire.EI, mixed, rtol=1e-13)
+            np.testing.assert_allclose(rod.GJ / wire.GJ, wires + stick * (torsion - wires), rtol=1e-13)
+            np.testing.assert_allclose(rod.radius, 1e-3 * radius, rtol=1e-13)
+    for wires in range(1, 40):  # those around one or more of others are within them
+        rod = rj.Rod.bundle(1.0, wires, 1e-3, 1e9, poisson_ratio=0.3, stick=1.0)
+        EI1, EI2 = rod.bending_pair
+        assert wires * wire.EI * (1 - 1e-13) <= EI1 <= EI2
+        np.testing.assert_allclose(rod.GJ / wire.GJ, wires + (EI1 + EI2 - 2 * wires * wire.EI) / (2 * wire.EI))
+
+
 def test_equal_layers_are_one_rod():
     layers = rj.Rod.layered(1.0, [0, 1e-3, 2e-3], [1e9, 1e9], poisson_ratios=[0.3, 0.3], densities=[1e3, 1e3])
     rod = rj.Rod.circular(1.0, 2e-3, 1e9, poisson_ratio=0.3, density=1e3)

@@ -550,13 +550,13 @@ def document(content: dict[str, Any]) -> str:
     return "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in content.items()) + "\n"
 
 
-CLAMPED = dict(support="clamp", position="[0, 0, 0] m", tangent=[1, 0, 0])
+CLAMPED = dict(support="clamp", position="[0, 0, 0] m", tangent=[1, 0, 0], d2=[0, 1, 0])
 STIFF = dict(length="1 m", EI="4.9e-3 N m^2", GJ="3.3e-3 N m^2", EA="785 N")
 SOUND = dict(youngs_modulus="10 MPa", density="1200 kg/m^3")
 DOCUMENTS: list[dict[str, Any]] = [
     dict(
         rod=dict(section="circular", length="100 cm", radius="5 mm", poisson_ratio=0.5, **SOUND),
-        start=CLAMPED | dict(d2=[0, 1, 0], spin="10 deg"),
+        start=CLAMPED | dict(spin="10 deg"),
         end=dict(support="clamp", position="[80, 0, 0] cm", frame=LEVEL.tolist(), spin="0 deg"),
         loads=dict(gravity="[0, 0, -9.81] m/s^2", point_force=[dict(at="0.5 m", force="[0, 0, -0.2] N")]),
         solve=dict(rtol=1e-3, discretization="hermite"),
@@ -568,7 +568,7 @@ DOCUMENTS: list[dict[str, Any]] = [
     dict(
         rod=STIFF | dict(mass_per_length="0.1 kg/m", radius="5 mm"),
         start=CLAMPED,
-        end=dict(support="clamp", position="[0.8, 0, 0] m", tangent=[1, 0, 0], turns=1),
+        end=dict(support="clamp", position="[0.8, 0, 0] m", tangent=[1, 0, 0], d2=[0, 1, 0], turns=1),
         loads=dict(gravity="[0, 0, -9.81] m/s^2"),
         solve=dict(segments=4, discretization="finite_difference"),
     ),

@@ -514,6 +514,7 @@ d2 = [0, 0, 3]
 at = "0.5 m"
 position = "[0.3, 0, 0] m"
 tangent = [1, 0, 0]
+d2 = [0, 1, 0]
 spin = "90 deg"
 [[clips]]
 at = "0.7 m"
@@ -548,6 +549,7 @@ def test_frames_of_clips_in_a_scene_file(tmp_path):
             r"clips\[2\].tangent is not allowed together",
         ),
         ('spin = "90 deg"', 'spin = "190 deg"', r"clips\[1\].spin must lie in -180 deg to 180 deg, got 190 deg"),
+        ("d2 = [0, 1, 0]\n", "", r"clips\[1\].d2 or clips\[1\].frame is needed for clips\[1\].spin"),
         ("d2 = [0, 0, 3]", "d2 = [1, 0, 0]", r"clips\[0\].d2 must not be parallel"),
         ("tangent = [2, 0, 0]\n", "", r"clips\[0\].tangent or clips\[0\].frame is needed where"),
         ("d2 = [0, 0, 3]", "d2 = [0, 0, 3]\nsliding = true", r"clips\[0\]: sliding must be False where frame is given"),

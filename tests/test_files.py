@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import random_scenes
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
@@ -42,8 +43,10 @@ from rodjax import (
     solve,
     solve_path,
 )
+from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.files import FIELDS, FORMAT, OLDEST_FORMAT, load, point_data, save
+from rodjax.discretization.hermite import Curve
+from rodjax.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, point_data, save
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
 CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))
@@ -185,6 +188,29 @@ def test_every_kind_of_scene_comes_back(name, count, single, tmp_path):
         of_scene = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + leaf]), of_scene)
     save(of_scene, str(tmp_path / "rod.vtkhdf"))
     assert_same(load(str(tmp_path / "rod.vtkhdf")), of_scene)
+
+
+def test_scenes_of_every_class_come_back_whatever_their_sizes(single, tmp_path):
+    """The sizes of a scene's arrays have nothing to do with the mesh: some were taken for those of its nodes."""
+    rng, seen = np.random.default_rng(1), set()
+
+    def look(name: str, entry: h5py.Group | h5py.Dataset) -> None:
+        if name.startswith("scene/"):
+            seen.add(str(entry.attrs.get("kind", re.sub(r"/\d+(?=/|$)", "/*", name))))
+
+    for k in range(60):
+        result = dataclasses.replace(single, scene=random_scenes.scene(rng))
+        if k % 3 == 0:  # steps of a path
+            count = int(rng.integers(1, 12))
+            result = jax.tree.map(lambda leaf, count=count: jnp.asarray(np.stack([leaf] * count)), result)
+        save(result, tmp_path / "rod.vtkhdf")
+        assert_same(load(tmp_path / "rod.vtkhdf"), result)
+        with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:
+            group = file["rodjax"]
+            assert isinstance(group, h5py.Group)
+            group.visititems(look)
+    kinds = {name for name, kind in KINDS.items() if not issubclass(kind, Polyline | Curve | FramedCurve)}
+    assert seen >= kinds | {place for place in FIELDS if place.startswith("scene/clips")}
 
 
 @pytest.mark.parametrize(

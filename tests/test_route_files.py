@@ -39,7 +39,8 @@ def reported(tmp_path_factory):
     """The folder that `rodjax report` made of the example, with a result of its scene."""
     folder = tmp_path_factory.mktemp("report")
     assert main(["solve", str(ROUTES / "scene.toml"), "-o", str(folder / "result.vtkhdf")]) == 0
-    assert main(["report", str(ROUTES / "brake_line.toml"), "--out", str(folder / "out")]) == 0
+    # Before it is routed the line does not keep to all limits.
+    assert main(["report", str(ROUTES / "brake_line.toml"), "--out", str(folder / "out")]) == 3
     return folder
 
 
@@ -148,13 +149,24 @@ def test_report_tells_and_writes(reported, capsys):
 
 
 def test_report_takes_a_result(reported, files, capsys):
-    assert main(["report", "brake_line.toml", "--result", str(reported / "result.vtkhdf"), "--out", "mine"]) == 0
+    assert main(["report", "brake_line.toml", "--result", str(reported / "result.vtkhdf"), "--out", "mine"]) == 3
     out, err = capsys.readouterr()
-    assert err == ""
+    assert err.startswith("rodjax: brake_line.toml: limits: NOT kept: ")
     assert out.endswith(f"written: {', '.join(f'mine/{name}' for name in FILES)}\n")
     told = json.loads((files / "mine" / "report.json").read_text())
     before = json.loads((reported / "out" / "report.json").read_text())
     assert told["margins"] == pytest.approx(before["margins"], rel=1e-9)
+
+
+def test_a_limit_that_is_not_kept_exits_with_3_and_is_told(reported, files, capsys):
+    for strain, code in ((1e-9, 3), (0.5, 0)):
+        Path("limits.toml").write_text(f'title = "Line"\n[limits]\nstrain = {strain}\n')
+        assert main(["report", "limits.toml", "--result", str(reported / "result.vtkhdf"), "--out", "mine"]) == code
+        out, err = capsys.readouterr()
+        told = json.loads((files / "mine" / "report.json").read_text())
+        assert told["verdict"].startswith("NOT kept: 1 of 1 limit: " if code else "kept: the one limit")
+        assert told["verdict"] in out
+        assert err == (f"rodjax: limits.toml: limits: {told['verdict']}\n" if code else "")
 
 
 @pytest.mark.slow

@@ -35,11 +35,13 @@ mass_per_length = "0.1 kg/m"
 support = "clamp"
 position = "[0, 0, 0] m"
 tangent = [1, 0, 0]
+d2 = [0, 1, 0]
 
 [end]
 support = "clamp"
 position = "[80, 0, 0] cm"
 tangent = [1, 0, 0]
+d2 = [0, 1, 0]
 
 [loads]
 gravity = "[0, 0, -9.81] m/s^2"
@@ -148,7 +150,10 @@ def test_a_case_is_the_scene_of_a_file_with_its_values(files):
     scenes = CaseReader(Path("scene.toml"), Path("table.csv")).scenes(np.arange(2))
     text = (
         SCENE.replace('"100 cm"', '"110 cm"')
-        .replace('"[80, 0, 0] cm"\ntangent = [1, 0, 0]', '"[0.7, 0, 0] m"\ntangent = [1, 0, 0.5]\nd2 = [0, 1, 1]')
+        .replace(
+            '"[80, 0, 0] cm"\ntangent = [1, 0, 0]\nd2 = [0, 1, 0]',
+            '"[0.7, 0, 0] m"\ntangent = [1, 0, 0.5]\nd2 = [0, 1, 1]',
+        )
         .replace("[0, 0, -0.1] N", "[0, 0.2, -0.1] N")
         .replace("-9.81", "-1")
     )

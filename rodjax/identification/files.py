@@ -66,9 +66,11 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
+from rodjax.clocking import check_clocked
 from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.identification.loss import Loss
 from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
+from rodjax.identification.measured_table import UNITS as MEASURED
 from rodjax.identification.measurements import Centerline, EndForce, EndMoment, Experiment, Measurement, orthographic
 from rodjax.identification.unknowns import Per, Scale, Unknown, known_names, target
 from rodjax.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
@@ -111,7 +113,7 @@ def read_fit_files(fit: str | os.PathLike[str], data: str | os.PathLike[str]) ->
         _check_deviations(deviations, table)
     experiments, file = _experiments(table, scene, data, deviations)
     with in_file(fit):
-        _check_names(tables, experiments)
+        _check_names(tables, experiments, file.unclocked)
         unknowns = [_unknown(one, where) for where, one in tables.items()]
     if "rtol" not in settings and "segments" not in settings:
         settings |= {"rtol": file.rtol, "segments": file.segments}
@@ -188,11 +190,14 @@ def _prior(value: Any, key: str, unknown: Unknown) -> tuple[float, float]:
     return _number(value["value"], f"{key}.value", unknown.unit), _number(value["sd"], f"{key}.sd", unit)
 
 
-def _check_names(tables: Mapping[str, dict[str, Any]], experiments: Sequence[Experiment]) -> None:
+def _check_names(
+    tables: Mapping[str, dict[str, Any]], experiments: Sequence[Experiment], unclocked: Sequence[str]
+) -> None:
     # Before anything else, as the name tells which units are right.
     sought: dict[str, str] = {}
     for where, table in tables.items():
         for name in _names(table, where):
+            check_clocked(name, unclocked, where)
             if all(target(name, experiment) is None for experiment in experiments):
                 allowed = ", ".join(known_names(experiments[0]))
                 raise SceneFileError(f"{where}: there is no number {shown(name)}; allowed are {allowed}")
@@ -263,6 +268,9 @@ def _column_names(table: Any) -> dict[str, str]:
     """The keys of the scene by the names of the columns that hold them."""
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table.values()):
         raise SceneFileError(f'experiments must be a table such as gap = "end.position.0", got {shown(table)}')
+    for name in table:
+        if name in ("experiment", "cluster", *MEASURED):
+            raise SceneFileError(f"experiments.{name} must have another name: columns {name} are of what was measured")
     if table:
         try:
             check_scene_keys(list(table.values()))

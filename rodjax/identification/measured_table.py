@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import line, shown
-from rodjax.quantities import SceneFileError, si_value
+from rodjax.quantities import SceneFileError, number_in, si_value
 from rodjax.scene_keys import cell, check_keys, si_number
 
 AXES = "xyz"
@@ -221,10 +221,9 @@ def _points(
 
 def _number(column: _Column, row: _Row) -> float:
     text = row.cells[column.place]
-    try:
-        number = float(text)
-    except ValueError:
-        raise SceneFileError(f"line {row.line}, column {column.title}: must be a number, got {shown(text)}") from None
+    number = number_in(text)
+    if number is None:
+        raise SceneFileError(f"line {row.line}, column {column.title}: must be a number, got {shown(text)}")
     if not math.isfinite(number):
         raise SceneFileError(f"line {row.line}, column {column.title}: must be finite, got {shown(text)}")
     return number * column.factor

@@ -96,14 +96,22 @@ class Unknown:
         self.bounds = (None, None) if bounds is None else _bounds(bounds, check)
         self.size = None if size is None else float(positive(size, "size"))
         self.label = first if label is None else str(label)
-        is_distributed = first.startswith("distributed.") and _matches(first, ("force",))
-        self.unit = "N/m" if is_distributed else next((u for name, u in UNITS.items() if _matches(first, (name,))), "")
+        self.unit = unit_of(first)
 
     def natural_size(self, length: float) -> float:
         """The change that counts as large, for a rod of that length [m]."""
         if self.size is not None:
             return self.size
         return 1.0 if self.scale == "log" else {"m": length, "1/m": 1 / length, "rad/m": 1 / length}.get(self.unit, 1.0)
+
+
+def unit_of(name: str) -> str:
+    """SI unit of a number by its dotted name; none of a number without one."""
+    if name.startswith("distributed.") and _matches(name, ("force",)):
+        return "N/m"
+    if name.startswith("obstacles."):
+        return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal",)) else "m"
+    return next((unit for part, unit in UNITS.items() if _matches(name, (part,))), "")
 
 
 class Target(NamedTuple):

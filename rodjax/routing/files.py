@@ -76,11 +76,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
+from rodjax.clocking import check_clocked
+from rodjax.identification.unknowns import unit_of
 from rodjax.obstacle_tables import kind_of, obstacle
 from rodjax.obstacles import Obstacle
 from rodjax.quantities import (
     OF_TABLES,
-    QUANTITIES,
     SceneFileError,
     check_keys,
     in_file,
@@ -260,18 +261,12 @@ def _variable(table: Any, where: str) -> Variable:
         )
     if kind == "between":
         check_keys(table, where, (), ("kind", "key", *required))
-        unit = _unit_of(table["key"])
+        unit = unit_of(table["key"])
         example = f'"0.1 {unit}"' if unit else "0.1"
         values = {key: _number_or_list(table[key], key, where, unit, example) for key in required}
     else:
         values = si_values(table, where, required, (), other=("kind", "key"))
     return _made(make, {"key": table["key"], **values}, where)
-
-
-def _unit_of(key: str) -> str:
-    """That of the last name in a dotted key; of what no scene file has none."""
-    name = next((name for name in reversed(key.split(".")) if not name.isdigit()), "")
-    return QUANTITIES[name][0] if name in QUANTITIES else ""
 
 
 def _number_or_list(value: Any, key: str, where: str, unit: str, example: str) -> Float[np.ndarray, "..."]:
@@ -301,6 +296,8 @@ def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], v
 
 
 def _check_variables(variables: tuple[Variable, ...], file: SceneFile) -> None:
+    for k, variable in enumerate(variables):
+        check_clocked(variable.key, file.unclocked, f"variables[{k}]")
     try:
         checked_variables(variables, file.scenes[0])
     except (TypeError, ValueError) as error:

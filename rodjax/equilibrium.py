@@ -32,7 +32,7 @@ from rodjax.guess import Guess, first_shape
 from rodjax.implicit import differentiable, not_differentiated
 from rodjax.plane import check_planar, is_planar, plane
 from rodjax.ranges import check_ranges, with_ranges
-from rodjax.refinement import SAFETY, SIZES, Depth, first_size, graded, next_size, shares
+from rodjax.refinement import SAFETY, SIZES, Depth, error_by_rtol, first_size, graded, next_size, shares
 from rodjax.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -73,7 +73,7 @@ DEFAULT_RTOL = 1e-3
 LEAST_RTOL = 1e-10
 LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
 # At least so many in the span between two clips, on average, of the first mesh.
-SPAN_SEGMENTS = 3
+SPAN_SEGMENTS = 10
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
@@ -162,7 +162,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
     while True:
         failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
-        error = float(np.max(np.linalg.norm(errors.nodes, axis=1)))
+        error = float(error_by_rtol(errors))
         sinks = depth.lacking(errors, options.segments)
         is_fine = bool(result.converged) and max(SAFETY * error / rtol, sinks) <= 1
         if is_fine or _is_finest(options) or failures == MOST_FAILURES:
@@ -194,7 +194,7 @@ def refined_together(
     result, depth = solve(options, None), Depth()
     while rtol is not None and is_here(result):
         errors, converged = estimated_errors(result), np.asarray(result.converged)
-        sizes = np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1)
+        sizes = error_by_rtol(errors)
         error = float(np.max(sizes[converged], initial=0.0))
         sinks = depth.lacking(errors, options.segments, converged)
         if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
@@ -219,8 +219,8 @@ def _is_finest(options: Options) -> bool:
 def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
     if not error <= rtol:
         warnings.warn(
-            f"the estimated error {error:.1e} is above rtol = {rtol:g}{where} on the finest mesh, of "
-            f"{options.segments} segments",
+            f"the estimated error {error:.1e} (of the shape, or a tenth of that of forces, moments or curvature) is "
+            f"above rtol = {rtol:g}{where} on the finest mesh, of {options.segments} segments",
             NotConvergedWarning,
             stacklevel=4,
         )

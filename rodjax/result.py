@@ -17,9 +17,11 @@ from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.error import (
     Errors,
+    Sizes,
     depths_of_elements,
     errors_of_differences,
     errors_of_elements,
+    longest,
     with_contacts,
 )
 from rodjax.discretization.form import NEUTRAL, Form
@@ -106,7 +108,11 @@ class Equilibrium(eqx.Module):
       a step of a path took: 1, or more where it was split
     - `residual` [...] largest component of the gradient, in EI/L^2
     - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; computed when it
-      is asked for
+      is asked for. With it `force_error`, `moment_error`, `curvature_error` [...]: estimated errors of the mesh in the
+      forces and moments of the rod, its ends and clips, relative to the largest force (at least EI/L^2) and the largest
+      moment (at least 0.1 EI/L) in the rod, and in the curvature at a node, relative to the largest at any (at least
+      0.1/L). Between the nodes the rod may be bent more than at them. `moment_error` counts that obstacles touch at
+      nodes only
     - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
@@ -174,6 +180,19 @@ class Equilibrium(eqx.Module):
     def error_estimate(self) -> Float[Array, "..."]:
         errors = estimated_errors(self).nodes
         return jnp.sqrt(jnp.max(jnp.sum(errors**2, axis=-1), axis=-1))
+
+    @property
+    def force_error(self) -> Float[Array, "..."]:
+        return estimated_errors(self).force
+
+    @property
+    def moment_error(self) -> Float[Array, "..."]:
+        errors = estimated_errors(self)
+        return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
+
+    @property
+    def curvature_error(self) -> Float[Array, "..."]:
+        return estimated_errors(self).curvature
 
     @property
     def critical(self) -> Bool[Array, "..."]:
@@ -277,20 +296,41 @@ def over_leading_axes(function: Callable) -> Callable:
     return compiled(mapped)
 
 
-@over_leading_axes
 def estimated_errors(equilibrium: Equilibrium) -> Errors:
     """How far the equilibrium is from the continuum; of the continuum itself not a number."""
+    if is_known(equilibrium):
+        errors = _errors(equilibrium)
+        # Few rods can turn as a whole: the program that looks for such a turn is theirs.
+        if not np.any(errors.is_soft):
+            return errors
+    return _errors_beside_turns(equilibrium)
+
+
+@over_leading_axes
+def _errors(equilibrium: Equilibrium) -> Errors:
+    return _errors_of(equilibrium, is_turn_held=False)
+
+
+@over_leading_axes
+def _errors_beside_turns(equilibrium: Equilibrium) -> Errors:
+    return _errors_of(equilibrium, is_turn_held=True)
+
+
+def _errors_of(equilibrium: Equilibrium, *, is_turn_held: bool) -> Errors:
     state = equilibrium.state
     if equilibrium.discretization == "continuum":
-        return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), None)
+        unknown = Sizes(*[jnp.full((), jnp.nan, equilibrium.nodes.dtype)] * 3)
+        return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), *unknown, unknown, jnp.array(False), None)
     form, point = form_and_point(equilibrium)
     if isinstance(form, FrameForm):
-        return errors_of_frames(form, point)
+        return errors_of_frames(form, point, is_turn_held=is_turn_held)
     assert isinstance(form, MixedForm)
     if isinstance(state.shape, Curve):
-        errors = errors_of_elements(form, point)
+        errors = errors_of_elements(form, point, is_turn_held=is_turn_held)
     else:
-        errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T)
+        errors = errors_of_differences(
+            form, point, state.shape.nodes, equilibrium.tangents.T, is_turn_held=is_turn_held
+        )
     if isinstance(form, TouchingForm):
         return with_contacts(errors, form, point)
     if errors.axial is None:
@@ -298,7 +338,16 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
     # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
     now = slide(form.scene, state.shape, point)
     further = -jnp.linalg.solve(now.rates, errors.axial)
-    return errors._replace(nodes=errors.nodes + jnp.tensordot(further, now.nodes, 1))
+    nodes, forces, moments, curvature = (
+        jnp.tensordot(further, rate, 1) for rate in (now.nodes, now.forces, now.moments, now.curvature)
+    )
+    more = Sizes(longest(forces), longest(moments), jnp.max(jnp.abs(curvature))).relative_to(errors.scale)
+    return errors._replace(
+        nodes=errors.nodes + nodes,
+        force=errors.force + more.force,
+        moment=errors.moment + more.moment,
+        curvature=errors.curvature + more.curvature,
+    )
 
 
 class _Examination(eqx.Module):

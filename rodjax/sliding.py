@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.form import Form, Point
-from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.results import clip_moments, resultants
 from rodjax.discretization.shape import Shape
 from rodjax.linalg import factor
 from rodjax.scene import Scene, slid, sliding_places
@@ -19,13 +20,17 @@ class Slide(NamedTuple):
     """Of an equilibrium under clips at given arclengths, nondimensional.
 
     `axial`: what the sliding clips apply along the rod; `rates`: the derivatives by the arclengths of these clips, one
-    column for each; `nodes`: those of the nodes. By as much as a clip pulls along the rod the energy falls as its
-    arclength grows, so that the reverse of `rates` is the energy's second derivative.
+    column for each; `nodes`, `forces`, `moments`, `curvature`: those of the nodes, the forces through the spans, the
+    moments of ends and clips and the curvature at nodes. By as much as a clip pulls along the rod the energy falls as
+    its arclength grows, so that the reverse of `rates` is the energy's second derivative.
     """
 
     axial: Float[Array, "slides"]
     rates: Float[Array, "slides slides"]
     nodes: Float[Array, "slides n+1 3"]
+    forces: Float[Array, "slides 3 spans"]
+    moments: Float[Array, "slides 3 k"]
+    curvature: Float[Array, "slides n+1"]
 
     @property
     def stiffness(self) -> Float[Array, "slides slides"]:
@@ -46,16 +51,20 @@ def slide(scene: Scene, shape: Shape, point: MixedPoint) -> Slide:
         form, there = carried_to(slid(scene, places), shape, point)
         return form.unbalanced(there)
 
-    def seen(places: Float[Array, "slides"], motion: Motion) -> tuple[Float[Array, "slides"], Float[Array, "n+1 3"]]:
+    def seen(places: Float[Array, "slides"], motion: Motion) -> tuple[Array, ...]:
         form, there = carried_to(slid(scene, places), shape, point, motion)
-        return axial_forces(form, there), form.nodes(form.edges(there))
+        assert isinstance(form, MixedForm)
+        assert isinstance(there, MixedPoint)
+        ends = resultants(form, there)
+        moments = jnp.stack([ends.start_moment, ends.end_moment, *clip_moments(form, there)], axis=1)
+        return axial_forces(form, there), form.nodes(form.edges(there)), there.end_force, moments, ends.curvature
 
-    def rate(direction: Float[Array, "slides"]) -> tuple[Float[Array, "slides"], Float[Array, "n+1 3"]]:
+    def rate(direction: Float[Array, "slides"]) -> tuple[Array, ...]:
         _, (f, c) = jax.jvp(unbalanced, (places,), (direction,))
         return jax.jvp(seen, (places, nothing), (direction, Motion(*factors.solve(-f, -c))))[1]
 
-    rates, nodes = jax.vmap(rate)(jnp.eye(len(places), dtype=places.dtype))
-    return Slide(axial_forces(form, begin), rates.T, nodes)
+    rates, *others = jax.vmap(rate)(jnp.eye(len(places), dtype=places.dtype))
+    return Slide(axial_forces(form, begin), rates.T, *others)
 
 
 def axial_forces(form: Form, point: Point) -> Float[Array, "slides"]:

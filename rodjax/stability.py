@@ -110,10 +110,12 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
         motion = Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
         return motion, *here.system.times(motion.rotation, motion.multipliers)
 
-    axes = jnp.eye(3, dtype=point.tangents.dtype)
-    _, moments, gaps = jax.vmap(turn)(axes)
+    # One after another: XLA would otherwise compute the system again for each number made of it.
+    turns = jax.lax.map(turn, jnp.eye(3, dtype=point.tangents.dtype))
+    _, moments, gaps = turns
     missing = jnp.concatenate([moments.reshape(3, -1), gaps], axis=1)
-    motion, moments, gaps = turn(jnp.linalg.eigh(missing @ missing.T)[1][:, 0])
+    axis = jnp.linalg.eigh(missing @ missing.T)[1][:, 0]
+    motion, moments, gaps = jax.tree.map(lambda x: jnp.tensordot(axis, x, 1), turns)
     size = jnp.max(jnp.abs(motion.rotation))
     least = NEUTRAL * size / point.tangents.shape[1]
     is_neutral = (size > jnp.sqrt(NEUTRAL)) & (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)

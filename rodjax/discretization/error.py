@@ -8,6 +8,8 @@ second mesh is needed, and no neighbours, so that jumps of curvature or mesh do 
 
 By finite differences: the way to the elements between the same nodes, whose error is of fourth order, by one step of
 Newton's method.
+
+The same solution changes forces, moments and curvatures: so much are these off.
 """
 
 import itertools
@@ -15,17 +17,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.clipped import ClippedForm
+from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import positions_between
+from rodjax.discretization.results import clip_moments, positions_between, resultants
 from rodjax.discretization.touching import TouchingForm
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under
 from rodjax.linalg import factor_and_solve, short_sum
 from rodjax.scene import slides
+from rodjax.stability import Motion, neutral_turn
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
 from rodjax.vectors import components, cross, dot, root
@@ -39,6 +43,14 @@ COUPLE_REACH = 12.0
 # A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
 # displaces it by about half of that.
 CONTACT_REACH = 16.0
+CONTACT_MOMENT = 8.0
+# Errors of forces and moments are relative to the largest one in the rod, at least to these [EI/L^2], [EI/L]: of what
+# vanishes no part can be told. Of curvatures [1/L] as of moments.
+LEAST_FORCE = 1.0
+LEAST_MOMENT = 0.1
+# A correction of less stiffness [EI/L^2 per rad and length] than this may be mostly a turn that nothing resists; the
+# softest motion of a clamped rod has pi^2.
+SOFT = 1.0
 # Where it is looked at how deep a rod lies within obstacles, as parts of elements.
 DEPTH_PLACES = (0.25, 0.5, 0.75)
 
@@ -52,20 +64,100 @@ class Section(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `defects` of the elements,
-    as the displacement that each alone might make, `None` where there are none; `axial`: of the forces by which clips
-    pull along a rod that slides through them, `None` without such; `depths`: how deep each element lies within
-    obstacles, by the radius, `None` without such.
+    """`nodes`: from those of an equilibrium to where the continuum has them, in units of L; `force`, `moment` and
+    `curvature`: the largest errors of these, relative to `scale`, the largest of each in the rod; `is_soft`: as of
+    `correction`; `defects` of the elements, as the displacement that each alone might make, `None` where there are
+    none; `axial`: of the forces by which clips pull along a rod that slides through them, `None` without such;
+    `depths`: how deep each element lies within obstacles, by the radius, and `misplaced`: the error of moments, also
+    relative, that contacts make by lying beside their nodes, `None` without such.
     """
 
     nodes: Float[Array, "n+1 3"]
+    force: Float[Array, ""]
+    moment: Float[Array, ""]
+    curvature: Float[Array, ""]
+    scale: "Sizes"
+    is_soft: Bool[Array, ""]
     defects: Float[Array, "n"] | None
     axial: Float[Array, "slides"] | None = None
     depths: Float[Array, "n"] | None = None
+    misplaced: Float[Array, ""] | None = None
+
+
+class Sizes(NamedTuple):
+    """The largest force, moment and curvature along a rod, or the largest errors of them; nondimensional."""
+
+    force: Float[Array, ""]
+    moment: Float[Array, ""]
+    curvature: Float[Array, ""]
+
+    def as_scale(self) -> "Sizes":
+        """The same, and no less than what errors are relative to where all of a rod has less."""
+        least = (LEAST_FORCE, LEAST_MOMENT, LEAST_MOMENT)
+        return Sizes(*(jnp.maximum(size, low) for size, low in zip(self, least, strict=True)))
+
+    def relative_to(self, scale: "Sizes") -> "Sizes":
+        return Sizes(*(error / size for error, size in zip(self, scale, strict=True)))
+
+
+def longest(vectors: Float[Array, "3 *k"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.max(dot(vectors, vectors), initial=0.0))
+
+
+def of_sections(
+    forces: Float[Array, "3 k n"],
+    moments: Float[Array, "3 2 n"],
+    curvatures: Float[Array, "c 2 n"],
+    changes: tuple[Float[Array, "3 k n"], Float[Array, "3 2 n"], Float[Array, "c 2 n"]],
+    *,
+    has_clips: bool,
+) -> tuple[Sizes, Sizes]:
+    """The relative errors, and their scale: of the forces in elements, and of moments and curvatures (components across
+    the rod) at both ends of each, from what they change by; with clips also of what these apply, the jumps of forces
+    and moments.
+    """
+    force_change, moment_change, curvature_change = changes
+    bends = root(dot(curvatures, curvatures))
+    better = curvatures + curvature_change
+    error = Sizes(longest(force_change), longest(moment_change), jnp.max(jnp.abs(root(dot(better, better)) - bends)))
+    if has_clips:
+        force = longest(force_change[:, -1, :-1] - force_change[:, 0, 1:])
+        moment = longest(moment_change[:, 1, :-1] - moment_change[:, 0, 1:])
+        error = Sizes(jnp.maximum(error.force, force), jnp.maximum(error.moment, moment), error.curvature)
+    scale = Sizes(longest(forces), longest(moments), jnp.max(bends)).as_scale()
+    return error.relative_to(scale), scale
+
+
+def correction(
+    form: Form,
+    point: Point,
+    here: Linearization,
+    gradient: Float[Array, "b m"],
+    closure: Float[Array, "k"],
+    *,
+    is_turn_held: bool,
+) -> tuple[Motion, Bool[Array, ""]]:
+    """What takes a gradient and a closure away to leading order, and whether it is so soft a motion that it may be a
+    turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
+    turn the rod far. With `is_turn_held` such a turn is taken out.
+    """
+    motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
+    if not form.has_potential:
+        return motion, jnp.array(False)
+    if is_turn_held:
+        return motion.without(neutral_turn(form, point, here)), jnp.array(False)
+    places = motion.rotation.shape[1]
+    work = jnp.abs(jnp.sum(motion.rotation * gradient)) * places
+    return motion, work < SOFT * jnp.sum(motion.rotation**2)
 
 
 def errors_of_differences(
-    form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], at_nodes: Float[Array, "3 n+1"]
+    form: MixedForm,
+    point: MixedPoint,
+    nodes: Float[Array, "n+1 3"],
+    at_nodes: Float[Array, "3 n+1"],
+    *,
+    is_turn_held: bool = False,
 ) -> Errors:
     """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
     scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
@@ -73,22 +165,43 @@ def errors_of_differences(
     tangents = interleaved(at_nodes, point.tangents)
     begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
     here = elements.linearized(begin)
-    _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
-    end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
-    return Errors(elements.nodes(elements.edges(end)) - nodes, None, _axial_error(elements, form, end, point))
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
+    change = elements.force_change(elements.closure(motion.multipliers))
+    end = elements.moved(begin, here.bases, motion.rotation, change)
+    found, better = resultants(form, point), resultants(elements, end)
+    curvature = jnp.max(jnp.abs(better.curvature - found.curvature))
+    moments = [better.start_moment - found.start_moment, better.end_moment - found.end_moment]
+    if scene.clips:
+        moments += list(clip_moments(elements, end) - clip_moments(form, point))
+    error = Sizes(longest(_with_jumps(change)), longest(jnp.stack(moments, axis=1)), curvature)
+    forces = elements.with_end_force(end, field.forces_in_elements(scene))
+    bending, torque = jnp.max(better.curvature), scene.rod.GJ * end.total_twist
+    scale = Sizes(longest(forces), jnp.sqrt(bending**2 + torque**2), bending).as_scale()
+    shift = elements.nodes(elements.edges(end)) - nodes
+    return Errors(shift, *error.relative_to(scale), scale, is_soft, None, _axial_error(elements, form, end, point))
 
 
-def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
+def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool = False) -> Errors:
     field, scene, tangents = form.field, form.scene, point.tangents
     assert isinstance(field, HermiteElements)
     rod, h = scene.rod, field.h
     torque = rod.GJ * point.total_twist
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
-    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
-    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
-    moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
+
+    def forces_of(end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 3 n"]:
+        return form.with_end_force(MixedPoint(tangents, end_force, torque), field.forces_in_elements(scene))
+
+    def bent(tangents: Float[Array, "3 m"], forces: Float[Array, "3 3 n"], torque: Float[Array, ""]):
+        """The bending moments at both ends of the elements."""
+        by_start, by_end = field.by_end_tangents(scene, tangents, forces[:, ::2], torque)
+        nodes = tangents[:, ::2]
+        return jnp.stack([-cross(nodes[:, :-1], by_start), cross(nodes[:, 1:], by_end)], axis=1)
+
+    forces = forces_of(point.end_force)
+    bending_moments, bent_further = jax.linearize(bent, tangents, forces, torque)
+    moments = jnp.concatenate([bending_moments[:, 0, :1], bending_moments[:, 1]], axis=1)
     # In a clip that holds the tangent the moment jumps.
-    before = -cross(nodes[:, :-1], by_start) if scene.clips else moments[:, :-1]
+    before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
     last, passed = _integrated(form, field, point, torque, first)
 
@@ -97,7 +210,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     turn = cross(nodes[:, 1:], last.tangent)
     back = -cross(turn, middles)
     passed = [tangent + k / STEPS * -cross(turn, tangent) for k, tangent in enumerate(passed)]
-    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 1])
+    force = forces[:, 1]
     couple = last.moment - moments[:, 1:]
     gap = last.way + h[None] / 2 * back - form.edges(point).T
 
@@ -117,10 +230,10 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
         closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
     elif len(here.closure) > len(closure):
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
-    _, rotation, multipliers = factor_and_solve(form.regular(here.system), -gradient, -closure)
+    motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
 
-    force_change = form.force_change(form.closure(multipliers))
-    turned = short_sum(here.bases * rotation[None], axis=1)
+    force_change = form.force_change(form.closure(motion.multipliers))
+    turned = short_sum(here.bases * motion.rotation[None], axis=1)
     end_force = point.end_force + force_change
     ways, change = jax.jvp(
         lambda tangents: form.edges(MixedPoint(tangents, end_force, point.total_twist)), (tangents,), (turned,)
@@ -129,9 +242,23 @@ def errors_of_elements(form: MixedForm, point: MixedPoint) -> Errors:
     sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
-    moved = form.moved(point, here.bases, rotation, force_change)
+    moved = form.moved(point, here.bases, motion.rotation, force_change)
     axial = _axial_error(form, form, moved, point)
-    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH, axial)
+
+    # The first multiplier is the torque, where there is one.
+    torque_change = motion.multipliers[0] if form.has_torsion or not form.has_potential else jnp.zeros_like(torque)
+    section_change = jnp.broadcast_to(forces_of(end_force) - forces, forces.shape)
+    bending_change = bent_further(turned, section_change, torque_change) + jnp.stack([-at_start, at_end], axis=1)
+    at_ends, turned_ends = (jnp.stack([x[:, 0:-1:2], x[:, 2::2]], axis=1) for x in (tangents, turned))
+    relative, scale = of_sections(
+        forces,
+        bending_moments + torque * at_ends,
+        bending_moments / rod.EI,
+        (section_change, bending_change + torque_change * at_ends + torque * turned_ends, bending_change / rod.EI),
+        has_clips=bool(scene.clips),
+    )
+    defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
+    return Errors(displacements.T, *relative, scale, is_soft, defects, axial)
 
 
 def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Errors:
@@ -150,7 +277,8 @@ def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Erro
     if defects is not None:
         defects = defects + (sizes[:-1] + sizes[1:]) / 2
     nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
-    return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point))
+    moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT / errors.scale.moment
+    return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
 
 
 def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n"]:
@@ -168,6 +296,12 @@ def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n
         [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1
     )
     return jnp.maximum(jnp.max(depths, axis=1), 0.0)
+
+
+def _with_jumps(end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 k"]:
+    """The forces in the spans, and those of the clips between them."""
+    spans = end_force.reshape(3, -1)
+    return jnp.concatenate([spans, spans[:, 1:] - spans[:, :-1]], axis=1)
 
 
 def _axial_error(

@@ -7,12 +7,20 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells, JointCells
 from rodjax.discretization.clipped_frames import ClippedFrameForm
-from rodjax.discretization.error import COUPLE_REACH, STEPS, TURN_REACH, Errors
+from rodjax.discretization.error import (
+    COUPLE_REACH,
+    STEPS,
+    TURN_REACH,
+    Errors,
+    Sizes,
+    correction,
+    longest,
+    of_sections,
+)
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.results import Resultants
 from rodjax.energy import Sections
 from rodjax.guess import cubic
-from rodjax.linalg import factor_and_solve
 from rodjax.rotations import columns, inverse, product, rotated, tangent, unit
 from rodjax.supports import Directed, Free, Held
 from rodjax.vectors import cross, dot, root
@@ -103,18 +111,32 @@ def strains_beside_nodes(
     form: FrameForm, point: FramePoint
 ) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
     """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
-    field, own = form.field, own_moments(form, point)
-    moments = jnp.stack([-own[:, 0], own[:, 2]], axis=1)
+    strains, axial = _strains_at_ends(form, point, _end_moments(form, point))
+    s = form.field.strain_places[::2]
+    return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
+
+
+def _end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
+    """The section moments at both ends of each element, on its side of the node."""
+    own = own_moments(form, point)
+    return jnp.stack([-own[:, 0], own[:, 2]], axis=1)
+
+
+def _strains_at_ends(
+    form: FrameForm, point: FramePoint, moments: Float[Array, "3 2 n"]
+) -> tuple[Float[Array, "3 2 n"], Float[Array, "2 n"]]:
+    """Curvature along d1 and d2 and twist at both ends of each element under these moments, and axial strain."""
+    field = form.field
     q = field.of_cells(point.quaternions)[:, ::2]
     tension = dot(form.forces(point.quaternions, point.end_force)[:, ::2], tangent(q))
     sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
     sections = eqx.combine(sections, form.sections)
     strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
-    s = field.strain_places[::2]
     rest = form.scene.rod.rest_shape
     if rest is not None:
+        s = field.strain_places[::2]
         strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
-    return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
+    return strains, axial
 
 
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
@@ -239,14 +261,17 @@ class Pose(eqx.Module):
     moment: Float[Array, "3 n"]
 
 
-def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
+def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool = False) -> Errors:
     """As `error.errors_of_elements`: what the elements lack enters as strains at rest, couples and ways at rest."""
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
-        return _errors_of_joints(form, point)
-    moments, ends = _on_elements(form, point).moments, own_moments(form, point)[:, 2]
+        return _errors_of_joints(form, point, is_turn_held)
+    ends = _end_moments(form, point)
+    moments = ends[:, 0]
+    if not isinstance(form, ClippedFrameForm):
+        moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
     nodes = field.at_nodes(q)
-    first = Pose(jnp.zeros_like(moments[:, 1:]), nodes[:, :-1], moments[:, :-1])
+    first = Pose(jnp.zeros_like(moments), nodes[:, :-1], moments)
     last = _integrated(form, field, point, first)
 
     turn = product(last.quaternion, inverse(nodes[:, 1:]))
@@ -255,39 +280,41 @@ def errors_of_frames(form: FrameForm, point: FramePoint) -> Errors:
     middles = q[:, 1::2]
     force = form.forces(q, point.end_force)[:, 1]
     gap = last.way - edges - field.h[None] / 2 * cross(turn, tangent(middles))
-    couple = last.moment - ends + cross(last.way - edges, force)
+    couple = last.moment - ends[:, 1] + cross(last.way - edges, force)
 
     strains = jnp.broadcast_to((rotated(inverse(middles), turn) / field.h[None])[:, None], form.loads.shape)
     ways = rotated(inverse(middles), gap)
     at_rest = [jnp.zeros_like(x) if y is None else y for x, y in ((strains, form.rest_strains), (ways, form.rest_ways))]
 
-    def unbalanced(strains: Float[Array, "3 k n"], ways: Float[Array, "3 n"]):
-        lacking = eqx.tree_at(
-            lambda form: (form.rest_strains, form.rest_ways), form, (strains, ways), is_leaf=lambda x: x is None
-        )
-        return lacking.unbalanced(point)
+    def lacking(amount: Float[Array, ""] | float) -> FrameForm:
+        values = at_rest[0] + amount * strains, at_rest[1] + amount * ways
+        return eqx.tree_at(lambda form: (form.rest_strains, form.rest_ways), form, values, is_leaf=lambda x: x is None)
 
-    _, (gradient, closure) = jax.jvp(unbalanced, tuple(at_rest), (strains, ways))
+    zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
+    _, (gradient, closure) = jax.jvp(lambda amount: lacking(amount).unbalanced(point), (zero,), (one,))
     gradient += jnp.zeros_like(gradient).at[:, 2::2].set(rotated(inverse(nodes[:, 1:]), couple)) * form.is_free
     here = form.linearized(point)
-    _, rotation, multipliers = factor_and_solve(form.regular(here.system), -gradient, -closure)
+    motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
+    change = form.force_change(form.closure(motion.multipliers))
 
-    def reached(amount):
-        lacking = eqx.tree_at(
-            lambda form: (form.rest_strains, form.rest_ways),
-            form,
-            (at_rest[0] + amount * strains, at_rest[1] + amount * ways),
-            is_leaf=lambda x: x is None,
-        )
-        change = amount * form.force_change(form.closure(multipliers))
-        return lacking.edges(form.moved(point, here.bases, amount * rotation, change)).T
+    def reached(amount: Float[Array, ""]) -> Float[Array, "3 n"]:
+        there = form.moved(point, here.bases, amount * motion.rotation, amount * change)
+        return lacking(amount).edges(there).T
 
-    zero = jnp.zeros((), q.dtype)
-    _, changes = jax.jvp(reached, (zero,), (jnp.ones_like(zero),))
-    sums = jnp.concatenate([jnp.zeros_like(changes[:, :1]), jnp.cumsum(changes, axis=1)], axis=1)
+    _, way_changes = jax.jvp(reached, (zero,), (one,))
+    sums = jnp.concatenate([jnp.zeros_like(way_changes[:, :1]), jnp.cumsum(way_changes, axis=1)], axis=1)
     displacements = sums if isinstance(form.scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
-    return Errors(displacements.T, sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH)
+
+    # A difference, as a derivative of these would be a third one of the energy.
+    there = form.moved(point, here.bases, motion.rotation, change)
+    before = form.forces(q, point.end_force), ends, _strains_at_ends(form, point, ends)[0][:2]
+    moments = _end_moments(lacking(1.0), there).at[:, 1].add(couple)
+    after = form.forces(there.quaternions, there.end_force), moments, _strains_at_ends(form, there, moments)[0][:2]
+    changes = tuple(y - x for x, y in zip(before, after, strict=True))
+    relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
+    defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
+    return Errors(displacements.T, *relative, scale, is_soft, defects)
 
 
 def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: Pose) -> Pose:
@@ -339,7 +366,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
     return last
 
 
-def _errors_of_joints(form: FrameForm, point: FramePoint) -> Errors:
+def _errors_of_joints(form: FrameForm, point: FramePoint, is_turn_held: bool) -> Errors:
     """The way to the elements between the same nodes by one step of Newton's method."""
     field, scene = form.field, form.scene
     elements = FrameForm.of(scene, ElementCells(field.s))
@@ -347,6 +374,22 @@ def _errors_of_joints(form: FrameForm, point: FramePoint) -> Errors:
     q = jnp.stack([nodes[:, :-1], point.quaternions[:, 1:-1]], axis=2).reshape(4, -1)
     begin = FramePoint(jnp.concatenate([q, nodes[:, -1:]], axis=1), point.end_force, point.total_twist)
     here = elements.linearized(begin)
-    _, rotation, multipliers = factor_and_solve(elements.regular(here.system), -here.gradient, -here.closure)
-    end = elements.moved(begin, here.bases, rotation, elements.force_change(elements.closure(multipliers)))
-    return Errors(elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)), None)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
+    change = elements.force_change(elements.closure(motion.multipliers))
+    end = elements.moved(begin, here.bases, motion.rotation, change)
+    found, better = resultants_of_frames(form, point), resultants_of_frames(elements, end)
+    moments = [better.start_moment - found.start_moment, better.end_moment - found.end_moment]
+    curvature = jnp.max(jnp.abs(better.curvature - found.curvature))
+    forces = elements.forces(end.quaternions, end.end_force)
+    end_changes = [
+        after - before for after, before in zip(elements.end_forces(end), form.end_forces(point), strict=True)
+    ]
+    error = Sizes(longest(jnp.stack(end_changes, axis=1)), longest(jnp.stack(moments, axis=1)), curvature)
+    scale = Sizes(longest(forces), longest(_end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
+    return Errors(
+        elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)),
+        *error.relative_to(scale),
+        scale,
+        is_soft,
+        None,
+    )

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.along import value_at
+from rodjax.along import Value, largest_beside, value_at
 from rodjax.chain import ChainSystem
 from rodjax.discretization.form import FLOOR_SAFETY, Linearization
 from rodjax.discretization.hermite import HermiteElements
@@ -29,7 +29,7 @@ from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import short_sum
 from rodjax.obstacles import Obstacle
 from rodjax.scene import Scene
-from rodjax.supports import Free
+from rodjax.supports import Free, Held
 
 # A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
 PENETRATION = 3e-5
@@ -119,12 +119,20 @@ class TouchingForm(PartedForm):
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
-        return self.radius_at(self.field.s)
+        """At the nodes; of a radius that jumps, the larger one beside the node."""
+        return largest_beside(self._radius, self.field.s)
 
-    def radius_at(self, s: Float[Array, "k"]) -> Float[Array, "k"]:
+    def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
+        """At places in each element, as parts of it."""
+        s = self.field.s
+        begin, end = (jnp.broadcast_to(side[:, None], (len(s) - 1, len(parts))) for side in (s[:-1], s[1:]))
+        return value_at(self._radius, begin + parts[None] * (end - begin), begin, end)
+
+    @property
+    def _radius(self) -> Value:
         radius = self.scene.rod.radius
         assert radius is not None, "a scene with obstacles has a radius"
-        return value_at(radius, s, s, s)
+        return radius
 
     @property
     def stiffness(self) -> Float[Array, ""]:
@@ -147,9 +155,8 @@ class TouchingForm(PartedForm):
         depths = self.radius - jax.vmap(obstacle.at)(positions)
         return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
 
-    def depths_at(self, s: Float[Array, "k"], positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
-        """How far the rod is within the nearest obstacle at arclengths, by its radius there; 0 outside."""
-        radius = self.radius_at(s)
+    def depths_at(self, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
+        """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
 
@@ -223,6 +230,7 @@ class TouchingForm(PartedForm):
             jnp.einsum("ipn,jpn->ijn", cells.softness[None] * cells.along, cells.along),
             second,
             self.is_held,
+            is_backward=not isinstance(self.scene.start, Held),
         )
         return Linearization(
             bases=bases,

@@ -18,6 +18,7 @@ class Status(enum.IntEnum):
     SADDLE = 6
     NOT_PLANAR = 7
     COLLAPSED = 8
+    PASSED_THROUGH = 10
 
     @property
     def message(self) -> str:
@@ -31,6 +32,7 @@ class Status(enum.IntEnum):
             Status.SADDLE: "not converged: an equilibrium was found that is not a minimum, and no way down from it",
             Status.NOT_PLANAR: "not converged: planar is True, but supports, loads or twist leave the plane",
             Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
+            Status.PASSED_THROUGH: "not converged: from its start the rod came through an obstacle, or lies within one",
         }[self]
 
 

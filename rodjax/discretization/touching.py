@@ -26,8 +26,10 @@ from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
+from rodjax.guess import cubic
 from rodjax.linalg import short_sum
-from rodjax.obstacles import Obstacle
+from rodjax.obstacles import Obstacle, least
+from rodjax.passage import PLACES
 from rodjax.scene import Scene
 from rodjax.supports import Free, Held
 
@@ -37,6 +39,14 @@ BENDING = 100.0
 # The most of a contact that counts as it curves, in terms of that which the elements know of: beside one another in a
 # corner each of two obstacles may push as much as both together.
 MOST_CURVING = 2.0
+# A step takes no place deeper than this, in parts of the radius, into an obstacle; one that is there already so much
+# deeper. Its way is looked at at most so often, further on each time by its distance, or so much at least.
+DEEPEST = 0.5
+DEEPER = 0.125
+LEAST_WAY = 0.05
+MOST_LOOKS = 24
+# Places on the line to a held node that the rod does not reach yet.
+BETWEEN = 7
 
 
 class TouchingForm(PartedForm):
@@ -159,6 +169,59 @@ class TouchingForm(PartedForm):
         """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
+
+    def accepts(self, point: MixedPoint, trial: MixedPoint, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+        """Only where all places go straight from one to the other without getting too deep into an obstacle."""
+        before, after = self._looked_at(point), self._looked_at(trial)
+        ways = after - before
+        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        radius = self.radius
+        rim = jnp.append(radius, jnp.repeat(radius[self.held_places[1][1:]], BETWEEN))
+
+        def distances(positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
+            return least(*(jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles))
+
+        first = distances(before)
+        bound = least(DEEPEST * rim, first - DEEPER * rim)
+
+        # No place is nearer than its distance: so far each may go, and is looked at again.
+        def ahead(gone: Float[Array, "k"], gaps: Float[Array, "k"]) -> Float[Array, "k"]:
+            return gone + jnp.maximum(gaps, LEAST_WAY * rim)
+
+        def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            gone, _, count = state
+            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
+            gaps = distances(before + parts[:, None] * ways) - bound
+            return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+            gone, is_blocked, count = state
+            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
+
+        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
+        gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
+        return is_better & ~is_blocked & jnp.all(gone >= lengths)
+
+    def _looked_at(self, point: MixedPoint) -> Float[Array, "k 3"]:
+        """The nodes, and places on what the rod lacks of the way to each held one: else it would pass there."""
+        nodes = self.positions(self.edges(point))
+        _, held = self.held_places
+        lacking = nodes[held[1:]] - nodes[held[1:] - 1]
+        parts = jnp.linspace(0.0, 1.0, BETWEEN + 2, dtype=nodes.dtype)[1:-1]
+        across = nodes[held[1:] - 1][:, None] + parts[None, :, None] * lacking[:, None]
+        return jnp.concatenate([nodes, across.reshape(-1, 3)])
+
+    def places(self, nodes: Float[Array, "n+1 3"], point: MixedPoint) -> tuple[Array, Array, Array]:
+        """At equal steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
+        beside a held node this, elsewhere not a number.
+        """
+        s = self.field.s
+        x = jnp.linspace(0.0, 1.0, PLACES, dtype=s.dtype)
+        points = cubic(s, nodes, self.slopes(point)[:, ::2].T, x)
+        cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
+        radius = value_at(self._radius, x, s[cell], s[cell + 1])
+        beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
+        return points, radius, jnp.where(self.is_held[cell][:, None], nodes[cell], beside)
 
     def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
         return self.stiffness / 2 * jnp.sum(self.depths(positions) ** 2)

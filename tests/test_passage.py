@@ -111,14 +111,12 @@ def turn_about(points: np.ndarray, centre: np.ndarray) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::rodjax.NotConvergedWarning")
 def test_random_heavy_cables_never_come_through_without_a_word():
     scenes, guesses = random_scenes(24)
-    stack = rj.path.stack_scenes(scenes)
-    solve = jax.jit(jax.vmap(lambda scene, points: rj.solve(scene, segments=32, guess=rj.Guess(points))))
-    results = solve(stack, jnp.stack(guesses))
     right = 0
-    for k, (scene, begin) in enumerate(zip(scenes, guesses, strict=True)):
-        result = jax.tree.map(lambda leaf, k=k: leaf[k], results)
+    for scene, begin in zip(scenes, guesses, strict=True):
+        result = rj.solve(scene, segments=32, guess=rj.Guess(begin))
         if not result.converged:
             continue
         pipe, box, _ = scene.obstacles
@@ -132,17 +130,17 @@ def test_random_heavy_cables_never_come_through_without_a_word():
     assert right >= 0.7 * len(scenes)
 
 
-def above_or_not_converged(result: rj.Equilibrium, begin: np.ndarray, axis: rj.obstacles.Obstacle) -> None:
+def above_or_not_converged(result: rj.Equilibrium, axis: rj.obstacles.Obstacle) -> None:
+    """From left to right a rod goes clockwise round what is below it."""
     assert isinstance(axis, rj.Capsule)
-    turn = turn_about(np.asarray(result.nodes), np.asarray(axis.start))
-    assert not result.converged or turn == pytest.approx(turn_about(begin, np.asarray(axis.start)), abs=0.1)
+    assert not result.converged or turn_about(np.asarray(result.nodes), np.asarray(axis.start)) < 0
 
 
 @pytest.mark.filterwarnings("ignore::rodjax.NotConvergedWarning")
 def test_a_slack_heavy_cable_does_not_fall_through_a_pipe():
     """It came back 0.2 below the pipe, and was called converged."""
-    begin = arch(0.19)
-    above_or_not_converged(rj.solve(heavy(0.92, 1000.0, [PIPE]), segments=32, guess=rj.Guess(begin)), begin, PIPE)
+    result = rj.solve(heavy(0.92, 1000.0, [PIPE]), segments=32, guess=rj.Guess(arch(0.19)))
+    above_or_not_converged(result, PIPE)
 
 
 def over_a_pipe(raised: float = 0.0) -> Scene:
@@ -158,7 +156,7 @@ def resting() -> rj.Equilibrium:
 
 
 def test_a_heavy_cable_rests_on_a_pipe(resting):
-    above_or_not_converged(resting, arch(0.2), resting.scene.obstacles[0])
+    above_or_not_converged(resting, resting.scene.obstacles[0])
     distance = rj.clearance(resting, resting.scene.obstacles, points=7).distance[0]
     assert abs(float(distance)) < 0.05 * RADIUS  # between the nodes of a mesh that is given
     assert float(jnp.sum(resting.contact_forces[:, 2])) > 0.3 * 0.94 * 170.0
@@ -183,8 +181,9 @@ def test_a_pipe_that_is_suddenly_above_is_named(resting, tmp_path):
 
 @pytest.mark.slow
 def test_a_step_of_a_path_that_would_come_through_is_parted(resting):
-    scenes = [over_a_pipe(raised) for raised in (0.0, 0.3)]
+    scenes = [over_a_pipe(raised) for raised in (0.0, 0.2)]
     path = rj.solve_path(scenes, segments=32, guess=resting)
+    assert int(path.substeps[1]) > 1
     for k, scene in enumerate(scenes):
         one = jax.tree.map(lambda leaf, k=k: leaf[k], path)
-        above_or_not_converged(one, arch(0.2), scene.obstacles[0])
+        above_or_not_converged(one, scene.obstacles[0])

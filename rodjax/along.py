@@ -178,6 +178,15 @@ def value_at(value: Value, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Floa
     return value.at(s, a, b) if isinstance(value, Along) else jnp.broadcast_to(value, s.shape)
 
 
+def largest_beside(value: Value, s: Float[Array, "k"]) -> Float[Array, "k"]:
+    """A number or `Along` at arclengths one after another; of `Steps` the larger mean on both sides of each."""
+    if not isinstance(value, Steps):
+        return value_at(value, s, s, s)
+    means = value.mean(s[:-1], s[1:])
+    before, beyond = jnp.append(means[:1], means), jnp.append(means, means[-1:])
+    return jnp.where(before > beyond, before, beyond)
+
+
 def stiffness_at(
     value: Value, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Float[Array, "*k"]
 ) -> Float[Array, "*k"]:

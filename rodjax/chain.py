@@ -11,6 +11,8 @@ rotation, force of the element before it and displacement, coupled with those of
     border       border^T theta - compliance y = c
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,8 @@ class ChainSystem(eqx.Module):
 
     `diagonal`, `lower`, `across`: the blocks of H, as in `linalg.SaddlePointSystem`; `by_force`: those of B at start,
     middle and end of each element; `cell_compliance`: C; `stiffness`: S; `held`: the nodes whose place is given. What
-    is no rotation comes as one vector: border, then the nodes, then the elements.
+    is no rotation comes as one vector: border, then the nodes, then the elements. `is_backward`: elimination begins at
+    the end, for a free start: a first node that nothing holds or touches has no pivot.
     """
 
     diagonal: Float[Array, "2 2 m"]
@@ -34,6 +37,21 @@ class ChainSystem(eqx.Module):
     cell_compliance: Float[Array, "3 3 n"]
     stiffness: Float[Array, "n+1 3 3"]
     held: Bool[Array, "n+1"]
+    is_backward: bool = eqx.field(static=True, default=False)
+
+    def mirrored(self) -> "ChainSystem":
+        """The same system of the rod counted from its end: the forces through the elements have the other sign."""
+        return dataclasses.replace(
+            self,
+            diagonal=self.diagonal[..., ::-1],
+            lower=jnp.swapaxes(self.lower, 0, 1)[..., ::-1],
+            across=jnp.swapaxes(self.across, 0, 1)[..., ::-1],
+            border=self.border[..., ::-1],
+            by_force=-self.by_force[:, :, ::-1, ::-1],
+            cell_compliance=self.cell_compliance[..., ::-1],
+            stiffness=self.stiffness[::-1],
+            held=self.held[::-1],
+        )
 
     def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
         """H + shift I in the place of H, with one shift or one for each point."""
@@ -76,7 +94,10 @@ class _Middles(eqx.Module):
 
 
 class ChainFactors(eqx.Module):
-    """The factorisation of a `ChainSystem`; `negative` as in `linalg.Factors`."""
+    """The factorisation of a `ChainSystem`; `negative` as in `linalg.Factors`.
+
+    Where elimination begins at the end, `system` and all else is mirrored.
+    """
 
     system: ChainSystem
     middles: _Middles
@@ -93,12 +114,19 @@ class ChainFactors(eqx.Module):
 
     def solve(self, f: Float[Array, "2 m"], c: Float[Array, "j"]) -> tuple[Float[Array, "2 m"], Float[Array, "j"]]:
         first, nodes, gaps = self.system.parted(c)
+        if self.system.is_backward:
+            f, nodes, gaps = f[:, ::-1], nodes[::-1], -gaps[::-1]
         x, y = self._without_border(f[:, None], nodes[None], gaps[None])
         x, y = x[:, 0], y[0]
         by_border, of_border = self.border_solution
         multipliers = self.complement @ (first - jnp.einsum("ikm,im->k", self.system.border, x))
         x -= jnp.einsum("ikm,k->im", by_border, multipliers)
-        return x, jnp.concatenate([multipliers, y - multipliers @ of_border])
+        y = jnp.concatenate([multipliers, y - multipliers @ of_border])
+        if self.system.is_backward:
+            _, displacements, forces = self.system.parted(y)
+            y = jnp.concatenate([multipliers, displacements[::-1].reshape(-1), -forces[::-1].reshape(-1)])
+            x = x[:, ::-1]
+        return x, y
 
     def _without_border(
         self, f: Float[Array, "2 r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
@@ -141,6 +169,7 @@ class ChainFactors(eqx.Module):
 
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
+    system = system.mirrored() if system.is_backward else system
     n = system.across.shape[-1]
     dtype = system.diagonal.dtype
     middles, coupled, negative = _eliminated(system)

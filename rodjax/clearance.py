@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.along import value_at
+from rodjax.along import largest_beside
 from rodjax.checks import Numbers, instance, whole_number
-from rodjax.obstacles import Obstacle, checked_obstacles, least
+from rodjax.obstacles import Obstacle, checked_obstacles
 from rodjax.result import Equilibrium, over_leading_axes
 from rodjax.rod import Rod
 
@@ -76,8 +76,7 @@ def places(equilibrium: Equilibrium, fractions: Float[Numbers, "p"]) -> Float[Ar
 
 def radius_at(rod: Rod, s: Float[Array, "k"]) -> Float[Array, "k"]:
     """The radius at arclengths one after another; of one that jumps, the larger one beside the place."""
-    before, beyond = (value_at(rod.radius, side, s[:-1], s[1:]) for side in (s[1:], s[:-1]))
-    return -least(-jnp.append(beyond, before[-1]), -jnp.append(beyond[0], before))
+    return largest_beside(rod.radius, s)
 
 
 def _nearest(

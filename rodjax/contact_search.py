@@ -1,8 +1,9 @@
 """Where a rod lies that touches obstacles: Newton's method, with contacts that become stiffer and stiffer.
 
 A rod that begins within an obstacle, or that its loads drive into one, would be thrown about by full contacts. So the
-first ones are soft; each equilibrium is then the start of the next, until the contacts are those of a result. A start
-that touches already begins with stiffer ones, and one that is all but in equilibrium with full ones.
+first ones are soft: all loads together press the rod in by a part of its radius, or as deep as it begins; each
+equilibrium is then the start of the next, until the contacts are those of a result. A start that touches already begins
+with stiffer ones, and one that is all but in equilibrium with full ones.
 """
 
 import equinox as eqx
@@ -11,14 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.mixed import MixedPoint
-from rodjax.discretization.touching import BENDING, TouchingForm
+from rodjax.discretization.touching import PENETRATION, TouchingForm
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium
 from rodjax.status import Outcome, Status
 
-# Into the first contacts a force that bends the rod presses it so deep, in parts of its length; where the start
-# touches, so deep. From there on they become stiffer by STIFFENING at a time.
-FIRST_DEPTH = 0.05
-TOUCHING_DEPTH = 2e-3
+# Into the first contacts all loads together press the rod so deep, in parts of its radius; where the start touches, so
+# deep. From there on they become stiffer by STIFFENING at a time.
+FIRST_DEPTH = 0.3
+TOUCHING_DEPTH = 4e-3
 STIFFENING = 30.0
 # The residual [EI/L^2] of a start that is all but in equilibrium.
 NEAR = 1.0
@@ -38,7 +39,10 @@ def find_touching(form: TouchingForm, point: MixedPoint, solver: Newton, find: F
     deepest = depths.reshape(-1)[jnp.argmax(depths)]
     touches = jnp.any(point.end_force[:, 1:] != point.end_force[:, :-1])
     least = jnp.where(touches, TOUCHING_DEPTH, FIRST_DEPTH)
-    soft = BENDING / (form.stiffness * jnp.where(deepest > least, deepest, least))
+    radius = form.radius
+    thinnest = radius[jnp.argmin(radius)]
+    depth = jnp.where(deepest > least * thinnest, deepest, least * thinnest)
+    soft = PENETRATION * thinnest / depth
     is_near = form.linearized(point).residual <= NEAR
     count = jnp.zeros((), int)
     outcome = Outcome(jnp.zeros_like(soft), count, count, jnp.full((), Status.RUNNING, int))

@@ -28,8 +28,9 @@ from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
-from rodjax.guess import Guess, first_shape
+from rodjax.guess import Guess, first_shape, resampled
 from rodjax.implicit import differentiable, not_differentiated
+from rodjax.passage import PLACES, Before
 from rodjax.plane import check_planar, is_planar, plane
 from rodjax.ranges import check_ranges, with_ranges
 from rodjax.refinement import SAFETY, SIZES, Depth, error_by_rtol, first_size, graded, next_size, shares
@@ -41,6 +42,7 @@ from rodjax.result import (
     SolverState,
     equilibrium,
     estimated_errors,
+    passage_to,
     warn_if_not_converged,
     warn_if_overstretched,
 )
@@ -58,7 +60,7 @@ from rodjax.scene import (
 from rodjax.sliding_search import INNER_TOLERANCE, slid_free
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
-from rodjax.status import Outcome, Status
+from rodjax.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -247,7 +249,35 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         assert isinstance(state.shape, Curve)
         assert isinstance(shape, Curve)
         end_force = _of_elements(end_force, state.shape.s, shape.s)
-    return SolverState(shape, end_force, state.units, state.places)
+    shape, end_force = _on_its_side(coarse, shape, end_force)
+    return SolverState(shape, end_force, state.units, state.places, before=state.before)
+
+
+def _on_its_side(
+    last: Equilibrium, shape: Shape, end_force: Float[Array, "3 *parts"]
+) -> tuple[Shape, Float[Array, "3 *parts"]]:
+    """What a solve on another mesh begins from: where the last one came through an obstacle, what that began from."""
+    state = last.state
+    if state.before is None or not isinstance(shape, Curve):
+        return shape, end_force
+    points = (state.before.points - state.units.origin[None]) / state.units.length
+    begin = Curve.through(resampled(points, 2 * (len(shape.s) - 1))).on(shape.s)
+    is_lost = last.status == Status.PASSED_THROUGH
+    return (
+        jax.tree.map(lambda old, new: jnp.where(is_lost, old, new), begin, shape),
+        jnp.where(is_lost, 0.0, end_force),
+    )
+
+
+def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
+    """Where the rod was when it last was sound; not a number where that is to be the first shape of the search."""
+    if not scene.obstacles:
+        return None
+    last = guess.state.before if isinstance(guess, Equilibrium) else None
+    if last is None:
+        return Before(jnp.full((PLACES, 3), jnp.nan, scene.rod.length.dtype), scene.obstacles)
+    shapes = [jax.tree.map(jnp.shape, obstacles) for obstacles in (last.obstacles, scene.obstacles)]
+    return last if eqx.tree_equal(*shapes) else Before(last.points, scene.obstacles)
 
 
 def _of_elements(
@@ -376,7 +406,8 @@ def first_state(
     """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
     if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
         state = guess.state
-        return SolverState(state.shape, state.end_force, state.units, state.places), guess.total_twist
+        before = _before(scene, guess)
+        return SolverState(state.shape, state.end_force, state.units, state.places, before=before), guess.total_twist
     return _first_state(scene, guess, options)
 
 
@@ -408,13 +439,14 @@ def _first_state(
     no_force = jnp.zeros(force_shape(scene, options.segments), scene.rod.length.dtype)
     if needs_frames(scene):
         return _first_frames(scaled, units, guess, options)
+    before = _before(scene, guess)
     if guess is None:
         no_twist = jnp.zeros_like(no_force[0]) if no_force.ndim == 1 else jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled)), no_twist
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), no_twist
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(units, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled)), guess.total_twist
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), guess.total_twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -426,7 +458,9 @@ def _first_state(
     places = sliding_places(scaled)
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
-    return SolverState(shape, end_force, state.units, places), guess.total_twist
+    if scene.obstacles:
+        shape, end_force = _on_its_side(guess, shape, end_force)
+    return SolverState(shape, end_force, state.units, places, before=before), guess.total_twist
 
 
 def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Float[Array, "3 *others"]:
@@ -520,7 +554,8 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
         search = Search.of(scene, guess, twist, options)
         if isinstance(search.form, TouchingForm):
             assert isinstance(search.point, MixedPoint)
-            return search.found(find_touching(search.form, search.point, solver, options.find))
+            end = find_touching(search.form, search.point, solver, options.find)
+            return _on_one_side(search, search.found(end), guess)
         return search.found(find_equilibrium(search.form, search.point, solver, options.find))
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, twist)
@@ -528,6 +563,28 @@ def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: O
     point = minimum.problem.mixed_point(minimum.point)
     stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
+
+
+def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
+    """Not converged where the rod came through an obstacle on the way, or lies within one."""
+    form, before = search.form, guess.before
+    assert isinstance(form, TouchingForm)
+    assert isinstance(search.point, MixedPoint)
+    assert before is not None
+    nodes = form.nodes(form.edges(search.point))
+    begin, _, _ = form.places(nodes, search.point)
+    begin = guess.units.origin[None] + guess.units.length * begin
+    before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
+    passed, now = passage_to(form, found.point, found.state.shape.nodes, guess.units, before)
+    converged = is_converged(found.outcome.status)
+    status = jnp.where(converged & ~passed.is_sound, Status.PASSED_THROUGH, found.outcome.status)
+    kept = jax.tree.map(lambda new, old: jnp.where(converged & passed.is_sound, new, old), now, before)
+    return eqx.tree_at(
+        lambda found: (found.outcome.status, found.state.before),
+        found,
+        (status, kept),
+        is_leaf=lambda value: value is None,
+    )
 
 
 def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
@@ -597,4 +654,5 @@ def _solve(
 def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
-    return SolverState(shape, state.end_force * (state.units.force / units.force), units, state.places)
+    force = state.end_force * (state.units.force / units.force)
+    return SolverState(shape, force, units, state.places, before=state.before)

@@ -74,6 +74,7 @@ FIELDS = {
     ),
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
+    "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
@@ -109,7 +110,8 @@ FIELDS = {
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
     "scene/clips/*/frame": ("1", "frame that a clip holds, columns d1, d2, t, global axes"),
     **{
-        f"scene/obstacles/*{part}/{name}": (unit, f"{description}, global axes")
+        f"{where}/obstacles/*{part}/{name}": (unit, f"{description}, global axes")
+        for where in ("scene", "state/before")
         for part in ("", "/obstacles/*", "/obstacles/*/obstacles/*")
         for name, unit, description in (
             ("point", "m", "point of the plane of a half space"),

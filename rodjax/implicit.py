@@ -66,10 +66,11 @@ def _change_of_result(scene: Scene, result: Equilibrium, scene_change: Scene) ->
 def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Equilibrium:
     shape = result.state.shape
     outcome = Outcome(result.residual, result.iterations, result.evaluations, result.status)
+    before = result.state.before
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        found = Found(SolverState(shape, point.end_force, units, places), point, outcome, result.stable)
+        found = Found(SolverState(shape, point.end_force, units, places, before=before), point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))

@@ -1,5 +1,6 @@
 """Quasistatic paths: a sequence of scenes, each solved from the last, in one compiled scan."""
 
+import dataclasses
 import functools
 import math
 import typing
@@ -288,7 +289,7 @@ def _predicted(last: _Station, before: _Station, scene: Scene) -> SolverState:
     state = last.state
     shape = state.shape.extrapolated(before.state.shape, ratio)
     force = before.state.end_force * (before.state.units.force / state.units.force)
-    predicted = SolverState(shape, state.end_force + ratio * (state.end_force - force), state.units, state.places)
+    predicted = dataclasses.replace(state, shape=shape, end_force=state.end_force + ratio * (state.end_force - force))
     return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), predicted, state)
 
 

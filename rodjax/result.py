@@ -1,5 +1,6 @@
 """What a solve gives: the equilibrium of a scene, and how far it is to be believed."""
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable
@@ -35,12 +36,14 @@ from rodjax.discretization.framed_results import (
     strains_beside_nodes,
 )
 from rodjax.discretization.hermite import Curve, HermiteElements
-from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import cubic
 from rodjax.linalg import factor
+from rodjax.obstacles import InUnits
+from rodjax.passage import Before, Passage, passage
 from rodjax.scene import Scene, has_potential, nondimensional, slid, slides
 from rodjax.sliding import slide
 from rodjax.stability import examined
@@ -52,6 +55,8 @@ from rodjax.vectors import dot, root
 MOST_PENETRATION = 1e-4
 # Beyond this |axial strain| a cable or hose is damaged, and stiffnesses that are constant are no longer those it has.
 DEFAULT_STRAIN_LIMIT = 0.05
+# Of several rods that came through obstacles, so many are named.
+MOST_NAMED = 3
 
 
 class NotConvergedWarning(UserWarning):
@@ -69,7 +74,8 @@ class SolverState(eqx.Module):
     are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
     with the forces of the clips beyond it, with obstacles one for each segment, with those of clips and contacts;
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
-    `clip_moments`: in the continuum, where no mesh gives them.
+    `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
+    was when it last was sound: a solve that begins here is judged by it.
     """
 
     shape: Shape
@@ -77,6 +83,7 @@ class SolverState(eqx.Module):
     units: Units
     places: Float[Array, "... slides"] | None = None
     clip_moments: Float[Array, "... clips 3"] | None = None
+    before: Before | None = None
 
 
 class Equilibrium(eqx.Module):
@@ -271,7 +278,7 @@ def equilibrium(
         substeps=substeps,
         residual=outcome.residual,
         scene=scene,
-        state=SolverState(found.state.shape, found.state.end_force, units, found.state.places),
+        state=dataclasses.replace(found.state, units=units),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
     )
 
@@ -488,12 +495,52 @@ def _largest_strain(equilibrium: Equilibrium) -> str:
 
 def _outcome(equilibrium: Equilibrium) -> str:
     codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
+    messages = {code: Status(code).message for code in codes}
+    if Status.PASSED_THROUGH in messages:
+        messages[Status.PASSED_THROUGH] += _passages(equilibrium)
     if equilibrium.status.ndim == 0:
         return (
-            f"{Status(codes[0]).message}; residual {float(equilibrium.residual):.1e} EI/L^2 "
+            f"{messages[codes[0]]}; residual {float(equilibrium.residual):.1e} EI/L^2 "
             f"after {int(equilibrium.iterations)} iterations"
         )
-    return "\n".join(f"{count} {Status(code).message}" for code, count in zip(codes, counts, strict=True))
+    return "\n".join(f"{count} {messages[code]}" for code, count in zip(codes, counts, strict=True))
+
+
+def _passages(equilibrium: Equilibrium) -> str:
+    """Which obstacles those that came through one did, and where."""
+    found = _passage_of(equilibrium)
+    passed = np.argwhere((np.asarray(equilibrium.status) == Status.PASSED_THROUGH) & ~np.asarray(found.is_sound))
+    named = []
+    for index in map(tuple, passed[:MOST_NAMED]):
+        k, length = int(found.obstacle[index]), float(equilibrium.scene.rod.length[index])
+        how = "within" if found.is_within[index] else "through"
+        which = f"{list(map(int, index))}: " if index else ""
+        kind = type(equilibrium.scene.obstacles[k]).__name__
+        named.append(f"{which}{how} obstacles[{k}] ({kind}) at s = {float(found.place[index]) * length:.4g} m")
+    more = [f"and {len(passed) - MOST_NAMED} more"] if len(passed) > MOST_NAMED else []
+    return "".join(f" ({part})" for part in [", ".join([*named, *more])] if part)
+
+
+@over_leading_axes
+def _passage_of(equilibrium: Equilibrium) -> Passage:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    state = equilibrium.state
+    if state.before is None:  # of a file of an earlier version
+        return Passage(jnp.full((), -1), jnp.full_like(equilibrium.residual, jnp.nan), jnp.array(False))
+    found, _ = passage_to(form, point, state.shape.nodes, state.units, state.before)
+    return found
+
+
+def passage_to(
+    form: TouchingForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], units: Units, before: Before
+) -> tuple[Passage, Before]:
+    """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
+    points, radius, held = form.places(nodes, point)
+    points, held = (units.origin[None] + units.length * place for place in (points, held))
+    obstacles = tuple(obstacle.obstacle for obstacle in form.scene.obstacles if isinstance(obstacle, InUnits))
+    found = passage(before, points, obstacles, units.length * radius, held)
+    return found, Before(points, obstacles)
 
 
 def warn_if_not_converged(equilibrium: Equilibrium) -> None:

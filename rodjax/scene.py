@@ -43,8 +43,10 @@ class Scene(eqx.Module):
         the nodes of the mesh. There all loads together press it in by 3e-5 of its radius. A mesh that is chosen for a
         tolerance is one whose elements lie no deeper than 1e-4 of the radius between their nodes either. Where the rod
         is jammed, or bent over an edge, it may lie deeper, as on a mesh that is given: `rodjax.describe` says so, and
-        `rodjax.clearance` tells where. Where no obstacle touches the rod they only cost time: to see how far it is from
-        what it stays away from, `rodjax.clearance` needs none in the scene. Double precision only.
+        `rodjax.clearance` tells where. A rod that came through an obstacle since its guess or the last step of its
+        path, or whose centerline lies within one, is not converged. Where no obstacle touches the rod they only cost
+        time: to see how far it is from what it stays away from, `rodjax.clearance` needs none in the scene. Double
+        precision only.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart

@@ -22,6 +22,7 @@ class Status(enum.IntEnum):
     NOT_PLANAR = 7
     COLLAPSED = 8
     OVERSTRETCHED = 9
+    PASSED_THROUGH = 10
     OUT_OF_RANGE = 12
 
     @property
@@ -39,6 +40,7 @@ class Status(enum.IntEnum):
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
             Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
             "positive or an arclength beyond the rod",
+            Status.PASSED_THROUGH: "not converged: from its start the rod came through an obstacle, or lies within one",
         }[self]
 
 

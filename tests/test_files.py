@@ -47,6 +47,7 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, point_data, save
+from rodjax.passage import Before
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
 CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))
@@ -304,7 +305,8 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     touching = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, obstacles=obstacles)
     scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped, touching]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
-    state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1])
+    before = Before(single.nodes, touching.obstacles)
+    state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1], before=before)
     results.append(dataclasses.replace(single, state=state))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")

@@ -286,12 +286,13 @@ def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n
     beside a held place so much more than it is held there.
     """
     s, nodes = form.field.s, form.positions(form.edges(point))
-    held = jnp.where(form.is_held, form.depths_at(s, nodes), 0.0)
+    at_nodes = form.depths_at(nodes, form.radius)
+    held = jnp.where(form.is_held, at_nodes, 0.0)
     parts = jnp.array(DEPTH_PLACES, s.dtype)
     places = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
     positions = positions_between(form, point, nodes, places.reshape(-1))
-    between = form.depths_at(places.reshape(-1), positions).reshape(places.shape)
-    at_ends = jnp.where(form.is_held, 0.0, form.depths_at(s, nodes))
+    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(places.shape)
+    at_ends = jnp.where(form.is_held, 0.0, at_nodes)
     depths = jnp.concatenate(
         [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1
     )

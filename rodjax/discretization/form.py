@@ -100,6 +100,10 @@ class Form(eqx.Module):
     ) -> Any:
         """The point turned by rotations in its bases, and under another force."""
 
+    def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+        """Whether a step goes from a point to another, which is better or not judged."""
+        return is_better
+
     @abstractmethod
     def linearized(self, point: Any) -> Linearization: ...
 

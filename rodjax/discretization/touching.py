@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.along import value_at
+from rodjax.along import Value, largest_beside, value_at
 from rodjax.chain import ChainSystem
 from rodjax.discretization.form import FLOOR_SAFETY, Linearization
 from rodjax.discretization.hermite import HermiteElements
@@ -26,10 +26,12 @@ from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
+from rodjax.guess import cubic
 from rodjax.linalg import short_sum
-from rodjax.obstacles import Obstacle
+from rodjax.obstacles import Obstacle, least
+from rodjax.passage import PLACES
 from rodjax.scene import Scene
-from rodjax.supports import Free
+from rodjax.supports import Free, Held
 
 # A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
 PENETRATION = 3e-5
@@ -37,6 +39,14 @@ BENDING = 100.0
 # The most of a contact that counts as it curves, in terms of that which the elements know of: beside one another in a
 # corner each of two obstacles may push as much as both together.
 MOST_CURVING = 2.0
+# A step takes no place deeper than this, in parts of the radius, into an obstacle; one that is there already so much
+# deeper. Its way is looked at at most so often, further on each time by its distance, or so much at least.
+DEEPEST = 0.5
+DEEPER = 0.125
+LEAST_WAY = 0.05
+MOST_LOOKS = 24
+# Places on the line to a held node that the rod does not reach yet.
+BETWEEN = 7
 
 
 class TouchingForm(PartedForm):
@@ -119,12 +129,20 @@ class TouchingForm(PartedForm):
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
-        return self.radius_at(self.field.s)
+        """At the nodes; of a radius that jumps, the larger one beside the node."""
+        return largest_beside(self._radius, self.field.s)
 
-    def radius_at(self, s: Float[Array, "k"]) -> Float[Array, "k"]:
+    def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
+        """At places in each element, as parts of it."""
+        s = self.field.s
+        begin, end = (jnp.broadcast_to(side[:, None], (len(s) - 1, len(parts))) for side in (s[:-1], s[1:]))
+        return value_at(self._radius, begin + parts[None] * (end - begin), begin, end)
+
+    @property
+    def _radius(self) -> Value:
         radius = self.scene.rod.radius
         assert radius is not None, "a scene with obstacles has a radius"
-        return value_at(radius, s, s, s)
+        return radius
 
     @property
     def stiffness(self) -> Float[Array, ""]:
@@ -147,11 +165,63 @@ class TouchingForm(PartedForm):
         depths = self.radius - jax.vmap(obstacle.at)(positions)
         return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
 
-    def depths_at(self, s: Float[Array, "k"], positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
-        """How far the rod is within the nearest obstacle at arclengths, by its radius there; 0 outside."""
-        radius = self.radius_at(s)
+    def depths_at(self, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
+        """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
+
+    def accepts(self, point: MixedPoint, trial: MixedPoint, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+        """Only where all places go straight from one to the other without getting too deep into an obstacle."""
+        before, after = self._looked_at(point), self._looked_at(trial)
+        ways = after - before
+        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        radius = self.radius
+        rim = jnp.append(radius, jnp.repeat(radius[self.held_places[1][1:]], BETWEEN))
+
+        def distances(positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
+            return least(*(jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles))
+
+        first = distances(before)
+        bound = least(DEEPEST * rim, first - DEEPER * rim)
+
+        # No place is nearer than its distance: so far each may go, and is looked at again.
+        def ahead(gone: Float[Array, "k"], gaps: Float[Array, "k"]) -> Float[Array, "k"]:
+            return gone + jnp.maximum(gaps, LEAST_WAY * rim)
+
+        def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            gone, _, count = state
+            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
+            gaps = distances(before + parts[:, None] * ways) - bound
+            return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+            gone, is_blocked, count = state
+            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
+
+        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
+        gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
+        return is_better & ~is_blocked & jnp.all(gone >= lengths)
+
+    def _looked_at(self, point: MixedPoint) -> Float[Array, "k 3"]:
+        """The nodes, and places on what the rod lacks of the way to each held one: else it would pass there."""
+        nodes = self.positions(self.edges(point))
+        _, held = self.held_places
+        lacking = nodes[held[1:]] - nodes[held[1:] - 1]
+        parts = jnp.linspace(0.0, 1.0, BETWEEN + 2, dtype=nodes.dtype)[1:-1]
+        across = nodes[held[1:] - 1][:, None] + parts[None, :, None] * lacking[:, None]
+        return jnp.concatenate([nodes, across.reshape(-1, 3)])
+
+    def places(self, nodes: Float[Array, "n+1 3"], point: MixedPoint) -> tuple[Array, Array, Array]:
+        """At equal steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
+        beside a held node this, elsewhere not a number.
+        """
+        s = self.field.s
+        x = jnp.linspace(0.0, 1.0, PLACES, dtype=s.dtype)
+        points = cubic(s, nodes, self.slopes(point)[:, ::2].T, x)
+        cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
+        radius = value_at(self._radius, x, s[cell], s[cell + 1])
+        beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
+        return points, radius, jnp.where(self.is_held[cell][:, None], nodes[cell], beside)
 
     def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
         return self.stiffness / 2 * jnp.sum(self.depths(positions) ** 2)
@@ -223,6 +293,7 @@ class TouchingForm(PartedForm):
             jnp.einsum("ipn,jpn->ijn", cells.softness[None] * cells.along, cells.along),
             second,
             self.is_held,
+            is_backward=not isinstance(self.scene.start, Held),
         )
         return Linearization(
             bases=bases,

@@ -141,7 +141,7 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
     state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
     return jax.lax.cond(
-        state.restart | state.is_pushed | (merit <= bound),
+        state.restart | form.accepts(state.point, trial, state.is_pushed | (merit <= bound)),
         lambda: _advanced(form, state, trial, linearization, solver, find),
         lambda: _shortened(form, state, find),
     )

@@ -140,7 +140,9 @@ class SpaceCurve(eqx.Module):
             size = jnp.sqrt(jnp.sum(first**2))
             if is_known(size) and not float(size) > 1e-6:
                 if d2 is DEFAULT_D2:
-                    raise ValueError("d2 must be given: its default (0, 1, 0) is parallel to the first tangent")
+                    raise ValueError(
+                        "d2 must not be parallel to the first tangent, as its default (0, 1, 0) is: give d2"
+                    )
                 raise ValueError(f"d2 must not be parallel to the first tangent, got {d2}")
             d1 = _carried(first / size, tangents)
         return SpaceCurve(points, s / s[-1], d1.T), s[-1]

@@ -188,7 +188,9 @@ def frame(tangent: Any, d2: Any = DEFAULT_D2) -> Float[Array, "3 3"]:
     # Below this the direction of d2 is mostly rounding of the input.
     if is_known(length) and not length > 1e-6:
         if is_default:
-            raise ValueError(f"d2 must be given: its default (0, 1, 0) is parallel to the tangent, got tangent = {t}")
+            raise ValueError(
+                f"d2 must not be parallel to the tangent, as its default (0, 1, 0) is: give d2, got tangent = {t}"
+            )
         raise ValueError(f"d2 must not be parallel to the tangent, got d2 = {d2} and tangent = {t}")
     d2 = across / length
     return leaf(xp.stack([xp.cross(d2, t), d2, t], axis=-1))

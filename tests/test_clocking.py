@@ -296,10 +296,12 @@ def test_the_command_says_what_was_fitted(tmp_path, capsys):
 
 
 def test_a_default_d2_is_not_spoken_of_as_given():
-    with pytest.raises(ValueError, match=r"d2 must be given: its default \(0, 1, 0\) is parallel to the tangent"):
+    with pytest.raises(
+        ValueError, match=r"parallel to the tangent, as its default \(0, 1, 0\) is: give d2, got tangent"
+    ):
         rj.frame((0, 1, 0))
     with pytest.raises(ValueError, match="d2 must not be parallel to the tangent, got d2 = "):
         rj.frame((0, 1, 0), (0.0, 2.0, 0.0))
     points = [(0, 0, 0), (0, 1, 0), (0, 2, 0), (0, 3, 0)]
-    with pytest.raises(ValueError, match=r"d2 must be given: its default \(0, 1, 0\) is parallel to the first tangent"):
+    with pytest.raises(ValueError, match=r"parallel to the first tangent, as its default \(0, 1, 0\) is: give d2"):
         rj.Rod.from_centerline(points, 1.0, 1.0, 1.0)

@@ -283,6 +283,9 @@ def found(reported, files, monkeypatch):
             verified=result,
             margins=margins,
             objective=0.62,
+            optimal=asked.get("feasible", True),
+            gain=1e-8,
+            multipliers={"bend radius": 0.05},
             names=names,
             units=tuple(unit for variable in variables for unit in variable.units()),
             numbers=np.linspace(0.1, 0.2, len(names)),
@@ -293,10 +296,12 @@ def found(reported, files, monkeypatch):
                 objective=np.array([0.7, np.inf]),
                 violation=np.array([0.0, 0.25]),
                 feasible=np.array([True, False]),
+                gain=np.array([1e-8, np.inf]),
+                optimal=np.array([True, False]),
                 iterations=np.array([3, 4]),
                 solves=np.array([5, 6]),
                 violated=("", "bend radius by 25 %"),
-                message=("Optimization terminated successfully", "Iteration limit reached"),
+                message=("optimal to first order", "limit of iterations reached"),
             ),
             solves=11,
             with_gradients=9,
@@ -316,8 +321,10 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     assert found["names"] == ("floor", "pipe", "bracket")
     assert found["segments"] is None
     assert out.startswith("A route that keeps to all limits, with the objective 0.62: 1 of 2 starts came to one.")
+    assert "It is optimal to first order: " in out
+    assert "held by bend radius (0.0005 for 1 %)" in out
     assert re.search(r"clips\.0\.at +100 mm\n", out)
-    assert re.search(r"1 +inf +4 +6  fails in bend radius by 25 %; Iteration limit reached\n", out)
+    assert re.search(r"1 +inf +4 +6  fails in bend radius by 25 %; limit of iterations reached\n", out)
     assert "Change of each margin by the design variables:" in out
     names = [*FILES, "route.json", "result.vtkhdf", "scene.toml"]
     assert out.endswith(f"written: {', '.join(f'out/{name}' for name in names)}\n")
@@ -327,6 +334,9 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
 
     told = json.loads((files / "out" / "route.json").read_text(), parse_constant=refuse)
     assert told["feasible"] is True
+    assert told["optimal"] is True
+    assert told["multipliers"] == {"bend radius": 0.05}
+    assert [start["optimal"] for start in told["starts"]] == [True, False]
     assert told["values"] == {"clips.0.at": 0.2, "clips.0.position": [0, 0, 0]}
     assert told["starts"][1]["objective"] is None
     assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m"}

@@ -141,22 +141,57 @@ def test_a_cable_in_clips_beside_a_monte_carlo():
 
 
 @pytest.mark.slow
-def test_a_column_near_buckling_is_flagged():
+def test_a_column_near_buckling_is_flagged_and_sampled():
     """Between clamps it buckles at 4 pi^2 EI/L^2; a small side force keeps the bow to one side."""
     rod = Rod(1.0, 1.0, 1.0, EA)
+    sigma = 4e-5
 
-    def flags(part: float, **options) -> dict[str, str]:
+    def column(part: float, moment: float, **options) -> rj.Envelope:
         end = Clamp((1 - part * 4 * np.pi**2 / EA, 0, 0), LEVEL)
         scene = Scene(rod, Clamp(ORIGIN, LEVEL), end, point_forces=[PointForce(0.5, (0, 0, 0.005))])
-        return rj.tolerances(rj.solve(scene, segments=8), [Tolerance("end.position.0", 4e-5)], **options).flags
+        result = rj.solve(scene, segments=8)
+        return rj.tolerances(result, [Tolerance("end.position.0", sigma)], limits=Limits(end_moment=moment), **options)
 
-    assert flags(0.5) == flags(0.5, samples=1000) == {}
+    half, sampled = column(0.5, 1.0), column(0.5, 1.0, samples=1000)
+    assert half.flags == sampled.flags == {}
+    assert half.sampled is None
+    assert half.scatter is half.first_order
     # The stiffness of the bow would vanish within 2.5 standard deviations of the thrust, and its height, as of any bow
     # near the load that buckles, grows by more than in proportion.
-    for options in ({}, {"samples": 1000}):
-        near = flags(0.98, **options)
-        assert "near instability" in near["rod"]
-        assert "standard deviation by solves" in near["centerline"]
+    few = column(0.98, 1.0, samples=0)
+    assert few.margins is not None
+    assert "near instability" in few.flags["rod"]
+    assert "standard deviation by solves" in few.flags["centerline"]
+    assert few.sampled is None
+    assert not few.is_certain
+    assert str(few).startswith("To first order, which does NOT hold for rod")
+    # A limit that by the first order is broken once in 160: at 2.5 deviations.
+    limit = float(few.margins.value[0] + 2.5 * few.first_order.deviation[0])
+    found = column(0.98, limit)
+    assert found.sampled is not None
+    assert found.samples == 2000
+    assert found.scatter is found.sampled
+    np.testing.assert_allclose(found.first_order.probability, stats.norm.sf(2.5), rtol=1e-6)
+    # The moment grows with the thrust alone: the thrust at which it is at the limit tells the probability.
+    z = np.linspace(-3, 3, 16)
+    end = 1 - 0.98 * 4 * np.pi**2 / EA + sigma * z
+    nominal = Scene(
+        rod, Clamp(ORIGIN, LEVEL), Clamp((end[8], 0, 0), LEVEL), point_forces=[PointForce(0.5, (0, 0, 0.005))]
+    )
+    scenes = [eqx.tree_at(lambda s: s.end.position, nominal, jax.numpy.array([x, 0.0, 0.0])) for x in end]
+    rods = solve_batch(scenes, segments=8)
+    moments = np.linalg.norm(rods.start_moment, axis=1)
+    assert np.all(np.diff(moments) < 0)
+    expected = stats.norm.cdf(np.interp(limit, moments[::-1], z[::-1]))
+    assert expected > 5 * stats.norm.sf(2.5)
+    # Four standard errors of 2000 samples.
+    error = 4 * np.sqrt(expected * (1 - expected) / 2000)
+    np.testing.assert_allclose(found.scatter.probability, expected, atol=error)
+    np.testing.assert_allclose(found.scatter.any_broken, expected, atol=error)
+    first, line = str(found).splitlines()[:2]
+    assert first.startswith("By 2000 samples, as the first order does not hold for ")
+    assert f"broken with probability {found.sampled.probability[0]:.2g}; to first order, which does not hold," in line
+    assert "standard deviation by solves" in column(0.98, limit, samples=1000).flags["centerline"]
 
 
 @pytest.mark.parametrize(

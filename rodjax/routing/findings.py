@@ -30,6 +30,7 @@ class Gradients(NamedTuple):
     - `variables`: names, `units`: of their values (v,)
     - `margins`: names, as of `rodjax.Margins`
     - `derivatives` (m, v): of each relative margin by each variable, by its unit
+    - `remark`: told beside them; of a route whether it is an optimum, and what holds it
     """
 
     variables: tuple[str, ...]
@@ -37,6 +38,7 @@ class Gradients(NamedTuple):
     values: Float[np.ndarray, "v"]
     margins: tuple[str, ...]
     derivatives: Float[np.ndarray, "m v"]
+    remark: str = ""
 
     @staticmethod
     def of(route: Route) -> "Gradients":
@@ -44,7 +46,7 @@ class Gradients(NamedTuple):
         margins = tuple(name for name in route.gradients if name != "objective")
         rows = [np.asarray(route.gradients[name]) for name in margins]
         derivatives = np.reshape(rows, (len(rows), len(route.names)))
-        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives)
+        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives, route.optimality)
 
 
 class Fact(NamedTuple):

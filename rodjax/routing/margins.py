@@ -1,5 +1,6 @@
 """By how much a rod at rest keeps to limits: of each limit the value that decides, where it is, and its margin."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,15 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rodjax.along import Value, value_at
 from rodjax.checks import instance, sequence
 from rodjax.clearance import POINTS, places, radius_at
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.modes import lowest_mode
-from rodjax.obstacles import Obstacle, checked_obstacles, least
+from rodjax.obstacles import Obstacle, checked_obstacles
 from rodjax.result import Equilibrium, beside_nodes, over_leading_axes
 from rodjax.routing.limits import Limits
 from rodjax.vectors import dot, root
+
+# Steps of the secant method towards the nearest place of a piece of the rod.
+NEARER = 6
 
 
 class Margins(eqx.Module):
@@ -51,7 +56,7 @@ class Margins(eqx.Module):
 
 
 class Measured(eqx.Module):
-    """What a limit is compared with, where it decides in each of w parts of the rod, or at w = 1 place.
+    """What a limit is compared with: at each of w places of the rod, or at w = 1, the worst.
 
     `slack`: smooth, of order 1 and not negative where the limit is kept, for optimisers. `obstacle`: the number of
     the one whose clearance it is.
@@ -84,13 +89,13 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     - `obstacles`: a list of `Obstacle`, from which `limits.clearance` is kept.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
 
-    Each is that of the worst place. Clearance is looked for at the nodes and four places between two of them, and where
-    a parabola through the worst of these and those beside it is lowest; curvature at the nodes, on both
-    sides of them and between them where the mesh is of elements whose tangents are the unknowns, else at the nodes;
+    Each is that of the worst place. Clearance is that of the nearest place of the rod, looked for between each two of
+    the nodes and four places between two nodes; curvature is looked at on both sides of the nodes and at four places
+    between two of them where the mesh is of elements whose tangents are the unknowns, else at the nodes;
     twist and strain at the nodes, the strain at a clip the mean of both sides. Of rods in clips whose frames are the
     unknowns, curvature, twist and strain on both sides of the nodes.
 
-    Derivatives are those of the worst place, which stays at the same part of the mesh, by numbers of the scene, the
+    Derivatives are those of the worst place, held at its fraction of the mesh, by numbers of the scene, the
     limits and the obstacles; of a straight rod, that of the bend radius is 0.
 
     Raises `ValueError` or `TypeError` for a limit that asks for what the scene has not: a radius, clips, obstacles, for
@@ -98,7 +103,7 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     obstacles, names = checked(equilibrium, limits, obstacles, names)
-    found = _margins(equilibrium, limits, obstacles)
+    found = measured_margins(equilibrium, limits, obstacles)
     labels = [each.name if each.obstacle is None else f"clearance to {names[each.obstacle]}" for each in found]
     value, limit, margin, s = (
         jnp.concatenate(rows, axis=-1)
@@ -144,20 +149,23 @@ def checked(subject: Any, limits: Limits, obstacles: Any, names: Any) -> tuple[t
 
 
 @over_leading_axes
-def _margins(equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...]) -> list[Measured]:
+def measured_margins(equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...]) -> list[Measured]:
+    """Of each limit the worst."""
     return measured(equilibrium, limits, obstacles)
 
 
 def measured(
-    equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...], windows: int = 1
+    equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...], everywhere: bool = False
 ) -> list[Measured]:
-    """What the limits of an equilibrium are compared with; what is so all along it, in equal parts of its mesh."""
+    """What the limits of an equilibrium are compared with; `everywhere`: limits along the rod at every place looked
+    at, of clearances at the nearest place of every piece between two of these, in place of the worst alone.
+    """
     scene = equilibrium.scene
     found = []
     if limits.bend_radius is not None:
-        found.append(_bend_radius(equilibrium, limits.bend_radius, windows))
+        found.append(_bend_radius(equilibrium, limits.bend_radius, everywhere))
     if limits.clearance is not None:
-        found += _clearances(equilibrium, limits.clearance, obstacles, windows)
+        found += _clearances(equilibrium, limits.clearance, obstacles, everywhere)
     for unit, limit, of_clips in (
         ("N", limits.clip_force, "clip_forces"),
         ("N m", limits.clip_moment, "clip_moments"),
@@ -180,7 +188,7 @@ def measured(
         ("strain", "", limits.strain, along.axial_strain),
     ):
         if limit is not None:
-            found.append(_largest(name, unit, values, limit, along.s, windows))
+            found.append(_largest(name, unit, values, limit, along.s, everywhere))
     if limits.stability is not None:
         stiffness = lowest_mode(equilibrium).stiffness
         unit = limits.stability + scene.rod.bending_scale / scene.rod.length**2
@@ -217,15 +225,15 @@ def _size(name: str, unit: str, vector: Float[Array, "3"], limit: Float[Array, "
 
 
 def _largest(
-    name: str, unit: str, values: Float[Array, "k"], limit: Float[Array, ""], s: Float[Array, "k"], windows: int
+    name: str, unit: str, values: Float[Array, "k"], limit: Float[Array, ""], s: Float[Array, "k"], everywhere: bool
 ) -> Measured:
-    at = _least_in(windows, -jax.lax.stop_gradient(jnp.abs(values)))
+    at = _decisive(-jax.lax.stop_gradient(jnp.abs(values)), everywhere)
     chosen = values[at]
     limits = jnp.broadcast_to(limit.astype(chosen.dtype), chosen.shape)
     return Measured(name, unit, False, jnp.abs(chosen), limits, 1 - (chosen / limits) ** 2, s[at])
 
 
-def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: int) -> Measured:
+def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], everywhere: bool) -> Measured:
     is_of_elements = isinstance(equilibrium.state.shape, Curve)
     s = _both_sides(equilibrium) if is_of_elements else _along(equilibrium)[0]
     radius = radius_at(equilibrium.scene.rod, s)
@@ -234,9 +242,12 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], windows: 
     def curvature_at(equilibrium: Equilibrium, at: Int[Array, "w"]) -> Float[Array, "w"]:
         return _curvature(equilibrium, s[at]) if is_of_elements else _along(equilibrium)[1][at]
 
-    # The search needs no derivatives.
-    curvature = curvature_at(jax.lax.stop_gradient(equilibrium), jnp.arange(len(s)))
-    at = _least_in(windows, jax.lax.stop_gradient(1 - curvature * (limit + radius)))
+    if everywhere:
+        at = jnp.arange(len(s))
+    else:
+        # The search needs no derivatives.
+        curvature = curvature_at(jax.lax.stop_gradient(equilibrium), jnp.arange(len(s)))
+        at = _decisive(jax.lax.stop_gradient(1 - curvature * (limit + radius)), False)
     curvature, radius, limit = curvature_at(equilibrium, at), radius[at], limit[at]
     # What is left of its curvature is rounding, or what the solver left.
     is_straight = curvature * equilibrium.scene.rod.length <= float(jnp.finfo(curvature.dtype).eps) ** 0.5
@@ -274,56 +285,76 @@ def _curvature(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "
 
 
 def _clearances(
-    equilibrium: Equilibrium, limit: Float[Array, "..."], obstacles: tuple[Obstacle, ...], windows: int
+    equilibrium: Equilibrium, limit: Float[Array, "..."], obstacles: tuple[Obstacle, ...], everywhere: bool
 ) -> list[Measured]:
-    s = places(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
-    radius = radius_at(equilibrium.scene.rod, s)
-    limits = jnp.broadcast_to(limit.astype(radius.dtype), (len(obstacles),))
-    # The search needs no derivatives.
-    fixed, fixed_s, fixed_radius, bodies = jax.lax.stop_gradient((equilibrium, s, radius, obstacles))
-    positions = fixed.position_at(fixed_s)
-    at = jnp.stack([_least_in(windows, body.distance(positions) - fixed_radius) for body in bodies])
-    # The worst of the places looked at with those beside it, also beyond its part of the rod, and the lowest place of
-    # the parabola through the three: where the next place becomes the worst one, it stays.
-    near = jnp.clip(at, 1, len(s) - 2)[..., None] + jnp.arange(-1, 2)[None, None]
-    points = equilibrium.position_at(s[near.reshape(-1)]).reshape(*near.shape, 3)
-    values = jnp.stack([jax.vmap(jax.vmap(body.at))(points[k]) for k, body in enumerate(obstacles)]) - radius[near]
-    lowest = jax.vmap(jax.vmap(_lowest))(s[near], values)
-    low_points = equilibrium.position_at(lowest.reshape(-1)).reshape(*at.shape, 3)
+    edges = places(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
+    limits = jnp.broadcast_to(limit.astype(edges.dtype), (len(obstacles),))
+    # The search needs no derivatives: where the distance is least along the rod, its derivative by the place is 0.
+    fixed, fixed_edges, bodies = jax.lax.stop_gradient((equilibrium, edges, obstacles))
+    curve = jax.jvp(fixed.position_at, (fixed_edges,), (jnp.ones_like(edges),))
+    radius = fixed.scene.rod.radius
 
     def to(number: int, obstacle: Obstacle) -> Measured:
-        here = at[number]
-        worst = jnp.take_along_axis(values[number], (here - near[number, :, 0])[:, None], axis=1)[:, 0]
-        low = jax.vmap(obstacle.at)(low_points[number]) - radius[here]
-        distance = least(worst, low)
-        place = jnp.where(low < worst, lowest[number], s[here])
+        fraction, gap = _nearest_in_pieces(bodies[number], radius, fixed_edges, fixed.position_at, *curve)
+        at = _decisive(gap, everywhere)
+        a, b, fraction = edges[at], edges[at + 1], fraction[at]
+        s = a + fraction * (b - a)
+        radii = value_at(equilibrium.scene.rod.radius, s, a, b)
+        distance = obstacle.distance(equilibrium.position_at(s)) - radii
         limit = jnp.broadcast_to(limits[number], distance.shape)
-        slack = (distance - limit) / (2 * radius[here])
-        return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, place, number)
+        slack = (distance - limit) / (2 * radii)
+        return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, s, number)
 
     return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
 
 
-def _lowest(s: Float[Array, "3"], values: Float[Array, "3"]) -> Float[Array, ""]:
-    """The lowest place between three of the parabola through their values; the middle one where it has none."""
-    a, b = s[1] - s[0], s[2] - s[1]
-    rise, fall = values[0] - values[1], values[2] - values[1]
-    bend = a * fall + b * rise
-    has_lowest = bend > 0
-    shift = (b * b * rise - a * a * fall) / (2 * jnp.where(has_lowest, bend, 1.0))
-    return jnp.where(has_lowest, jnp.clip(s[1] + shift, s[0], s[2]), s[1])
+def _nearest_in_pieces(
+    body: Obstacle,
+    radius: Value,
+    edges: Float[Array, "k+1"],
+    position_at: Callable[[Float[Array, "k"]], Float[Array, "k 3"]],
+    positions: Float[Array, "k+1 3"],
+    slopes: Float[Array, "k+1 3"],
+) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+    """Where each piece of a rod between two arclengths is nearest to a body, as a fraction of the piece, and how near.
+
+    Where the distance falls at its start and rises at its end, its least is where the derivative is 0, found by the
+    secant method within a bracket; else it is that of the nearer end.
+    """
+    a, b = edges[:-1], edges[1:]
+    h = b - a
+    radii = value_at(radius, a, a, b), value_at(radius, b, a, b)
+    taper = (radii[1] - radii[0]) / h
+
+    def gap(points: Float[Array, "m 3"], along: Float[Array, "m 3"]) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
+        return jax.jvp(body.distance, (points,), (along,))
+
+    distance, rate = gap(positions, slopes)
+    ends = distance[:-1] - radii[0], distance[1:] - radii[1]
+    falls, rises = rate[:-1] - taper, rate[1:] - taper
+    has_least = (falls < 0) & (rises > 0)
+
+    def closer(_: Any, state: tuple[Float[Array, "k"], ...]) -> tuple[Float[Array, "k"], ...]:
+        low, high, before, rate_before, f, rate = state
+        low, high = jnp.where(rate < 0, f, low), jnp.where(rate < 0, high, f)
+        change = rate - rate_before
+        ahead = f - rate * (f - before) / jnp.where(change == 0, 1.0, change)
+        ahead = jnp.where((ahead > low) & (ahead < high), ahead, (low + high) / 2)
+        # Where the derivative is 0 already, it stays.
+        ahead = jnp.where(rate == 0, f, ahead)
+        rate_ahead = gap(*jax.jvp(position_at, (a + ahead * h,), (jnp.ones_like(f),)))[1] - taper
+        return low, high, f, rate, ahead, rate_ahead
+
+    zero, one = jnp.zeros_like(h), jnp.ones_like(h)
+    f = jax.lax.fori_loop(0, NEARER, closer, (zero, one, zero, falls, one, rises))[4]
+    lowest = body.distance(position_at(a + f * h)) - radii[0] - f * (radii[1] - radii[0])
+    f = jnp.where(has_least, f, jnp.where(ends[1] < ends[0], 1.0, 0.0))
+    return f, jnp.where(has_least, lowest, jnp.minimum(*ends))
 
 
-def _parts(windows: int, count: int) -> Int[Array, "w p"]:
-    """The numbers of so many places in equal parts, the last of them again where they do not suffice."""
-    size = -(-count // windows)
-    return jnp.minimum(jnp.arange(windows * size), count - 1).reshape(windows, size)
-
-
-def _least_in(windows: int, values: Float[Array, "k"]) -> Int[Array, "w"]:
-    """Where the values are least in each of so many equal parts of them."""
-    parts = _parts(windows, len(values))
-    return parts[jnp.arange(windows), jnp.argmin(values[parts], axis=1)]
+def _decisive(values: Float[Array, "k"], everywhere: bool) -> Int[Array, "w"]:
+    """All places, or the one where the values are least."""
+    return jnp.arange(len(values)) if everywhere else jnp.argmin(values)[None]
 
 
 @over_leading_axes

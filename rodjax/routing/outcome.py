@@ -39,6 +39,9 @@ def as_dict(route: Route) -> dict[str, Any]:
     return {
         "feasible": route.feasible,
         "objective": plain(route.objective),
+        "optimal": route.optimal,
+        "gain_within_a_thousandth": plain(route.gain),
+        "multipliers": {name: plain(value) for name, value in route.multipliers.items()},
         "numbers": {
             name: {"value": plain(value), "unit": unit}
             for name, unit, value in zip(route.names, route.units, np.asarray(route.numbers), strict=True)
@@ -52,6 +55,8 @@ def as_dict(route: Route) -> dict[str, Any]:
         "starts": [
             {
                 "feasible": bool(starts.feasible[k]),
+                "optimal": bool(starts.optimal[k]),
+                "gain_within_a_thousandth": plain(starts.gain[k]),
                 "objective": plain(starts.objective[k]),
                 "violation": plain(starts.violation[k]),
                 "violated": starts.violated[k],

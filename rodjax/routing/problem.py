@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.along import Along
 from rodjax.compilation import compiled
 from rodjax.equilibrium import Solver
 from rodjax.implicit import differentiable
@@ -20,9 +21,6 @@ from rodjax.routing.variables import Variable, leaf_names, with_numbers
 from rodjax.scene import Scene
 from rodjax.supports import Clip, Held, Support
 from rodjax.vectors import dot, root
-
-# Constraints along the rod are those of its worst place in each of so many equal parts.
-WINDOWS = 8
 
 
 class Problem(eqx.Module):
@@ -58,12 +56,14 @@ class Evaluation(eqx.Module):
     is_valid: Bool[Array, "..."]
 
 
-def spans(scene: Scene, names: set[str]) -> Float[Array, "spans"]:
-    """By how much the rod between held places is longer than the straight way, as parts of the rod's length.
+def spans(problem: Problem, scene: Scene) -> Float[Array, "spans"]:
+    """By how much the rod between held places is longer than the straight way, as parts of the rod's length, and than
+    a rod is that is pulled as tight as the limits of force allow.
 
     Of a rod that may become shorter or move, else nothing: a rod that is given is as it is. Sliding clips hold no place
     of the rod.
     """
+    names = leaf_names(problem.scene, problem.variables)
     length = scene.rod.length
     supports: list[tuple[Float[Array, ""], Support | Clip, bool]] = [(jnp.zeros_like(length), scene.start, False)]
     supports += [(clip.at, clip, clip.sliding) for clip in scene.clips]
@@ -72,18 +72,29 @@ def spans(scene: Scene, names: set[str]) -> Float[Array, "spans"]:
         return jnp.zeros(0, length.dtype)
     found = []
     before = None
-    for s, support, is_sliding in supports:
+    for k, (s, support, is_sliding) in enumerate(supports):
         if not isinstance(support, Held | Clip):
             continue
         if before is not None:
             gap = support.position - before[1]
             way = before[2] + root(dot(gap, gap))
             if is_sliding:
-                before = before[0], support.position, way
+                before = before[0], support.position, way, before[3]
                 continue
-            found.append((s - before[0] - way) / length)
-        before = s, support.position, jnp.zeros_like(length)
+            strain = _most_strain(problem.limits, scene, min(before[3], len(supports) - 1 - k))
+            found.append(((1 + strain) * (s - before[0]) - way) / length)
+        before = s, support.position, jnp.zeros_like(length), k
     return jnp.stack(found) if found else jnp.zeros(0, length.dtype)
+
+
+def _most_strain(limits: Limits | None, scene: Scene, clips: int) -> Float[Array, ""]:
+    """Of a span with so many clips between it and an end: the tension is that of the end and what the clips bear."""
+    most = jnp.zeros_like(scene.rod.length)
+    if limits is None or limits.end_force is None or (clips and limits.clip_force is None):
+        return most
+    stiffness = scene.rod.EA.values if isinstance(scene.rod.EA, Along) else scene.rod.EA
+    force = limits.end_force if limits.clip_force is None else limits.end_force + clips * limits.clip_force
+    return force.astype(most.dtype) / jnp.max(stiffness)
 
 
 def is_ordered(scene: Scene) -> Bool[Array, ""]:
@@ -96,11 +107,10 @@ def is_ordered(scene: Scene) -> Bool[Array, ""]:
 @compiled
 def spare_lengths(problem: Problem, designs: Float[Array, "k n"]) -> Float[Array, "k"]:
     """The least of the spans of each design, minus infinity where clips do not follow one another."""
-    names = leaf_names(problem.scene, problem.variables)
 
     def one(u: Float[Array, "n"]) -> Float[Array, ""]:
         scene = problem.scene_at(u)
-        least = jnp.min(spans(scene, names), initial=jnp.inf)
+        least = jnp.min(spans(problem, scene), initial=jnp.inf)
         return jnp.where(is_ordered(scene), least, -jnp.inf)
 
     return jax.vmap(one)(designs)
@@ -114,14 +124,14 @@ def scenes_of(problem: Problem, designs: Float[Array, "k n"]) -> Scene:
 def _kept(problem: Problem, result: Equilibrium) -> list[Measured]:
     if problem.limits is None:
         return []
-    return measured(result, problem.limits, problem.obstacles, WINDOWS)
+    return measured(result, problem.limits, problem.obstacles, everywhere=True)
 
 
 def _values(
     problem: Problem, scene: Scene, result: Equilibrium
 ) -> tuple[Float[Array, ""], Float[Array, "m"], Float[Array, "spans"], list[Measured]]:
     """The objective, the slacks, which of them are of spans, and what they are of."""
-    spare = spans(scene, leaf_names(problem.scene, problem.variables))
+    spare = spans(problem, scene)
     kept = _kept(problem, result)
     return problem.objective.of(result), jnp.concatenate([spare, *(each.slack for each in kept)]), spare, kept
 
@@ -189,6 +199,15 @@ def valued(
         return objective, slacks, is_valid
 
     return jax.lax.map(lambda entry: one(*entry), (designs, results))
+
+
+def group_starts(problem: Problem, guesses: Equilibrium) -> tuple[int, ...]:
+    """The number of the first slack of each span, and of each thing that is limited."""
+    one = jax.eval_shape(lambda stack: jax.tree.map(lambda leaf: leaf[0], stack), guesses)
+    _, _, spare, kept = jax.eval_shape(lambda found: _values(problem, found.scene, found), one)
+    count = spare.shape[0]
+    sizes = [each.slack.shape[0] for each in kept]
+    return (*range(count), *(count + sum(sizes[:k]) for k in range(len(sizes))))
 
 
 def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium) -> Evaluation:

@@ -1,5 +1,6 @@
 """route(): the best place of clips, ends and cable within limits, from many starts at once."""
 
+import itertools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -16,37 +17,47 @@ from rodjax.checks import instance, positive, whole_number
 from rodjax.equilibrium import Options, Solver, checked_options, solve
 from rodjax.result import Equilibrium, NotConvergedWarning
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import Margins, checked, margins
+from rodjax.routing.margins import Margins, checked, margins, measured_margins
 from rodjax.routing.objective import Objective
+from rodjax.routing.optimality import Optimality, optimality
 from rodjax.routing.problem import (
     Evaluation,
     Problem,
     arranged,
     chosen,
     evaluated,
+    group_starts,
     nothing_evaluated,
     scenes_of,
     spare_lengths,
 )
 from rodjax.routing.rounds import Rounds
-from rodjax.routing.search import Asked, Numbers, Outcome, Search, Settings
+from rodjax.routing.search import KEPT, REGION, Asked, Numbers, Outcome, Search, Settings
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
 from rodjax.scene import Scene, slides
 from rodjax.solvers.newton import Newton
 
 SEGMENTS = 48
-# Of each limit so much is kept in reserve, as a part of it, for the error of the mesh.
+# Of each limit so much is kept in reserve, as a part of it, until the error of the mesh is known.
 RESERVE = 1e-3
+# The reserve is then that error, as a finer mesh has it, and this part of it for what that mesh lacks itself: elements
+# are of fourth order, by which it is a fifteenth.
+BEYOND = 0.1
 TOLERANCE = 1e-6
 ITERATIONS = 100
-# SLSQP begins as if second derivatives by the variables in 0 to 1 were so much, as a part of the objective.
+# A search begins as if second derivatives by the variables in 0 to 1 were so much, as a part of the objective.
 FIRST_CURVATURE = 0.3
 # A start is drawn so many times, of which the first counts whose clips leave the rod long enough between them; where
 # it has no equilibrium it is drawn again, so often.
 DRAWS = 64
 REDRAWS = 3
-# The best designs that are solved again on a finer mesh, until one keeps to the limits there.
+# The best designs that are solved again on a finer mesh, and searched on with the reserve that it asks for, so often.
 VERIFIED = 5
+FINISHED = 3
+# Slacks of the finer mesh above this are far from their limits.
+MATTERS = 0.05
+# Multipliers below this part of the objective are none.
+NOTHING = 1e-6
 
 
 class Starts(eqx.Module):
@@ -55,13 +66,17 @@ class Starts(eqx.Module):
     - `designs` (k, n): where they ended, in SI units, as `Route.numbers`; `objective` (k,)
     - `violation` (k,): the largest, as a part of the limit and beside it; 0 where `feasible` (k,)
     - `violated`: what it is of, "" of feasible ones
-    - `iterations`, `solves` (k,); `message`: of SLSQP, for each
+    - `gain` (k,): by how much the objective falls at most, to first order, where no variable moves by more than a
+        thousandth of its range and all limits are kept; `optimal` (k,): whether that is below the tolerance
+    - `iterations`, `solves` (k,); `message`: how each search ended
     """
 
     designs: Float[np.ndarray, "k n"]
     objective: Float[np.ndarray, "k"]
     violation: Float[np.ndarray, "k"]
     feasible: Bool[np.ndarray, "k"]
+    gain: Float[np.ndarray, "k"]
+    optimal: Bool[np.ndarray, "k"]
     iterations: Int[np.ndarray, "k"]
     solves: Int[np.ndarray, "k"]
     violated: tuple[str, ...] = eqx.field(static=True)
@@ -72,7 +87,11 @@ class Route(eqx.Module):
     """The best of the routes found; `feasible`: it keeps to all limits, on the finer mesh too.
 
     - `scene`; `equilibrium`: on the mesh of the search; `verified`: on one twice as fine, and `margins` of that
-    - `objective`: what was least
+    - `objective`: what was least; `optimal`: whether conditions of optimality to first order hold there: `gain`, by
+        how much it falls at most, to first order, within a thousandth of the range of each variable and the limits, is
+        below the tolerance
+    - `multipliers`: by the names of what holds the objective up, by how much it falls for a whole limit more: of the
+        limits, the spans of the rod kept from being pulled taut, and per range the ends of the ranges
     - `names`, `units` (n): of the numbers that varied; `numbers` (n,): what they are in SI units; `values`: by the key
       of each variable, what the scene has
     - `gradients`: by the names of the margins, and "objective": the derivatives by `numbers`, (n,); of the margins at
@@ -88,6 +107,9 @@ class Route(eqx.Module):
     verified: Equilibrium
     margins: Margins
     objective: float
+    optimal: bool = eqx.field(static=True)
+    gain: float
+    multipliers: dict[str, float]
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     numbers: Float[np.ndarray, "n"]
@@ -107,9 +129,10 @@ class Route(eqx.Module):
         effort = f"{self.solves} solves, {self.with_gradients} of them with derivatives by {len(self.names)} numbers"
         effort += f"; {self.failed} found no equilibrium" if self.failed else ""
         if self.feasible:
+            least = f" The least margin is that of {name}, {100 * margin:.2g} %," if self.margins.names else " Solved"
             return (
                 f"A route that keeps to all limits, with the objective {self.objective:.6g}: {kept} of {count} starts "
-                f"came to one. The least margin is that of {name}, {100 * margin:.2g} %, on a mesh of "
+                f"came to one. {self.optimality}{least} on a mesh of "
                 f"{self.verified.s.shape[-1] - 1} segments. It took {effort}."
             )
         gap = self.starts.violated[int(np.argmin(self.starts.violation))]
@@ -118,6 +141,16 @@ class Route(eqx.Module):
             f"search. The one that violates them least fails in {gap or name}; on the finer mesh {name} has the margin "
             f"{100 * margin:.2g} %. It took {effort}."
         )
+
+    @property
+    def optimality(self) -> str:
+        """Whether the objective is an optimum, and what holds it, in words."""
+        gain = f"within a thousandth of the ranges the objective falls by {self.gain:.1g} at most"
+        if not self.optimal:
+            return f"It is NOT known to be an optimum, the search stalled: {gain}."
+        held = sorted(self.multipliers.items(), key=lambda item: -item[1])
+        told = ", ".join(f"{name} ({value / 100:.2g} for 1 %)" for name, value in held)
+        return f"It is optimal to first order: {gain}; held by {told or 'no limit'}."
 
 
 def route(
@@ -134,13 +167,13 @@ def route(
     solver: Solver | None = None,
     tolerance: Any = TOLERANCE,
     iterations: int = ITERATIONS,
-    reserve: Any = RESERVE,
+    reserve: Any = None,
     progress: bool = False,
 ) -> Route:
     """The design of least cost that keeps to limits: where clips sit, how long the cable is, how its ends point.
 
-    Each start is a search by scipy's SLSQP with exact derivatives; all starts are computed together. The first begins
-    at the nominal scene, the others at random designs.
+    Each start is a search by sequential quadratic programming with exact derivatives; all starts are computed together.
+    The first begins at the nominal scene, the others at random designs.
 
     **Arguments:**
 
@@ -152,18 +185,20 @@ def route(
     - `starts`: how many, and `seed` of the random ones.
     - `segments`: of the mesh, Hermite elements; `None` for 48.
     - `solver`: a `Newton`; `None` for `Newton()`.
-    - `tolerance`: of SLSQP, on the objective as a part of that of the first start; `iterations`: most of each attempt.
-    - `reserve`: of each limit so much more is asked, as a part of it, for the error of the mesh.
+    - `tolerance`: an objective is optimal where it falls by no more than this part of that of the first start within a
+        thousandth of the ranges; `iterations`: most of each search.
+    - `reserve`: of each limit so much more is asked, as a part of it, for the error of the mesh; `None`: a thousandth,
+        and of the best five designs in the end as much as a mesh twice as fine differs.
     - `progress`: show a progress bar of rounds of solves.
 
-    Limits all along the rod are kept at its worst place in each of 8 equal parts of the mesh, a constraint for each
-    part: no mean or softened maximum is taken, so that a constraint is off by nothing but the mesh. Its derivative is
-    that of the worst place, and jumps where another place of the same part becomes worst.
+    Limits all along the rod are kept at every place that `rodjax.margins` looks at, each place a constraint: so all
+    constraints are smooth, and no softened maximum is taken. The result is called optimal where the conditions of
+    optimality hold to first order, with the multipliers told; else the search stalled, and it says so.
 
-    Where the length, positions or arclengths vary, the rod between two held places is kept at least as long as the
-    straight way between them. A trial that would pull the rod taut there is stepped back from without a solve, as is
-    one where clips would not follow one another; so is one without an equilibrium. A search that ends outside of the
-    limits is led to the least violation, and goes on from there.
+    Where the length, positions or arclengths vary, the rod between two held places is kept as long as the straight way
+    between them, or as little shorter as it is where it is pulled by as much as the limits of force at ends and clips
+    allow. A trial that would pull the rod more taut is stepped back from without a solve, as is one where clips would
+    not follow one another; so is one without an equilibrium.
 
     The same arguments give the same route to the last bit. Where no start keeps to the limits, the result is that of
     the least violation, `feasible` is False, and `str` says what is missing. Raises `ValueError` or `TypeError` for
@@ -172,14 +207,14 @@ def route(
     problem, names = _problem(scene, variables, limits, objective, obstacles, names, segments, solver)
     count = whole_number(starts, "starts", 1, 100_000)
     rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63 - 1))
-    reserve = float(positive(reserve, "reserve"))
+    given = None if reserve is None else float(positive(reserve, "reserve"))
     tolerance = float(positive(tolerance, "tolerance"))
     iterations = whole_number(iterations, "iterations", 1, 1_000_000)
     instance(progress, "progress", bool)
 
     fleet = _Fleet(problem, count, rng, progress)
-    found = fleet.search(tolerance, iterations, reserve)
-    return _best(problem, names, fleet, found)
+    fleet.search(tolerance, iterations, RESERVE if given is None else given)
+    return _best(fleet, names, is_finished=given is None)
 
 
 def _problem(
@@ -207,7 +242,7 @@ class _Fleet:
     """All searches: where they stand, the best of each, and what evaluates them."""
 
     def __init__(self, problem: Problem, count: int, rng: np.random.Generator, progress: bool):
-        self._problem, self._progress = problem, progress
+        self.problem, self._progress = problem, progress
         self._options: Options = checked_options(
             problem.scene, problem.segments, None, "hermite", problem.solver, None, False
         )[0]
@@ -217,13 +252,17 @@ class _Fleet:
         designs = jnp.asarray(self._starts)
         self.last = nothing_evaluated(problem, designs, self._guesses)
         self.best = self.last
-        self._reserve = 0.0
-        # Of the best of each search: by how much its slacks lack the reserve, and its objective.
+        # Of each search, what is asked of the slacks; of its best, by how much they lack that, and its objective.
+        self.reserves = np.zeros(self.last.slacks.shape)
         self.lacking, self.objective = np.full(count, np.inf), np.full(count, np.inf)
+        self.outcomes = [Outcome(0, "")] * count
+        self.groups = group_starts(problem, self._guesses)
+        self.scale = self.tolerance = 1.0
+        self._iterations = ITERATIONS
 
     def _begin(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "k n"], Equilibrium]:
         """Designs that have equilibria, with these; where there is none after all that of another start stands in."""
-        nominal = first_numbers(self._problem.scene, self._problem.variables)
+        nominal = first_numbers(self.problem.scene, self.problem.variables)
         designs = np.concatenate([nominal[None], self._drawn(count - 1, rng)])
         results = self._solved_cold(designs)
         converged = np.asarray(results.converged)
@@ -247,44 +286,72 @@ class _Fleet:
         return designs[stand_in], jax.tree.map(lambda leaf: leaf[jnp.asarray(stand_in)], results)
 
     def _drawn(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "k n"]:
-        size = (count, DRAWS, sum(variable.count for variable in self._problem.variables))
+        size = (count, DRAWS, sum(variable.count for variable in self.problem.variables))
         designs = rng.random(size)
         if not count:
             return designs[:, 0]
-        spare = np.asarray(spare_lengths(self._problem, jnp.asarray(designs.reshape(-1, size[-1]))))
+        spare = np.asarray(spare_lengths(self.problem, jnp.asarray(designs.reshape(-1, size[-1]))))
         spare = spare.reshape(size[:2])
         first = np.where(np.any(spare > 0, axis=1), np.argmax(spare > 0, axis=1), np.argmax(spare, axis=1))
         return designs[np.arange(count), first]
 
     def _spare(self, design: Float[np.ndarray, "n"]) -> float:
-        return float(spare_lengths(self._problem, jnp.asarray(design)[None])[0])
+        return float(spare_lengths(self.problem, jnp.asarray(design)[None])[0])
 
     def _solved_cold(self, designs: Float[np.ndarray, "k n"]) -> Equilibrium:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConvergedWarning)
-            scenes = scenes_of(self._problem, jnp.asarray(designs))
-            options: dict[str, Any] = dict(segments=self._problem.segments, solver=self._problem.solver)
+            scenes = scenes_of(self.problem, jnp.asarray(designs))
+            options: dict[str, Any] = dict(segments=self.problem.segments, solver=self.problem.solver)
             return solve_stack(scenes, **options, strain_limit=None)
 
-    def search(self, tolerance: float, iterations: int, reserve: float) -> list[Outcome]:
-        """How the searches ended."""
-        count, self._reserve = len(self._starts), reserve
+    def search(self, tolerance: float, iterations: int, reserve: float) -> None:
+        """All searches from their starts, with this reserve of each limit."""
+        self.reserves[:, self.best.spare.shape[-1] :] = reserve
         first = self.evaluate({k: Asked(start, False) for k, start in enumerate(self._starts)})
         usable = [abs(numbers.objective) for numbers in first.values() if numbers.is_valid]
-        scale = FIRST_CURVATURE * (usable[0] if usable and usable[0] > 0 else 1.0)
-        settings = Settings(scale, reserve, tolerance / FIRST_CURVATURE, iterations)
+        self.scale = FIRST_CURVATURE * (usable[0] if usable and usable[0] > 0 else 1.0)
+        self.tolerance, self._iterations = tolerance / FIRST_CURVATURE, iterations
+        self._run(first, 1.0)
 
+    def finish(self, reserves: dict[int, Float[np.ndarray, "m"]]) -> None:
+        """These searches again, from the best they found, with another reserve."""
+        which = list(reserves)
+        for k in which:
+            self.reserves[k] = reserves[k]
+        self.lacking[which] = self.objective[which] = np.inf
+        self._starts[which] = np.asarray(self.best.design)[which]
+        near = np.isin(np.arange(len(self._starts)), which)
+        self._guesses = chosen(jnp.asarray(near), self.best.result, self._guesses)
+        self._run(self.evaluate({k: Asked(self._starts[k], False) for k in which}), REGION)
+
+    def _run(self, first: dict[int, Numbers], region: float) -> None:
         def search(k: int) -> Callable[[Callable[[Asked], Numbers]], Outcome]:
+            settings = Settings(self.scale, self.reserves[k], self.tolerance, self._iterations, self.groups, region)
             return lambda ask: Search(self._starts[k], first[k], settings, ask, self._spare).run()
 
+        which = list(first)
         with tqdm(disable=not self._progress, unit="round") as bar:
 
             def evaluate(asked: dict[int, Asked]) -> dict[int, Numbers]:
                 bar.update()
                 bar.set_postfix(running=len(asked))
-                return self.evaluate(asked)
+                found = self.evaluate({which[j]: one for j, one in asked.items()})
+                return {j: found[which[j]] for j in asked}
 
-            return Rounds([search(k) for k in range(count)], evaluate).run()
+            found = Rounds([search(k) for k in which], evaluate).run()
+        for k, outcome in zip(which, found, strict=True):
+            self.outcomes[k] = Outcome(self.outcomes[k].iterations + outcome.iterations, outcome.message)
+
+    def optimality(self, k: int) -> Optimality:
+        """Of the best design of a search, in units of the objective."""
+        slacks, rates = np.asarray(self.best.slacks[k]), np.asarray(self.best.rates[k])
+        m = len(slacks)
+        return optimality(rates[0], slacks - self.reserves[k], rates[1 : m + 1], np.asarray(self.best.design[k]))
+
+    def is_optimal(self, gain: float) -> bool:
+        # As the searches, to rounding.
+        return bool(gain <= self.scale * self.tolerance * (1 + 1e-6))
 
     def evaluate(self, asked: dict[int, Asked]) -> dict[int, Numbers]:
         """One design of each search that asked."""
@@ -296,9 +363,9 @@ class _Fleet:
         if np.any(accepted):
             self._guesses = chosen(jnp.asarray(accepted), self.last.result, self._guesses)
         order = jnp.asarray(np.pad(order, (0, len(designs) - count), mode="edge"))
-        placed, scenes, guesses = arranged(self._problem, jnp.asarray(designs), self._guesses, order)
+        placed, scenes, guesses = arranged(self.problem, jnp.asarray(designs), self._guesses, order)
         results = solve_first(scenes, guesses, count, self._options)
-        self.last = evaluated(self._problem, placed, results, self.last, order, jnp.asarray(count))
+        self.last = evaluated(self.problem, placed, results, self.last, order, jnp.asarray(count))
         objective, slacks, rates, is_valid = (
             np.asarray(x) for x in (self.last.objective, self.last.slacks, self.last.rates, self.last.is_valid)
         )
@@ -315,8 +382,7 @@ class _Fleet:
         slacks: Float[np.ndarray, "k m"],
         is_valid: Bool[np.ndarray, "k"],
     ) -> None:
-        # SLSQP keeps constraints to its tolerance only.
-        lacking = np.maximum(0.9 * self._reserve - np.min(slacks, axis=1, initial=np.inf), 0.0)
+        lacking = np.maximum(np.max(self.reserves - slacks, axis=1, initial=0.0) - KEPT, 0.0)
         is_better = (lacking < self.lacking) | ((lacking == self.lacking) & (objective < self.objective))
         is_better &= is_valid & np.isin(np.arange(len(is_valid)), asked)
         self.lacking = np.where(is_better, lacking, self.lacking)
@@ -325,49 +391,119 @@ class _Fleet:
             self.best = chosen(jnp.asarray(is_better), self.last, self.best)
 
 
-def _best(problem: Problem, names: tuple[str, ...], fleet: _Fleet, outcomes: list[Outcome]) -> Route:
-    feasible = fleet.lacking == 0
+def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
+    """The best of the searches that keeps to the limits on a finer mesh."""
+    problem = fleet.problem
     order = np.lexsort((fleet.objective, fleet.lacking))
     if not np.isfinite(fleet.lacking[order[0]]):
         raise ValueError("variables must leave designs whose equilibrium has derivatives: none of the starts has")
-    best, verified, kept, is_kept = order[0], None, None, False
-    for k in order[:VERIFIED]:
-        if not feasible[k] and verified is not None:
+    candidates = [int(k) for k in order[:VERIFIED] if fleet.lacking[k] == 0] or [int(order[0])]
+    finer = {k: _finer(fleet, k) for k in candidates}
+    for _ in range(FINISHED if is_finished and problem.limits is not None else 0):
+        reserves = {k: _reserve(fleet, k, finer[k]) for k in candidates if _is_open(fleet, k, finer[k])}
+        if not reserves:
             break
-        here = jax.tree.map(lambda leaf, k=k: leaf[k], fleet.best.result)
-        finer = solve(here.scene, segments=2 * problem.segments, guess=here, solver=problem.solver)
-        found = _margins(finer, problem, names)
-        is_kept = bool(feasible[k]) and bool(finer.converged) and bool(np.all(np.asarray(found.margin) >= 0))
-        if is_kept or verified is None:
-            best, verified, kept = k, finer, found
-        if is_kept:
-            break
-    assert verified is not None
-    assert kept is not None
+        fleet.finish(reserves)
+        finer |= {k: _finer(fleet, k) for k in reserves}
+    kept = {k: fleet.lacking[k] == 0 and _is_kept(finer[k]) for k in candidates}
+    best = min(candidates, key=lambda k: (not kept[k], fleet.lacking[k], fleet.objective[k]))
+    verified = finer[best][0]
+    found = _margins(verified, problem, names)
+    feasible = fleet.lacking == 0
+    feasible[[k for k in candidates if not kept[k]]] = False
     at = jax.tree.map(lambda leaf: leaf[best], fleet.best)
     variables = problem.variables
     scales = np.concatenate([variable.scales() for variable in variables])
     rates = np.asarray(at.rates) / scales[None]
-    rows = {"objective": rates[0], **dict(zip(kept.names, rates[1 + at.slacks.shape[-1] :], strict=True))}
+    rows = {"objective": rates[0], **dict(zip(found.names, rates[1 + at.slacks.shape[-1] :], strict=True))}
     offsets = _offsets(problem)
+    labels = tuple(label for variable in variables for label in variable.labels())
+    conditions = fleet.optimality(best)
     return Route(
-        feasible=is_kept,
+        feasible=bool(kept[best]),
         scene=at.result.scene,
         equilibrium=at.result,
         verified=verified,
-        margins=kept,
+        margins=found,
         objective=float(at.objective),
-        names=tuple(label for variable in variables for label in variable.labels()),
+        optimal=bool(kept[best]) and fleet.is_optimal(conditions.gain),
+        gain=float(conditions.gain),
+        multipliers=_multipliers(fleet, at, conditions, found.names, labels),
+        names=labels,
         units=tuple(unit for variable in variables for unit in variable.units()),
         numbers=offsets + scales * np.asarray(at.design),
         values={variable.key: np.asarray(number_of(at.result.scene, variable)) for variable in variables},
         gradients=rows,
-        starts=_starts(fleet, outcomes, feasible, offsets, scales, kept.names),
+        starts=_starts(fleet, feasible, offsets, scales, found.names),
         solves=int(np.sum(fleet.solves)),
         with_gradients=int(np.sum(fleet.solves)) - len(feasible) - fleet.redrawn,
         failed=fleet.failed,
         redrawn=fleet.redrawn,
     )
+
+
+def _finer(fleet: _Fleet, k: int) -> tuple[Equilibrium, Float[np.ndarray, "g"]]:
+    """The best design of a search on a mesh twice as fine, and the least slack of each limit there."""
+    problem = fleet.problem
+    here = jax.tree.map(lambda leaf: leaf[k], fleet.best.result)
+    with warnings.catch_warnings():
+        # What did not converge is not kept.
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        finer = solve(here.scene, segments=2 * problem.segments, guess=here, solver=problem.solver)
+    if problem.limits is None:
+        return finer, np.zeros(0)
+    found = measured_margins(finer, problem.limits, problem.obstacles)
+    return finer, np.array([float(each.slack[0]) for each in found])
+
+
+def _is_kept(finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> bool:
+    return bool(finer[0].converged) and float(np.min(finer[1], initial=0.0)) >= 0
+
+
+def _errors(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "g"]:
+    """By how much the slack of each limit is too large on the mesh of the search."""
+    spans = fleet.best.spare.shape[-1]
+    return np.minimum.reduceat(np.asarray(fleet.best.slacks[k]), np.array(fleet.groups))[spans:] - finer[1]
+
+
+def _reserve(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "m"]:
+    """For the error of the mesh, of what is limited within reach."""
+    spans, m = fleet.best.spare.shape[-1], fleet.reserves.shape[1]
+    error = _errors(fleet, k, finer)
+    # Far from its limit a slack may be off by more than it matters.
+    error = np.clip(error, -RESERVE, None) + BEYOND * np.abs(error) + 2 * KEPT
+    is_near = finer[1] < MATTERS
+    each = np.where(is_near, error, RESERVE)
+    return np.concatenate([np.zeros(spans), np.repeat(each, np.diff([*fleet.groups[spans:], m]))])
+
+
+def _is_open(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> bool:
+    """Whether a search has more in reserve than its mesh needs, or less."""
+    if fleet.lacking[k] > 0 or not bool(finer[0].converged):
+        return False
+    wanted = _reserve(fleet, k, finer)
+    return bool(np.max(np.abs(wanted - fleet.reserves[k]), initial=0.0) > 4 * KEPT) or not _is_kept(finer)
+
+
+def _multipliers(
+    fleet: _Fleet, at: Evaluation, conditions: Optimality, names: tuple[str, ...], labels: tuple[str, ...]
+) -> dict[str, float]:
+    """What holds the objective, by name, per whole limit; per range of the variables at their ends."""
+    slacks, rates, spans = np.asarray(at.slacks), np.asarray(at.rates), at.spare.shape[-1]
+    m, found = len(slacks), {}
+    bounds = [*fleet.groups, m]
+    for g, (first, last) in enumerate(itertools.pairwise(bounds)):
+        multiplier = float(np.sum(conditions.multipliers[first:last]))
+        if g >= spans and multiplier > 0:
+            # Slacks are in units of their own: by how much for a margin, their derivatives tell.
+            worst, row = first + int(np.argmin(slacks[first:last])), rates[1 + m + g - spans]
+            multiplier *= float(rates[1 + worst] @ row) / max(float(row @ row), np.finfo(float).tiny)
+        found[names[g - spans] if g >= spans else f"length of the rod in span {g}"] = multiplier
+    for values, end in ((conditions.lower, "lower"), (conditions.upper, "upper")):
+        found |= {f"{label} at its {end} end": float(value) for label, value in zip(labels, values, strict=True)}
+    # What the program leaves of others is nothing.
+    least = NOTHING * abs(float(at.objective))
+    return {name: value for name, value in found.items() if value > least}
 
 
 def _offsets(problem: Problem) -> Float[np.ndarray, "n"]:
@@ -383,7 +519,6 @@ def _margins(equilibrium: Equilibrium, problem: Problem, names: tuple[str, ...])
 
 def _starts(
     fleet: _Fleet,
-    outcomes: list[Outcome],
     feasible: Bool[np.ndarray, "k"],
     offsets: Float[np.ndarray, "n"],
     scales: Float[np.ndarray, "n"],
@@ -397,16 +532,24 @@ def _starts(
     labels = (*(f"length of the rod in span {k}" for k in range(count)), *names)
     violation = np.maximum(-np.min(table, axis=1, initial=np.inf), 0.0)
     worst = np.argmin(table, axis=1) if labels else np.zeros(len(table), int)
+    usable = np.isfinite(fleet.lacking)
+    gain = np.array([fleet.optimality(k).gain if usable[k] else np.inf for k in range(len(feasible))])
     return Starts(
         designs=offsets[None] + scales[None] * np.asarray(best.design),
         objective=fleet.objective,
         violation=np.where(feasible, 0.0, np.where(np.isfinite(fleet.lacking), violation, np.inf)),
         feasible=feasible,
-        iterations=np.array([outcome.iterations for outcome in outcomes]),
+        gain=gain,
+        optimal=feasible & np.array([fleet.is_optimal(one) for one in gain]),
+        iterations=np.array([outcome.iterations for outcome in fleet.outcomes]),
         solves=fleet.solves,
         violated=tuple(
-            "" if feasible[k] or not labels else f"{labels[w]} by {100 * violation[k]:.2g} %"
+            ""
+            if feasible[k] or not labels
+            else f"{labels[w]} by {100 * violation[k]:.2g} %"
+            if fleet.lacking[k] > 0
+            else f"{labels[w]} on the finer mesh"
             for k, w in enumerate(worst)
         ),
-        message=tuple(outcome.message for outcome in outcomes),
+        message=tuple(outcome.message for outcome in fleet.outcomes),
     )

@@ -1,8 +1,9 @@
 """tolerances(): how far a rod at rest scatters where what holds it does, and how likely it then breaks its limits.
 
 To first order: the derivatives J of all quantities by the tolerated numbers, through the implicit function theorem, and
-J Sigma J^T. Whether the first order is enough is looked at by solves: a Monte Carlo of them, or a few at distances of
-sqrt(3) standard deviations, which is the three-point rule of Gauss & Hermite along each direction.
+J Sigma J^T. Whether the first order is enough is looked at by a few solves at distances of sqrt(3) standard deviations,
+which is the three-point rule of Gauss & Hermite along each direction. Where it is not, a Monte Carlo of solves follows,
+and its numbers come first.
 """
 
 import dataclasses
@@ -36,6 +37,9 @@ NEAR = 3.0
 # Draws from the normal distribution of the first order, for the probability that any limit is broken.
 DRAWS = 100_000
 MOST_SAMPLES = 10_000_000
+# Samples where the first order is not enough and none are asked for: a probability of 0.2 to 0.01.
+SAMPLES = 2000
+NOT_FINITE = "not finite as it should be, so that nothing can be said to first order"
 
 
 class Tolerance:
@@ -112,6 +116,8 @@ class Envelope:
     - `stiffness`, `stiffness_deviation` N: of the softest motion, as by `rodjax.lowest_mode`, not numbers where that
       has none
     - `sampled`: `Scatter` of the Monte Carlo, `None` without samples; `samples`: how many of its solves converged
+    - `scatter`: that of the two which holds: `sampled` where something is flagged and there are samples, else
+      `first_order`; `is_certain`: whether one does
     - `flags`: sentences by what they concern, where the first order is not enough: names of the margins, "centerline",
       "start_force", "end_force", or of all "rod"
     """
@@ -128,25 +134,43 @@ class Envelope:
     samples: int
     flags: dict[str, str]
 
+    @property
+    def scatter(self) -> Scatter:
+        return self.first_order if self.sampled is None or not _is_in_doubt(self.flags) else self.sampled
+
+    @property
+    def is_certain(self) -> bool:
+        return self.sampled is not None or not _is_in_doubt(self.flags)
+
     def __str__(self) -> str:
-        """One line for each limit, the envelope, and what is flagged."""
-        first, sampled = self.first_order, self.sampled
+        """One line for each limit and one for the envelope, what holds first; then what is flagged."""
+        leading = self.scatter
+        is_sampled = leading is self.sampled
+        other = self.first_order if is_sampled else self.sampled
+        beside = "to first order, which does not hold," if is_sampled else "sampled"
         lines = []
+        if is_sampled:
+            lines.append(f"By {self.samples} samples, as the first order does not hold for {', '.join(self.flags)}:")
+        elif not self.is_certain:
+            lines.append(
+                f"To first order, which does NOT hold for {', '.join(self.flags)}: samples={SAMPLES} tells what does"
+            )
         names = self.margins.names if self.margins else ()
         for k, name in enumerate(names):
             assert self.margins is not None
-            text = f"{name}: {self.margins.value[k]:.4g} +- {first.deviation[k]:.2g} {self.margins.units[k]}"
+            text = f"{name}: {self.margins.value[k]:.4g} +- {leading.deviation[k]:.2g} {self.margins.units[k]}"
             text += f" ({self.margins.kinds[k]} {self.margins.limit[k]:.4g})"
-            text += f", broken with probability {first.probability[k]:.2g}"
-            if sampled is not None:
-                text += f"; sampled +- {sampled.deviation[k]:.2g}, {sampled.probability[k]:.2g}"
+            text += f", broken with probability {leading.probability[k]:.2g}"
+            if other is not None:
+                text += f"; {beside} +- {other.deviation[k]:.2g}, {other.probability[k]:.2g}"
             lines.append(text)
         if names:
-            text = f"any limit broken with probability {first.any_broken:.2g}, at most {self.any_bound:.2g}"
-            lines.append(text if sampled is None else f"{text}; sampled {sampled.any_broken:.2g}")
-        k = int(np.nanargmax(first.position)) if np.any(np.isfinite(first.position)) else 0
-        text = f"centerline: +- {first.position[k]:.2g} m at most, at s = {self.s[k]:.4g} m"
-        lines.append(text if sampled is None else f"{text}; sampled {np.max(sampled.position):.2g}")
+            text = f"any limit broken with probability {leading.any_broken:.2g}"
+            text += "" if is_sampled else f", at most {self.any_bound:.2g}"
+            lines.append(text if other is None else f"{text}; {beside} {other.any_broken:.2g}")
+        k = int(np.nanargmax(leading.position)) if np.any(np.isfinite(leading.position)) else 0
+        text = f"centerline: +- {leading.position[k]:.2g} m at most, at s = {self.s[k]:.4g} m"
+        lines.append(text if other is None else f"{text}; {beside} {np.max(other.position):.2g}")
         lines += [f"not of first order: {name}: {flag}" for name, flag in self.flags.items()]
         return "\n".join(lines)
 
@@ -158,7 +182,7 @@ def tolerances(
     limits: Limits | None = None,
     obstacles: Any = (),
     names: Any = None,
-    samples: int = 0,
+    samples: int | None = None,
     seed: int = 0,
 ) -> Envelope:
     """How an equilibrium scatters where numbers of its scene do, normally and independently of one another.
@@ -169,8 +193,8 @@ def tolerances(
     - `tolerances`: a list of `Tolerance`.
     - `limits`, `obstacles`, `names`: as for `rodjax.margins`, which are then looked at; `None` for the shape and the
         forces alone.
-    - `samples`: solves of a Monte Carlo, warm from the equilibrium, besides the first order; 0: a few solves that tell
-        whether the first order is enough.
+    - `samples`: solves of a Monte Carlo, warm from the equilibrium, besides the first order; `None`: a few solves that
+        tell whether the first order is enough, and where it is not, 2000 samples; 0: the few solves alone.
     - `seed`: of the random numbers.
 
     Flagged are quantities whose standard deviation by the solves differs by more than 5 % from that of the first order,
@@ -190,7 +214,7 @@ def tolerances(
     if not bool(equilibrium.converged):
         raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
     tolerances = sequence(tolerances, "tolerances", "Tolerance")
-    samples = whole_number(samples, "samples", 0, MOST_SAMPLES)
+    samples = None if samples is None else whole_number(samples, "samples", 0, MOST_SAMPLES)
     rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63))
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if limits is None and obstacles:
@@ -208,42 +232,49 @@ def _envelope(
     tolerances: tuple[Tolerance, ...],
     owners: Int[np.ndarray, "p"],
     kept: Margins | None,
-    samples: int,
+    samples: int | None,
     rng: np.random.Generator,
 ) -> Envelope:
     slopes = scattering.slopes()
     first = by_derivatives(slopes)
     values, p = slopes.here.values, len(owners)
     deviation = np.sqrt(first.values)
-    compared, sampled, count, unsolved = [], None, 0, 0
-    if samples:
+    length = float(scattering.equilibrium.s[-1])
+    stiffness, stiffness_deviation = float(slopes.stiffness), float(np.linalg.norm(slopes.stiffness_by))
+    flags, sampled, count = {}, None, 0
+
+    def flag(unsolved: int, compared: Sequence[Moments], count: int) -> None:
+        """What was flagged before stays."""
+        found = [_flags_of_rod(stiffness, stiffness_deviation, unsolved, first)]
+        found += [_flags(slopes.here, first, moments, kept, length, count) for moments in compared]
+        for each in found:
+            for name, told in each.items():
+                flags.setdefault(name, told)
+
+    if not samples:
+        *few, unsolved = by_few(scattering, slopes)
+        flag(unsolved, few, 0)
+    if samples or (samples is None and _is_in_doubt(flags)):
+        samples = samples or SAMPLES
         second, rods = by_samples(scattering, slopes.here, rng.standard_normal((samples, p)))
-        count, unsolved = len(rods), samples - len(rods)
-        compared = [second]
+        count = len(rods)
+        flag(samples - count, [second] if count else [], count)
         is_broken = _broken(rods, kept)
         if count:
             parts = np.mean(is_broken, axis=0), float(np.mean(np.any(is_broken, axis=1)))
             sampled = Scatter.of(second, *parts)
-    else:
-        *compared, unsolved = by_few(scattering, slopes)
     probability = _probabilities(values, deviation, kept)
     draws = values[None] + rng.standard_normal((DRAWS, p)) @ slopes.by.values
     any_broken = float(np.max([np.mean(np.any(_broken(draws, kept), axis=1)), *probability]))
     variances = np.stack([np.sum(np.square(slopes.by.values[owners == k]), axis=0) for k in range(len(tolerances))])
-    stiffness_deviation = float(np.linalg.norm(slopes.stiffness_by))
-    flags = _flags_of_rod(float(slopes.stiffness), stiffness_deviation, unsolved, first)
-    s = np.asarray(scattering.equilibrium.s)
-    for moments in compared if count or not samples else ():
-        for name, flag in _flags(slopes.here, first, moments, kept, float(s[-1]), count).items():
-            flags.setdefault(name, flag)
     return Envelope(
         tolerances=tolerances,
         margins=kept,
         first_order=Scatter.of(first, probability, any_broken),
         any_bound=min(1.0, float(np.sum(probability))),
         shares=(variances / np.where(first.values > 0, first.values, 1.0)[None]).T,
-        s=s,
-        stiffness=float(slopes.stiffness),
+        s=np.asarray(scattering.equilibrium.s),
+        stiffness=stiffness,
         stiffness_deviation=stiffness_deviation,
         sampled=sampled,
         samples=count,
@@ -317,6 +348,11 @@ def _largest(covariances: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k"]:
 # --- where the first order is not enough -----------------------------------------------------------------------------
 
 
+def _is_in_doubt(flags: dict[str, str]) -> bool:
+    """Whether the first order is wrong of something; a straight rod has no bend radius, which is no doubt."""
+    return any(flag != NOT_FINITE for flag in flags.values())
+
+
 def _flags_of_rod(stiffness: float, deviation: float, unsolved: int, first: Moments) -> dict[str, str]:
     told = []
     if not all(np.all(np.isfinite(x)) for x in (first.nodes, first.forces)):
@@ -335,7 +371,7 @@ def _flags(
     flags = {}
     for k, name in enumerate(kept.names if kept else ()):
         if not np.isfinite(here.values[k]):
-            flags[name] = "not finite as it should be, so that nothing can be said to first order"
+            flags[name] = NOT_FINITE
             continue
         size = max(abs(float(here.values[k])), abs(float(kept.limit[k])) if kept else 0.0)
         spreads = math.sqrt(first.values[k]), math.sqrt(second.values[k])

@@ -178,7 +178,7 @@ def gradients(cable: Cable) -> str:
     told = "Change of each margin by the design variables:"
     count = len(found.variables)
     parts = [_columns(found, range(k, min(k + COLUMNS, count))) for k in range(0, count, COLUMNS)]
-    return "\n".join([told, *parts])
+    return "\n".join([*([found.remark] if found.remark else []), told, *parts])
 
 
 def _columns(gradients: Gradients, which: Sequence[int]) -> str:

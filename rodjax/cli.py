@@ -22,7 +22,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, load, save
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.result import Equilibrium, MeshWarning, NotConvergedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
 from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
@@ -177,6 +177,7 @@ def _solve(arguments: argparse.Namespace) -> int:
     with warnings.catch_warnings():
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("ignore", MeshWarning)  # the errors are told
         if file.is_path:
             result = rodjax.solve_path(file.scenes, **settings, progress=sys.stderr.isatty())
         else:

@@ -16,7 +16,7 @@ from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
 from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.path import solve_path
-from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, describe
+from rodjax.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
 from rodjax.rod import Law, Rod
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFileError, read_scene
@@ -86,6 +86,7 @@ __all__ = [
     "LineSearch",
     "Margins",
     "Mesh",
+    "MeshWarning",
     "Mode",
     "Newton",
     "NonlinearCG",

@@ -23,7 +23,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, load, save
-from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning
+from rodjax.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.status import Status
 from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
@@ -179,6 +179,7 @@ def _solve(arguments: argparse.Namespace) -> int:
     with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("ignore", MeshWarning)  # the errors are told
         warnings.simplefilter("always", OverstretchedWarning)
         if file.is_path:
             result = rodjax.solve_path(file.scenes, **file.settings, progress=sys.stderr.isatty())

@@ -43,8 +43,10 @@ from rodjax.result import (
     equilibrium,
     estimated_errors,
     passage_to,
+    warn_if_coarse,
     warn_if_not_converged,
     warn_if_overstretched,
+    warn_of_unknown_mesh,
 )
 from rodjax.scene import (
     Scene,
@@ -113,11 +115,15 @@ def solve(
     **Arguments:**
 
     - `scene`: `Scene`.
-    - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs.
+    - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs. The
+        errors on a given mesh are not estimated unless asked for (`error_estimate`, `describe`); outside `jit` a
+        `MeshWarning` is given where a segment turns by so much that it is far too long.
     - `rtol`: the relative error of the shape that is wanted; `None` for 1e-3. Segments are added, elements where they
-        are needed, until the estimated error is below it. The mesh of a guess that is an `Equilibrium` comes first.
-        Where the numbers of the scene are not known, as inside `jit`, it is that of the guess or one of 32 elements
-        whatever `rtol`, and `error_estimate` says what that gives.
+        are needed, until the estimated `error_estimate` is below it and `force_error`, `moment_error` and
+        `curvature_error` below ten times it: by default 0.1 % of the length, and 1 % of the largest force, moment and
+        curvature. The mesh of a guess that is an `Equilibrium` comes first. Where the numbers of the scene are not
+        known, as inside `jit`, `vmap` and `grad`, it is that of the guess or one of 32 elements whatever `rtol`, of
+        which a `MeshWarning` tells once; `error_estimate` says what that gives.
     - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order.
         `None`: that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
@@ -147,13 +153,19 @@ def solve(
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
-    if rtol is not None and is_known(result):
-        result = _refined(result, options, rtol, strain_limit)
+    if is_known(result):
+        result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
     if fixed_scene is not scene:
         result = with_ranges(fixed_scene, result)
     warn_if_not_converged(result)
     warn_if_overstretched(result, strain_limit)
     return differentiable(scene, result)
+
+
+def _looked_at(result: Equilibrium) -> Equilibrium:
+    """On a mesh that was given."""
+    warn_if_coarse(result)
+    return result
 
 
 def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: Float[Array, ""] | float) -> Equilibrium:
@@ -194,6 +206,8 @@ def refined_together(
     `solve` is given the options and what it found with the last ones.
     """
     result, depth = solve(options, None), Depth()
+    if rtol is None and is_here(result):
+        return _looked_at(result)
     while rtol is not None and is_here(result):
         errors, converged = estimated_errors(result), np.asarray(result.converged)
         sizes = error_by_rtol(errors)
@@ -349,6 +363,7 @@ def checked_options(
         segments = first_size(rtol, discretization, SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0)
     else:
         segments = TRACED_SEGMENTS[discretization]
+        warn_of_unknown_mesh(segments)
     one_of(find, "find", typing.get_args(Find))
     if find == "equilibrium" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where find is 'equilibrium': NonlinearCG only goes down")

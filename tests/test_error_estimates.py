@@ -1,7 +1,10 @@
 """Estimated errors of shape, forces, moments and curvature against those that finer meshes show."""
 
 import functools
+import re
+import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import pytest
 import rodjax as rj
 from rodjax.path import stack_scenes
 from rodjax.refinement import SECTION_FACTOR
+from rodjax.result import warn_of_unknown_mesh
 from rodjax.rotations import columns
 
 COUNT = 12
@@ -129,3 +133,33 @@ def test_what_a_rod_can_turn_by_is_no_error():
         assert np.all(getattr(found, name) > 0.5 * np.abs(coarse / sizes - 1)), name
         assert np.all(getattr(found, name) < 1e-2), name
     assert rj.solve(scenes[-1]).s.shape == (9,)  # was 129
+
+
+def test_a_mesh_far_too_coarse_is_told_without_an_estimate():
+    rod = rj.Rod(1.0, 1.0, 0.7, 1e4)
+    coil = rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free(moment=(0.0, 14.0, 0.0)))
+    # A circle of curvature 14/m: elements of 1/8 turn by 1.75, those of 1/4 by 3.5.
+    with pytest.warns(rj.MeshWarning, match=r"the mesh of 4 segments is too coarse: the rod turns by 3\.\d rad"):
+        found = rj.solve(coil, segments=4)
+    assert found.converged
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rj.solve(coil, segments=8)
+    assert re.search(r"estimated errors on 4 segments: shape \S+ of the length, forces \S+ %, ", rj.describe(found))
+
+
+def test_that_nobody_chose_a_mesh_is_told_once():
+    warn_of_unknown_mesh.cache_clear()
+    scene = random_scenes()[0]
+
+    def traced(**options):
+        return jax.eval_shape(lambda scene: rj.solve(scene, **options), scene).s.shape
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert traced(segments=8) == (9,)
+    with pytest.warns(rj.MeshWarning, match="one of 32 segments, whatever its errors"):
+        assert traced() == (33,)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert traced() == (33,)

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 from tqdm import tqdm
 
 from rodjax.checks import instance, is_known, sequence
 from rodjax.compilation import compiled
+from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.equilibrium import (
     Discretization,
@@ -187,10 +188,10 @@ def _solve_here(
     if scenes.rod.length.ndim == 2:
         return jax.vmap(functools.partial(path_from, options=options), in_axes)(scenes, guess)
 
-    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, Float[Array, ""]]:
+    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, FirstTwist]:
         return first_state(scene, guess, options)
 
-    def search(scene: Scene, start: tuple[SolverState, Float[Array, ""]]) -> Search:
+    def search(scene: Scene, start: tuple[SolverState, FirstTwist]) -> Search:
         return Search.of(*in_units_of(scene, start[0]), start[1], options)
 
     once = jnp.ones((), int)

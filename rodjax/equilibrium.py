@@ -18,6 +18,7 @@ from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
 from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_twist import FirstTwist, last_of
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
 from rodjax.discretization.framed import FrameForm, FramePoint
@@ -55,6 +56,7 @@ from rodjax.sliding_search import INNER_TOLERANCE, slid_free
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Outcome, Status
+from rodjax.supports import Clamp
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -159,7 +161,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float) -> Equilibrium:
             defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
         lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
-        finer = _solve(result.scene, _finer(result, defects, options), result.total_twist, options)
+        finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
             finer,
@@ -348,14 +350,32 @@ def _is_by_differences(shape: Shape) -> bool:
     return isinstance(shape, Polyline) or (isinstance(shape, FramedCurve) and shape.is_of_joints)
 
 
-def first_state(
-    scene: Scene, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
-    """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
+def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Where to begin, and with which total twist: as the guess has it, where its mesh is kept."""
     if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
         state = guess.state
-        return SolverState(state.shape, state.end_force, state.units, state.places), guess.total_twist
+        return SolverState(state.shape, state.end_force, state.units, state.places), last_twist(guess)
     return _first_state(scene, guess, options)
+
+
+def last_twist(result: Equilibrium) -> FirstTwist:
+    """The total twist of an equilibrium, to be carried to the next one."""
+    return FirstTwist(result.total_twist, last_of(result.scene))
+
+
+def settled_state(scene: Scene, state: SolverState, first: FirstTwist) -> tuple[SolverState, Float[Array, ""]]:
+    """The same beginning with the tangents and frames that the scene holds, and the total twist there [rad]."""
+    if not needs_frames(scene) and not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
+        return state, first.total_twist
+    scaled, scaled_state = in_units_of(scene, state)
+    if slides(scene):
+        assert state.places is not None
+        scaled = slid(scaled, state.places)
+    form = form_of(scaled, scaled_state.shape)
+    begin, point = _first_point(form, scaled_state, first)
+    shape = begin.with_unknowns(point)
+    total_twist = form.settled(point).total_twist
+    return SolverState(shape, scaled_state.end_force, scaled_state.units, scaled_state.places), total_twist
 
 
 def _sliding(scene: Scene) -> tuple[bool, ...]:
@@ -377,9 +397,7 @@ def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
 
 
 @functools.partial(compiled, static_argnames=("options",))
-def _first_state(
-    scene: Scene, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
+def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
@@ -389,10 +407,10 @@ def _first_state(
     if guess is None:
         no_twist = jnp.zeros_like(no_force[0]) if no_force.ndim == 1 else jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled)), no_twist
+        return SolverState(shape, no_force, units, sliding_places(scaled)), FirstTwist(no_twist)
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(units, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled)), guess.total_twist
+        return SolverState(shape, no_force, units, sliding_places(scaled)), FirstTwist(guess.total_twist)
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -404,7 +422,7 @@ def _first_state(
     places = sliding_places(scaled)
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
-    return SolverState(shape, end_force, state.units, places), guess.total_twist
+    return SolverState(shape, end_force, state.units, places), last_twist(guess)
 
 
 def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Float[Array, "3 *others"]:
@@ -417,31 +435,34 @@ def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Fl
 
 def _first_frames(
     scene: Scene, units: Units, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
+) -> tuple[SolverState, FirstTwist]:
     """The same for a nondimensional scene that needs frames."""
     of_joints = options.discretization == "finite_difference"
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     no_force = jnp.zeros(force_shape(scene, options.segments), s.dtype)
     if isinstance(guess, Equilibrium):
-        shape, twist = guess.state.shape, guess.total_twist
+        shape, first = guess.state.shape, last_twist(guess)
         if isinstance(shape, FramedCurve):
             end_force = _in_spans(guess.state.end_force, no_force.shape)
-            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), twist
+            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), first
         points = _in_units(guess.state, units).shape.points(pieces)
-        return SolverState(framed_through(scene, points, of_joints), no_force, units), twist
+        start = guess.scene.start
+        if isinstance(start, Clamp):
+            frames = framed_through(scene, points, of_joints, (start.frame, guess.total_twist))
+            return SolverState(frames, no_force, units), first
+        return SolverState(framed_through(scene, points, of_joints), no_force, units), FirstTwist(guess.total_twist)
     if guess is not None:
-        return SolverState(
-            framed_through(scene, guess.nodes(units, pieces), of_joints), no_force, units
-        ), guess.total_twist
-    return SolverState(first_frames(scene, s, of_joints), no_force, units), rest_twist(scene)
+        frames = framed_through(scene, guess.nodes(units, pieces), of_joints)
+        return SolverState(frames, no_force, units), FirstTwist(guess.total_twist)
+    return SolverState(first_frames(scene, s, of_joints), no_force, units), FirstTwist(rest_twist(scene))
 
 
-def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     # To the same bits, whatever is made of it in the same program.
     find = _slid if slides(scene) else _found
-    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), twist, options))
+    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), first, options))
 
 
 def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
@@ -464,15 +485,15 @@ class Search(eqx.Module):
     normal: Float[Array, "3"] | None
 
     @staticmethod
-    def of(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> "Search":
+    def of(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> "Search":
         form = form_of(scene, guess.shape)
-        shape, point = _first_point(form, guess, twist)
+        shape, point = _first_point(form, guess, first)
         if not options.planar:
             return Search(form, point, shape, guess.units, None, None)
         assert isinstance(form, MixedForm)
         assert isinstance(point, MixedPoint)
         normal, axes = plane(scene, point.tangents)
-        within = is_planar(scene, twist)
+        within = is_planar(scene, first.total_twist)
         return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
 
     def found(self, end: NewtonEnd) -> Found:
@@ -492,27 +513,27 @@ class Search(eqx.Module):
         return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
 
 
-def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
     solver = options.solver
     if isinstance(solver, Newton):
-        search = Search.of(scene, guess, twist, options)
+        search = Search.of(scene, guess, first, options)
         if isinstance(search.form, TouchingForm):
             assert isinstance(search.point, MixedPoint)
             return search.found(find_touching(search.form, search.point, solver, options.find))
         return search.found(find_equilibrium(search.form, search.point, solver, options.find))
     assert isinstance(guess.shape, Polyline)
-    problem, start = FiniteDifference.begin(scene, guess.shape, twist)
+    problem, start = FiniteDifference.begin(scene, guess.shape, first)
     minimum = minimize(problem, start, solver)
     point = minimum.problem.mixed_point(minimum.point)
     stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
 
 
-def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
     """The same where the rod slides through clips."""
     assert guess.places is not None
     assert isinstance(options.solver, Newton)
-    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, twist)
+    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
     if scene.turns is not None:
         # They are those of the first shape.
         scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
@@ -521,24 +542,24 @@ def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Op
     inner = options._replace(solver=dataclasses.replace(options.solver, tolerance=INNER_TOLERANCE * tolerance))
 
     def find_at(scene: Scene, last: Found) -> Found:
-        return _found(scene, last.state, last.point.total_twist, inner)
+        return _found(scene, last.state, FirstTwist(last.point.total_twist), inner)
 
     count = jnp.zeros((), int)
-    begin = Found(guess, point, Outcome(jnp.zeros_like(twist), count, count, count), jnp.array(False))
+    begin = Found(guess, point, Outcome(jnp.zeros_like(point.total_twist), count, count, count), jnp.array(False))
     return slid_free(scene, find_at, begin, tolerance, options.find)
 
 
-def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, Point]:
+def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:
     """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
     scene, shape, field = form.scene, guess.shape, form.field
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        quaternions = shape.turned_to_ends(form, twist)
+        quaternions = shape.turned_to_ends(form, first)
         if isinstance(form, ClippedFrameForm):
             end_force = form.force_change(form.of_force(guess.end_force))
         else:
             end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
-        return shape, form.holding(FramePoint(quaternions, end_force, twist))
+        return shape, form.holding(FramePoint(quaternions, end_force, first.total_twist))
     if isinstance(form, PartedForm):
         end_force = form.force_change(form.of_force(guess.end_force))
         if isinstance(shape, Curve):
@@ -547,23 +568,23 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
         else:
             assert isinstance(shape, Polyline)
             tangents = shape.tangents
-        return shape, MixedPoint(tangents, end_force, form.twist_near(tangents, twist, scene.turns))
+        return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
     if isinstance(shape, Polyline):
-        problem, start = FiniteDifference.begin(scene, shape, twist)
+        problem, start = FiniteDifference.begin(scene, shape, first)
         return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
     assert isinstance(field, HermiteElements)
     assert isinstance(shape, Curve)
     assert isinstance(form, MixedForm)
     tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
-    total_twist = form.twist_near(tangents, twist, scene.turns)
+    total_twist = form.first_twist(shape, tangents, first)
     end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
     return shape, MixedPoint(tangents, end_force, total_twist)
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
 @functools.partial(compiled, static_argnames=("options",))
-def _solve(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Equilibrium:
-    return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int))
+def _solve(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Equilibrium:
+    return equilibrium(scene, solve_from(scene, state, first, options), jnp.ones((), int))
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:

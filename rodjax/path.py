@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.compilation import compiled
+from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.equilibrium import (
     Discretization,
     Options,
@@ -22,6 +23,7 @@ from rodjax.equilibrium import (
     checked_options,
     first_state,
     refined_together,
+    settled_state,
     solve_from,
 )
 from rodjax.guess import Guess
@@ -59,8 +61,8 @@ def solve_path(
 
     **Arguments:**
 
-    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames may turn by
-      less than pi from one to the next.
+    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The frames of ends and
+      clips may turn by less than pi from one to the next.
     - `at_critical`: `"jump"`: where the branch of equilibria loses its stability the path goes on with the minimum
         found beyond, as a cable does. `"stop"`: it ends with the last scene before the first critical point of the
         branch, see `rodjax.follow`; eager only.
@@ -150,12 +152,10 @@ def _structure(scene: Scene) -> str:
 
 
 @functools.partial(compiled, static_argnames=("options", "progress"))
-def _solve_path(
-    scenes: Scene, state: SolverState, twist: Float[Array, ""], options: Options, progress: bool
-) -> Equilibrium:
+def _solve_path(scenes: Scene, state: SolverState, first: FirstTwist, options: Options, progress: bool) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
-    first = jax.tree.map(lambda leaf: leaf[0], scenes)
+    first_scene = jax.tree.map(lambda leaf: leaf[0], scenes)
 
     def step(carry, numbered):
         last, before, bar = carry
@@ -163,10 +163,16 @@ def _solve_path(
         found, substeps = _step(last, before, scene, options, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        return (_Station(scene, found.state, found.point.total_twist), last, bar), (found, substeps)
+        return (_Station(scene, found.state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
-    start = _Station(first, state, twist)
+    # Of a first shape the twist is settled here, so that all steps carry it alike.
+    here = last_of(first_scene)
+    if first.last is None or jax.tree.structure(first.last) != jax.tree.structure(here):
+        state, total_twist = settled_state(first_scene, state, first)
+        first = FirstTwist(total_twist, here)
+    assert first.last is not None
+    start = _Station(first_scene, state, first.total_twist, first.last)
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
@@ -182,11 +188,12 @@ def path_from(
 
 
 class _Station(eqx.Module):
-    """A scene on the path and the state found for it."""
+    """A scene on the path, the state found for it, and what the next one carries on from there."""
 
     scene: Scene
     state: SolverState
     total_twist: Float[Array, ""]
+    last: Last
 
 
 class _Progress(eqx.Module):
@@ -195,6 +202,7 @@ class _Progress(eqx.Module):
     reached: SolverState
     begin: SolverState
     total_twist: Float[Array, ""]
+    last: Last
     fraction: Float[Array, ""]
     share: Float[Array, ""]
     is_last_try: Bool[Array, ""]
@@ -211,7 +219,8 @@ def _step(
     def attempt(progress: _Progress) -> _Progress:
         target = jnp.minimum(progress.fraction + progress.share, 1.0)
         here = jax.lax.cond(target < 1.0, lambda: between(last.scene, scene, target), lambda: scene)
-        found = solve_from(here, progress.begin, progress.total_twist, options)
+        first = FirstTwist(progress.total_twist, progress.last._replace(shape=progress.reached.shape))
+        found = solve_from(here, progress.begin, first, options)
         converged = is_converged(found.outcome.status)
         reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
         is_smallest = progress.share <= 0.5**MAX_SPLITS
@@ -219,6 +228,7 @@ def _step(
             reached=reached,
             begin=reached,
             total_twist=jnp.where(converged, found.point.total_twist, progress.total_twist),
+            last=jax.tree.map(lambda new, old: jnp.where(converged, new, old), last_of(here), progress.last),
             fraction=jnp.where(converged, target, progress.fraction),
             share=jnp.where(converged, 2 * progress.share, jnp.where(is_smallest, 1.0, progress.share / 2)),
             is_last_try=~converged & is_smallest,
@@ -240,6 +250,7 @@ def _step(
         reached=last.state,
         begin=_predicted(last, before, scene),
         total_twist=last.total_twist,
+        last=last.last,
         fraction=zero,
         share=jnp.ones_like(zero),
         is_last_try=no,

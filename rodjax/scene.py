@@ -34,9 +34,11 @@ class Scene(eqx.Module):
     - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
-    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
-        total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only, and
-        no clip with a frame between them: there an earlier equilibrium as a guess carries the turns of each span.
+    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an
+        earlier equilibrium whose scene states its turns too, beyond those. `None`: the turns of an earlier equilibrium,
+        whose frames turn by less than pi to those of this scene, so that turns are carried along a path; else the total
+        twist nearest to that of the initial shape. Two clamps only, and no clip with a frame between them: there an
+        earlier equilibrium as a guess carries the turns of each span.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at

@@ -409,7 +409,7 @@ def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Optio
         shape = kind.through(first_shape(scaled, pieces))
         return SolverState(shape, no_force, units, sliding_places(scaled)), FirstTwist(no_twist)
     if isinstance(guess, Guess):
-        shape = kind.through(guess.nodes(units, pieces))
+        shape = kind.through(guess.nodes(scaled, units, pieces))
         return SolverState(shape, no_force, units, sliding_places(scaled)), FirstTwist(guess.total_twist)
     state = guess.state
     if isinstance(state.shape, FramedCurve):
@@ -453,7 +453,7 @@ def _first_frames(
             return SolverState(frames, no_force, units), first
         return SolverState(framed_through(scene, points, of_joints), no_force, units), FirstTwist(guess.total_twist)
     if guess is not None:
-        frames = framed_through(scene, guess.nodes(units, pieces), of_joints)
+        frames = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
         return SolverState(frames, no_force, units), FirstTwist(guess.total_twist)
     return SolverState(first_frames(scene, s, of_joints), no_force, units), FirstTwist(rest_twist(scene))
 

@@ -232,6 +232,52 @@ def held_position(scene: Scene) -> Float[Array, "3"]:
     return held.position
 
 
+def scene_axes(scene: Scene) -> Float[Array, "3 3"]:
+    """Three unit vectors, the columns, that turn with the scene: where a search has to choose a direction and none is
+    better than the others, its choice is one of these.
+
+    A held frame; else by the first two directions that the scene has, of gravity, held tangents, ways between
+    positions, and loads. In a scene that has no two, all across the one are alike.
+    """
+    start, end = scene.start, scene.end
+    frames = [held.frame for held in (start, end, *scene.clips) if isinstance(held, Clamp | Clip)]
+    for frame in frames:
+        if frame is not None:
+            return frame
+    directions = [] if scene.gravity is None else [scene.gravity]
+    directions += [end.tangent for end in (start, end) if isinstance(end, Swivel)]
+    directions += [clip.tangent for clip in scene.clips if clip.tangent is not None]
+    positions = [held.position for held in (start, *scene.clips, end) if isinstance(held, Held | Clip)]
+    directions += [position - positions[0] for position in positions[1:]]
+    directions += [load.force for load in scene.point_forces]
+    ends = [end for end in (start, end) if isinstance(end, Free) and not end.follower]
+    directions += [load for end in ends for load in (end.force, end.moment) if load is not None]
+    for load in scene.distributed:
+        if not load.follower:
+            directions.append(load.force if isinstance(load, DistributedForce) else load.couple)
+    identity = jnp.eye(3, dtype=scene.rod.length.dtype)
+    # Of none of these the last axis, and of one another one that is not along it.
+    along = _first_of(jnp.stack([*directions, identity[2]]))
+    others = jnp.stack([*directions, identity[0], identity[1]])
+    sizes = jnp.sqrt(jnp.sum(others**2, axis=1))
+    others /= jnp.where(sizes > LEAST_DIRECTION, sizes, 1.0)[:, None]
+    across = others - (others @ along)[:, None] * along[None]
+    d1 = _first_of(jnp.where(jnp.sum(across**2, axis=1) > LEAST_ANGLE**2, across.T, 0.0).T)
+    return jnp.stack([d1, jnp.cross(along, d1), along], axis=1)
+
+
+# Vectors in the units of the rod, and parts of unit vectors across others, that are taken for none: roundings are less.
+LEAST_DIRECTION = 1e-9
+LEAST_ANGLE = 1e-3
+
+
+def _first_of(vectors: Float[Array, "k 3"]) -> Float[Array, "3"]:
+    """The first that is not zero, at the length 1."""
+    sizes = jnp.sqrt(jnp.sum(vectors**2, axis=1))
+    k = jnp.argmax(sizes > LEAST_DIRECTION)
+    return vectors[k] / sizes[k]
+
+
 def held_at_both_ends(scene: Scene) -> bool:
     """Whether the positions of both ends are given."""
     return isinstance(scene.start, Held) and isinstance(scene.end, Held)

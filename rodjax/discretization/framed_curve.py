@@ -18,7 +18,7 @@ from rodjax.discretization.twist import nearest_twist
 from rodjax.guess import cubic, first_shape
 from rodjax.rest import RestStrain
 from rodjax.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
-from rodjax.scene import Scene, held_at_both_ends
+from rodjax.scene import Scene, held_at_both_ends, scene_axes
 from rodjax.supports import Clamp, Directed, Held, Swivel
 from rodjax.vectors import dot
 
@@ -211,24 +211,36 @@ def framed_through(
     of_joints: bool,
     last: tuple[Float[Array, "3 3"], Float[Array, ""]] | None = None,
 ) -> FramedCurve:
-    """Through points, as many as a mesh has nodes, or nodes and middles of elements; twisted as the rod at rest, or
-    evenly where `last` gives the first frame and the total twist [rad].
+    """Through points, as many as a mesh has nodes, or nodes and middles of elements, with the tangents that ends hold;
+    twisted as the rod at rest, and evenly beside that towards the frames that they hold. Where `last` gives the first
+    frame and the total twist [rad], twisted evenly by that.
     """
     shape = (Polyline if of_joints else Curve).through(points)
     nodes, tangents = shape.nodes, shape.tangents
     if of_joints:
         tangents = jnp.concatenate([tangents[:, :1], tangents, tangents[:, -1:]], axis=1)
     s = jnp.linspace(0.0, 1.0, len(nodes), dtype=points.dtype)
+    places = _cells(s, of_joints).places
     if last is not None:
         frame, total_twist = last
-        places = _cells(s, of_joints).places
         return FramedCurve(nodes, spun(carried(from_frame(frame), tangents), total_twist * places), s)
-    first = from_frame(scene.start.frame) if isinstance(scene.start, Clamp) else jnp.eye(1, 4, dtype=s.dtype)[0]
+    start, end = scene.start, scene.end
+    if isinstance(shape, Curve):
+        # As a rod without frames begins.
+        tangents = shape.turned_to_ends(scene, places)
+    if isinstance(start, Directed):
+        tangents = tangents.at[:, 0].set(start.tangent)
+    if isinstance(end, Directed):
+        tangents = tangents.at[:, -1].set(end.tangent)
+    first = from_frame(start.frame if isinstance(start, Clamp) else scene_axes(scene))
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-    twist = _twist_at_rest(scene, _cells(s, of_joints).places)
-    return FramedCurve(nodes, spun(carried(first, tangents), twist), s)
+    q = spun(carried(first, tangents), _twist_at_rest(scene, places))
+    if isinstance(end, Clamp):
+        spin = _spin_between(q[:, -1], nearer(from_frame(end.frame), q[:, -1]))
+        q = spun(q, spin * places if isinstance(start, Clamp) else jnp.broadcast_to(spin, places.shape))
+    return FramedCurve(nodes, q, s)
 
 
 def rest_twist(scene: Scene) -> Float[Array, ""]:
@@ -262,7 +274,7 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     from_end = not isinstance(start, Held) or (isinstance(end, Clamp) and not isinstance(start, Directed))
     k, support = (-1, end) if from_end else (0, start)
     assert isinstance(support, Held)
-    held = q[:, k]
+    held = product(from_frame(scene_axes(scene)), q[:, k])
     if isinstance(support, Clamp):
         held = from_frame(support.frame)
     elif isinstance(support, Swivel):

@@ -38,7 +38,8 @@ class Along(eqx.Module):
 
 
 class Steps(Along):
-    """Constant between jumps. Meshes of elements have a node at each jump.
+    """Constant between jumps. Meshes of elements have a node at each jump: as many segments as make the elements between
+    two of them no shorter than 0.05 L/segments, which a solve chooses, or asks for where `segments` are given.
 
     `jumps`: (k,) [m], increasing, inside the rod; `values`: (k + 1,), before, between and beyond them.
     """

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import instance, is_known, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
+from rodjax.discretization.cells import segments_for_jumps
 from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist, last_of
@@ -25,6 +26,7 @@ from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
@@ -299,12 +301,14 @@ def checked_options(
         rtol = DEFAULT_RTOL
     # A node for each clip, and where the mesh is chosen a few of them in each span.
     least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
+    least = _least_for_jumps(scene, segments, least) if discretization == "hermite" else least
     if segments is not None:
         segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
     elif isinstance(guess, Equilibrium):
         segments = max(guess.s.shape[-1] - 1, least)
     elif rtol is not None and is_known(scene, guess):
-        segments = first_size(rtol, discretization, SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0)
+        wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
+        segments = first_size(rtol, discretization, max(wanted, least))
     else:
         segments = TRACED_SEGMENTS[discretization]
     one_of(find, "find", typing.get_args(Find))
@@ -316,6 +320,20 @@ def checked_options(
             raise ValueError("solver must be a Newton where planar is True")
         check_planar(scene, 0.0 if guess is None else guess.total_twist)
     return Options(segments, discretization, solver, planar, find), rtol
+
+
+def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
+    """The fewest elements, or more where a rod whose numbers are known has `Steps` near to one another."""
+    needed = segments_for_jumps(scene) if needs_frames(scene) and is_known(scene) else None
+    if needed is None or needed[0] <= (SIZES["hermite"][-1] if segments is None else segments):
+        return least if needed is None else max(least, needed[0])
+    count, gap = needed
+    where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
+    given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
+    raise ValueError(
+        f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "
+        f"needs segments = {count} or more, and {given}"
+    )
 
 
 def check_single(guess: Guess | Equilibrium | None) -> None:

@@ -21,6 +21,8 @@ from rodjax.units import Units
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
 # by half of its length.
 MAX_SPAN = 1.5
+# Positions nearer to one another than this part of the length are one place.
+ONE_PLACE = 1e-6
 
 
 class Scene(eqx.Module):
@@ -168,6 +170,25 @@ def _check_numbers(scene: Scene) -> None:
                 f"reaches at most {MAX_SPAN * length:g} m"
             )
     _check_clips(scene, length)
+    _check_turning(scene, length)
+
+
+def _check_turning(scene: Scene, length: float) -> None:
+    """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
+    if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
+        return
+    loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
+    loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
+    if loaded or any(clip.direction is not None for clip in scene.clips):
+        return
+    held = [
+        np.asarray(held.position) for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Pin | Clip)
+    ]
+    if max(float(np.max(np.abs(position - held[0]))) for position in held) <= ONE_PLACE * length:
+        raise ValueError(
+            f"all pins and clips are at one place, {held[0].tolist()} m: without gravity or a force the rod can turn "
+            "freely about it; move one of them or make one hold the tangent"
+        )
 
 
 def _check_clips(scene: Scene, length: float) -> None:

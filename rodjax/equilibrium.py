@@ -372,7 +372,9 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
     """Where to begin, and with which total twist: as the guess has it, where its mesh is kept."""
     if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
         state = guess.state
-        return SolverState(state.shape, state.end_force, state.units, state.places), last_twist(guess)
+        first = last_twist(guess)
+        if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
+            return SolverState(state.shape, state.end_force, state.units, state.places), first
     return _first_state(scene, guess, options)
 
 
@@ -416,6 +418,20 @@ def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
 
 @functools.partial(compiled, static_argnames=("options",))
 def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Cold starts look like warm ones, so that both have one program."""
+    state, first = _unsettled_state(scene, guess, options)
+    here = last_of(scene)
+    if first.last is not None and jax.tree.structure(first.last) == jax.tree.structure(here):
+        return state, first
+    if options.planar:
+        return state, FirstTwist(first.total_twist, here)
+    state, total_twist = settled_state(scene, state, first)
+    return state, FirstTwist(total_twist, here)
+
+
+def _unsettled_state(
+    scene: Scene, guess: Guess | Equilibrium | None, options: Options
+) -> tuple[SolverState, FirstTwist]:
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments

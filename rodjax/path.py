@@ -23,7 +23,6 @@ from rodjax.equilibrium import (
     checked_options,
     first_state,
     refined_together,
-    settled_state,
     solve_from,
 )
 from rodjax.guess import Guess
@@ -166,11 +165,6 @@ def _solve_path(scenes: Scene, state: SolverState, first: FirstTwist, options: O
         return (_Station(scene, found.state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
-    # Of a first shape the twist is settled here, so that all steps carry it alike.
-    here = last_of(first_scene)
-    if first.last is None or jax.tree.structure(first.last) != jax.tree.structure(here):
-        state, total_twist = settled_state(first_scene, state, first)
-        first = FirstTwist(total_twist, here)
     assert first.last is not None
     start = _Station(first_scene, state, first.total_twist, first.last)
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))

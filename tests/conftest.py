@@ -1,7 +1,6 @@
 """Settings of every test: double precision, strict dtype and rank promotion, a compilation cache kept between runs."""
 
 import os
-from pathlib import Path
 
 import jax
 import pytest
@@ -37,19 +36,6 @@ def pytest_collection_modifyitems(config, items):
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(skip)
-
-
-# A compiled program takes hundreds of memory maps, of which Linux allows a process 65530: beyond, compiling crashes it.
-MOST_MAPS = 30_000
-
-
-@pytest.fixture(autouse=True)
-def _few_compiled_programs():
-    """Drops all compiled programs where a worker has gathered very many; those needed again come from the cache."""
-    yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
-        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

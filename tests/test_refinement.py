@@ -8,7 +8,8 @@ from scipy.interpolate import CubicSpline
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
-from rodjax.equilibrium import TRACED_SEGMENTS, Discretization, _solve
+from rodjax.compilation import program_count
+from rodjax.equilibrium import TRACED_SEGMENTS, Discretization
 from rodjax.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
 TWISTED = Scene(
@@ -57,11 +58,6 @@ def test_a_tolerance_is_met_and_not_by_far(scene_and_truth):
         np.testing.assert_array_equal(again.nodes, result.nodes)
 
 
-def compiled_programs() -> int:
-    programs = [cell.cell_contents for cell in _solve.__closure__ or ()]  # a whole program, and a part of others
-    return sum(program._cache_size() for program in programs if hasattr(program, "_cache_size"))
-
-
 @pytest.mark.parametrize(
     ("discretization", "asked"), [("hermite", {}), ("finite_difference", dict(discretization="finite_difference"))]
 )
@@ -73,11 +69,11 @@ def test_without_segments_the_error_is_below_a_thousandth(scene_and_truth, discr
     assert result.error_estimate < 1e-3
     # Seen 2.7e-4 and 3.1e-4 with 8 elements, 2.0e-4 and 2.2e-4 with 64 edges.
     assert true_error(result, truth) < 1e-3
-    programs = compiled_programs()
+    programs = program_count()
     again = rj.solve(scene, guess=result)
     assert again.discretization == discretization
     assert again.iterations == 0
-    assert compiled_programs() == programs
+    assert program_count() == programs
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, leaf, one_of, positive, sequence, whole_number
 from rodjax.compilation import compiled
-from rodjax.equilibrium import Discretization, checked_options, first_state, settled_state, solve
+from rodjax.equilibrium import Discretization, checked_options, first_state, solve
 from rodjax.guess import Guess
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import THRESHOLDS, Loss
@@ -325,13 +325,13 @@ def beginnings(
         options, _ = checked_options(
             scene, structure.segments, None, structure.discretization, None, guess, structure.planar
         )
-        state, twist = settled_state(scene, *first_state(scene, guess, options))
+        state, first = first_state(scene, guess, options)
         solve_it = functools.partial(
             solve, segments=structure.segments, discretization=structure.discretization, planar=structure.planar
         )
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solve_it, scene))
         return eqx.tree_at(
-            lambda result: (result.scene, result.state, result.total_twist), blank, (scene, state, twist)
+            lambda result: (result.scene, result.state, result.total_twist), blank, (scene, state, first.total_twist)
         )
 
     return tuple(

@@ -108,7 +108,7 @@ def by_lbfgs(count: int, segments: int, seed: int) -> float:
     minimized = None
     start = time.perf_counter()
     for number, scene in enumerate(some):
-        state, twist = first_state(scene, None, options)
+        state, (twist, _) = first_state(scene, None, options)
         here = begin(scene, state.shape, twist)
         zero = jnp.zeros(here[0].no_displacement(here[1]).size)
         if minimized is None:

@@ -114,10 +114,10 @@ def scenes() -> dict[str, Scene]:
 @eqx.filter_jit
 def discretized(scene: Scene, segments: int) -> Discretized:
     options = Options(segments, "finite_difference", Newton(), planar=False)
-    state, twist = first_state(scene, problems.figure_1_start(), options)
+    state, first = first_state(scene, problems.figure_1_start(), options)
     scaled, _ = nondimensional(scene)
     assert isinstance(state.shape, Polyline)
-    problem, polyline = FiniteDifference.begin(scaled, state.shape, twist)
+    problem, polyline = FiniteDifference.begin(scaled, state.shape, first)
     form = MixedForm.of(scaled, EdgeTangents.of(scaled, segments))
     return Discretized(scene, form, problem.mixed_point(polyline), problem, polyline)
 

@@ -27,6 +27,7 @@ from scipy.interpolate import CubicSpline
 import rodjax
 from rodjax import problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_twist import FirstTwist
 from rodjax.equilibrium import Discretization, Options, first_state
 from rodjax.path import stack_scenes
 from rodjax.scene import nondimensional
@@ -139,7 +140,7 @@ class Rodjax:
 
 def begun(scene: rodjax.Scene, polyline: Polyline, twist: Float[Array, ""]) -> tuple[FiniteDifference, Polyline]:
     """The discretized scene, and where to begin."""
-    return FiniteDifference.begin(nondimensional(scene)[0], polyline, twist)
+    return FiniteDifference.begin(nondimensional(scene)[0], polyline, FirstTwist(twist))
 
 
 def moved(problem: FiniteDifference, polyline: Polyline, x: Float[Array, "3*m"]) -> Polyline:
@@ -178,7 +179,7 @@ class Minimizer:
 
     def prepared(self, problem: Problem, segments: int) -> Prepared:
         options = Options(segments, "finite_difference", rodjax.Newton(), planar=False)
-        state, twist = first_state(problem.scenes[0], problem.guess, options)
+        state, (twist, _) = first_state(problem.scenes[0], problem.guess, options)
         assert isinstance(state.shape, Polyline)
         first = state.shape
         begin, begin_s = compiled(begun, problem.scenes[0], first, twist)

@@ -38,7 +38,8 @@ class Along(eqx.Module):
 
 
 class Steps(Along):
-    """Constant between jumps. Meshes of elements have a node at each jump.
+    """Constant between jumps. Meshes of elements have a node at each jump, of so many segments that the elements
+    between two of them are not shorter than 0.05 L/segments: a solve chooses these, and refuses fewer.
 
     `jumps`: (k,) [m], increasing, inside the rod; `values`: (k + 1,), before, between and beyond them.
     """

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 from tqdm import tqdm
 
 from rodjax.checks import instance, is_known, sequence
 from rodjax.compilation import compiled
+from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.equilibrium import (
     Discretization,
@@ -243,10 +244,10 @@ def _solve_here(
         path = functools.partial(path_from, strain_limit=strain_limit, options=options)
         return jax.vmap(path, in_axes)(scenes, guess)
 
-    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, Float[Array, ""]]:
+    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, FirstTwist]:
         return first_state(scene, guess, options)
 
-    def search(scene: Scene, start: tuple[SolverState, Float[Array, ""]]) -> Search:
+    def search(scene: Scene, start: tuple[SolverState, FirstTwist]) -> Search:
         return Search.of(*in_units_of(scene, start[0]), start[1], options)
 
     def result(scene: Scene, found: Found) -> Equilibrium:

@@ -1,6 +1,9 @@
 """How the library's programs are compiled: in half the time, and once only where they are kept on disk."""
 
 import functools
+import gc
+import itertools
+import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,17 +19,102 @@ from rodjax.checks import is_known
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 _OUTSIDE = get_opaque_trace_state()
 
+# A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
+# crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
+SHARE_OF_MAPS = 0.5
+_MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+_log = logging.getLogger("rodjax")
+
+
+class _Programs:
+    """All that one function has been compiled to, and when it was last called."""
+
+    def __init__(self, function: Callable, static_argnames: Sequence[str]):
+        self.part: Any = jax.jit(function, static_argnames=static_argnames)
+        self.quick: Any = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
+        self.last_call = 0
+
+    @property
+    def count(self) -> int:
+        return self.part._cache_size() + self.quick._cache_size()
+
+    def clear(self) -> None:
+        self.part.clear_cache()
+        self.quick.clear_cache()
+
+
+_compiled: list[_Programs] = []
+_calls = itertools.count(1)
+
 
 def compiled(function: Callable, static_argnames: Sequence[str] = ()) -> Callable:
-    """`jax.jit` of a function, compiled with `QUICK` where it is a program of its own and not a part of another."""
-    part = jax.jit(function, static_argnames=static_argnames)
-    quick = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
+    """`jax.jit` of a function, compiled with `QUICK` where it is a program of its own and not a part of another.
+
+    Programs are kept as long as the process has room for them, see `SHARE_OF_MAPS`.
+    """
+    programs = _Programs(function, static_argnames)
+    _compiled.append(programs)
 
     @functools.wraps(function)
     def call(*args, **options):
-        return (quick if _is_whole(args, options) and _knows_quick() else part)(*args, **options)
+        if not _is_whole(args, options):
+            return programs.part(*args, **options)
+        run = programs.quick if _knows_quick() else programs.part
+        known = run._cache_size()
+        result = run(*args, **options)
+        programs.last_call = next(_calls)
+        if run._cache_size() != known:
+            _make_room()
+        return result
 
     return call
+
+
+def program_count() -> int:
+    """How many programs the library's own functions have been compiled to and keep in memory."""
+    return sum(programs.count for programs in _compiled)
+
+
+def _make_room() -> None:
+    """Drops programs, those of the functions called longest ago first, where the process has nearly too many maps."""
+    most = _most_maps()
+    if most is None or _maps() <= SHARE_OF_MAPS * most:
+        return
+    _say_once()
+    for programs in sorted(_compiled, key=lambda programs: programs.last_call):
+        if not programs.count:
+            continue
+        programs.clear()
+        gc.collect()
+        if _maps() <= SHARE_OF_MAPS * most / 2:
+            return
+    if _maps() > SHARE_OF_MAPS * most:
+        # Programs that others have compiled.
+        jax.clear_caches()
+
+
+def _maps() -> int:
+    return _MAPS.read_bytes().count(b"\n")
+
+
+@functools.cache
+def _most_maps() -> int | None:
+    """As many memory maps as a process may have; `None` where none is known to be the most."""
+    try:
+        return int(_MOST_MAPS.read_text()) if _MAPS.exists() else None
+    except (OSError, ValueError):
+        return None
+
+
+@functools.cache
+def _say_once() -> None:
+    # Not a warning, which may have been made an exception: the result of the call would be lost.
+    _log.warning(
+        "rodjax drops compiled programs, those used longest ago first: more would crash the process, which Linux "
+        "allows %s memory maps (vm.max_map_count). Scenes of one structure and mesh share programs; "
+        "rodjax.enable_compilation_cache() keeps them on disk.",
+        _most_maps(),
+    )
 
 
 def _is_whole(*args: Any) -> bool:

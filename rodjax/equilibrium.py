@@ -17,14 +17,17 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
+from rodjax.discretization.cells import segments_for_jumps
 from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_twist import FirstTwist, last_of
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
@@ -63,6 +66,7 @@ from rodjax.sliding_search import INNER_TOLERANCE, slid_free
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Outcome, Status, is_converged
+from rodjax.supports import Clamp
 from rodjax.units import Units
 
 Solver = Newton | NonlinearCG
@@ -186,7 +190,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
             defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
         lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
         options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
-        finer = _solve(result.scene, _finer(result, defects, options), result.total_twist, strain_limit, options)
+        finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
             finer,
@@ -355,12 +359,14 @@ def checked_options(
         rtol = DEFAULT_RTOL
     # A node for each clip, and where the mesh is chosen a few of them in each span.
     least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
+    least = _least_for_jumps(scene, segments, least) if discretization == "hermite" else least
     if segments is not None:
         segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
     elif isinstance(guess, Equilibrium):
         segments = max(guess.s.shape[-1] - 1, least)
     elif rtol is not None and is_known(scene, guess):
-        segments = first_size(rtol, discretization, SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0)
+        wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
+        segments = first_size(rtol, discretization, max(wanted, least))
     else:
         segments = TRACED_SEGMENTS[discretization]
         warn_of_unknown_mesh(segments)
@@ -373,6 +379,20 @@ def checked_options(
             raise ValueError("solver must be a Newton where planar is True")
         check_planar(scene, 0.0 if guess is None else guess.total_twist)
     return Options(segments, discretization, solver, planar, find), rtol
+
+
+def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
+    """The fewest elements, or more where a rod whose numbers are known has `Steps` near to one another."""
+    needed = segments_for_jumps(scene) if needs_frames(scene) and is_known(scene) else None
+    if needed is None or needed[0] <= (SIZES["hermite"][-1] if segments is None else segments):
+        return least if needed is None else max(least, needed[0])
+    count, gap = needed
+    where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
+    given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
+    raise ValueError(
+        f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "
+        f"needs segments = {count} or more, and {given}"
+    )
 
 
 def check_single(guess: Guess | Equilibrium | None) -> None:
@@ -415,15 +435,35 @@ def _is_by_differences(shape: Shape) -> bool:
     return isinstance(shape, Polyline) or (isinstance(shape, FramedCurve) and shape.is_of_joints)
 
 
-def first_state(
-    scene: Scene, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
-    """Where to begin, and the total twist to stay near to [rad]: as the guess has it, where its mesh is kept."""
+def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Where to begin, and with which total twist: as the guess has it, where its mesh is kept."""
     if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
         state = guess.state
-        before = _before(scene, guess)
-        return SolverState(state.shape, state.end_force, state.units, state.places, before=before), guess.total_twist
+        first = last_twist(guess)
+        if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
+            before = _before(scene, guess)
+            return SolverState(state.shape, state.end_force, state.units, state.places, before=before), first
     return _first_state(scene, guess, options)
+
+
+def last_twist(result: Equilibrium) -> FirstTwist:
+    """The total twist of an equilibrium, to be carried to the next one."""
+    return FirstTwist(result.total_twist, last_of(result.scene))
+
+
+def settled_state(scene: Scene, state: SolverState, first: FirstTwist) -> tuple[SolverState, Float[Array, ""]]:
+    """The same beginning with the tangents and frames that the scene holds, and the total twist there [rad]."""
+    if not needs_frames(scene) and not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
+        return state, first.total_twist
+    scaled, scaled_state = in_units_of(scene, state)
+    if slides(scene):
+        assert state.places is not None
+        scaled = slid(scaled, state.places)
+    form = form_of(scaled, scaled_state.shape)
+    begin, point = _first_point(form, scaled_state, first)
+    shape = begin.with_unknowns(point)
+    total_twist = form.settled(point).total_twist
+    return dataclasses.replace(scaled_state, shape=shape), total_twist
 
 
 def _sliding(scene: Scene) -> tuple[bool, ...]:
@@ -445,9 +485,21 @@ def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
 
 
 @functools.partial(compiled, static_argnames=("options",))
-def _first_state(
+def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Cold starts look like warm ones, so that both have one program."""
+    state, first = _unsettled_state(scene, guess, options)
+    here = last_of(scene)
+    if first.last is not None and jax.tree.structure(first.last) == jax.tree.structure(here):
+        return state, first
+    if options.planar:
+        return state, FirstTwist(first.total_twist, here)
+    state, total_twist = settled_state(scene, state, first)
+    return state, FirstTwist(total_twist, here)
+
+
+def _unsettled_state(
     scene: Scene, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
+) -> tuple[SolverState, FirstTwist]:
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
@@ -458,10 +510,11 @@ def _first_state(
     if guess is None:
         no_twist = jnp.zeros_like(no_force[0]) if no_force.ndim == 1 else jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), no_twist
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), FirstTwist(no_twist)
     if isinstance(guess, Guess):
-        shape = kind.through(guess.nodes(units, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), guess.total_twist
+        shape = kind.through(guess.nodes(scaled, units, pieces))
+        twist = FirstTwist(guess.total_twist)
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -475,7 +528,7 @@ def _first_state(
         places = state.places
     if scene.obstacles:
         shape, end_force = _on_its_side(guess, shape, end_force)
-    return SolverState(shape, end_force, state.units, places, before=before), guess.total_twist
+    return SolverState(shape, end_force, state.units, places, before=before), last_twist(guess)
 
 
 def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Float[Array, "3 *others"]:
@@ -488,31 +541,34 @@ def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Fl
 
 def _first_frames(
     scene: Scene, units: Units, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, Float[Array, ""]]:
+) -> tuple[SolverState, FirstTwist]:
     """The same for a nondimensional scene that needs frames."""
     of_joints = options.discretization == "finite_difference"
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     no_force = jnp.zeros(force_shape(scene, options.segments), s.dtype)
     if isinstance(guess, Equilibrium):
-        shape, twist = guess.state.shape, guess.total_twist
+        shape, first = guess.state.shape, last_twist(guess)
         if isinstance(shape, FramedCurve):
             end_force = _in_spans(guess.state.end_force, no_force.shape)
-            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), twist
+            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), first
         points = _in_units(guess.state, units).shape.points(pieces)
-        return SolverState(framed_through(scene, points, of_joints), no_force, units), twist
+        start = guess.scene.start
+        if isinstance(start, Clamp):
+            frames = framed_through(scene, points, of_joints, (start.frame, guess.total_twist))
+            return SolverState(frames, no_force, units), first
+        return SolverState(framed_through(scene, points, of_joints), no_force, units), FirstTwist(guess.total_twist)
     if guess is not None:
-        return SolverState(
-            framed_through(scene, guess.nodes(units, pieces), of_joints), no_force, units
-        ), guess.total_twist
-    return SolverState(first_frames(scene, s, of_joints), no_force, units), rest_twist(scene)
+        frames = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
+        return SolverState(frames, no_force, units), FirstTwist(guess.total_twist)
+    return SolverState(first_frames(scene, s, of_joints), no_force, units), FirstTwist(rest_twist(scene))
 
 
-def solve_from(scene: Scene, state: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:
     """The one code path of every solve: from a state to where the solver stops."""
     # To the same bits, whatever is made of it in the same program.
     find = _slid if slides(scene) else _found
-    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), twist, options))
+    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), first, options))
 
 
 def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
@@ -535,15 +591,15 @@ class Search(eqx.Module):
     normal: Float[Array, "3"] | None
 
     @staticmethod
-    def of(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> "Search":
+    def of(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> "Search":
         form = form_of(scene, guess.shape)
-        shape, point = _first_point(form, guess, twist)
+        shape, point = _first_point(form, guess, first)
         if not options.planar:
             return Search(form, point, shape, guess.units, None, None)
         assert isinstance(form, MixedForm)
         assert isinstance(point, MixedPoint)
         normal, axes = plane(scene, point.tangents)
-        within = is_planar(scene, twist)
+        within = is_planar(scene, first.total_twist)
         return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
 
     def found(self, end: NewtonEnd) -> Found:
@@ -563,17 +619,17 @@ class Search(eqx.Module):
         return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
 
 
-def _found(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
     solver = options.solver
     if isinstance(solver, Newton):
-        search = Search.of(scene, guess, twist, options)
+        search = Search.of(scene, guess, first, options)
         if isinstance(search.form, TouchingForm):
             assert isinstance(search.point, MixedPoint)
             end = find_touching(search.form, search.point, solver, options.find)
             return _on_one_side(search, search.found(end), guess)
         return search.found(find_equilibrium(search.form, search.point, solver, options.find))
     assert isinstance(guess.shape, Polyline)
-    problem, start = FiniteDifference.begin(scene, guess.shape, twist)
+    problem, start = FiniteDifference.begin(scene, guess.shape, first)
     minimum = minimize(problem, start, solver)
     point = minimum.problem.mixed_point(minimum.point)
     stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
@@ -602,11 +658,11 @@ def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
     )
 
 
-def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Options) -> Found:
+def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
     """The same where the rod slides through clips."""
     assert guess.places is not None
     assert isinstance(options.solver, Newton)
-    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, twist)
+    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
     if scene.turns is not None:
         # They are those of the first shape.
         scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
@@ -615,24 +671,24 @@ def _slid(scene: Scene, guess: SolverState, twist: Float[Array, ""], options: Op
     inner = options._replace(solver=dataclasses.replace(options.solver, tolerance=INNER_TOLERANCE * tolerance))
 
     def find_at(scene: Scene, last: Found) -> Found:
-        return _found(scene, last.state, last.point.total_twist, inner)
+        return _found(scene, last.state, FirstTwist(last.point.total_twist), inner)
 
     count = jnp.zeros((), int)
-    begin = Found(guess, point, Outcome(jnp.zeros_like(twist), count, count, count), jnp.array(False))
+    begin = Found(guess, point, Outcome(jnp.zeros_like(point.total_twist), count, count, count), jnp.array(False))
     return slid_free(scene, find_at, begin, tolerance, options.find)
 
 
-def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tuple[Shape, Point]:
+def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:
     """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
     scene, shape, field = form.scene, guess.shape, form.field
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        quaternions = shape.turned_to_ends(form, twist)
+        quaternions = shape.turned_to_ends(form, first)
         if isinstance(form, ClippedFrameForm):
             end_force = form.force_change(form.of_force(guess.end_force))
         else:
             end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
-        return shape, form.holding(FramePoint(quaternions, end_force, twist))
+        return shape, form.holding(FramePoint(quaternions, end_force, first.total_twist))
     if isinstance(form, PartedForm):
         end_force = form.force_change(form.of_force(guess.end_force))
         if isinstance(shape, Curve):
@@ -641,15 +697,15 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
         else:
             assert isinstance(shape, Polyline)
             tangents = shape.tangents
-        return shape, MixedPoint(tangents, end_force, form.twist_near(tangents, twist, scene.turns))
+        return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
     if isinstance(shape, Polyline):
-        problem, start = FiniteDifference.begin(scene, shape, twist)
+        problem, start = FiniteDifference.begin(scene, shape, first)
         return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
     assert isinstance(field, HermiteElements)
     assert isinstance(shape, Curve)
     assert isinstance(form, MixedForm)
     tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
-    total_twist = form.twist_near(tangents, twist, scene.turns)
+    total_twist = form.first_twist(shape, tangents, first)
     end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
     return shape, MixedPoint(tangents, end_force, total_twist)
 
@@ -659,11 +715,11 @@ def _first_point(form: Form, guess: SolverState, twist: Float[Array, ""]) -> tup
 def _solve(
     scene: Scene,
     state: SolverState,
-    twist: Float[Array, ""],
+    first: FirstTwist,
     strain_limit: Float[Array, ""] | float,
     options: Options,
 ) -> Equilibrium:
-    return equilibrium(scene, solve_from(scene, state, twist, options), jnp.ones((), int), strain_limit)
+    return equilibrium(scene, solve_from(scene, state, first, options), jnp.ones((), int), strain_limit)
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, number_array, shown
 from rodjax.discretization.joints import generic_field
-from rodjax.scene import Scene
+from rodjax.scene import Scene, scene_axes
 from rodjax.supports import Directed, Free, Held, Support, Swivel
 from rodjax.units import Units
 
@@ -40,17 +40,18 @@ class Guess(eqx.Module):
         self.points = leaf(number_array(points, "points", shape))
         self.total_twist = leaf(number_array(total_twist, "total_twist"))
 
-    def nodes(self, units: Units, segments: int) -> Float[Array, "n+1 3"]:
-        """The nodes of a mesh on this shape, nondimensional."""
-        return _unfolded(resampled((self.points - units.origin[None]) / units.length, segments))
+    def nodes(self, scene: Scene, units: Units, segments: int) -> Float[Array, "n+1 3"]:
+        """The nodes of a mesh on this shape, for a nondimensional scene."""
+        nodes = resampled((self.points - units.origin[None]) / units.length, segments)
+        return _unfolded(nodes, scene_axes(scene))
 
 
-def _unfolded(nodes: Float[Array, "n+1 3"]) -> Float[Array, "n+1 3"]:
+def _unfolded(nodes: Float[Array, "n+1 3"], axes: Float[Array, "3 3"]) -> Float[Array, "n+1 3"]:
     """Where an edge runs back along the last one, or has no length, all edges a little aside: such have no torsion."""
     edges = jnp.diff(nodes, axis=0)
     lengths = jnp.sqrt(jnp.sum(edges**2, axis=1))
     least = ASIDE * jnp.maximum(jnp.mean(lengths), ASIDE / len(edges))
-    aside = edges + least * generic_field(edges.T).T
+    aside = edges + least * generic_field(edges.T, axes).T
     cosines = jnp.sum(edges[1:] * edges[:-1], axis=1) / jnp.maximum(lengths[1:] * lengths[:-1], least**2)
     is_folded = jnp.any(cosines < FOLDED) | jnp.any(lengths < least)
     unfolded = nodes[:1] + jnp.concatenate([jnp.zeros((1, 3), nodes.dtype), jnp.cumsum(aside, axis=0)])
@@ -99,7 +100,7 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     if not isinstance(end, Held):
         along = start.tangent if isinstance(start, Directed) else _pull(scene)
         return start.position[None] + _helix(along, end, u)
-    return _bent_arc(start, end, scene.gravity, u)
+    return _bent_arc(start, end, scene.gravity, scene_axes(scene), u)
 
 
 def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
@@ -109,13 +110,13 @@ def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
     positions = [first, *(clip.position for clip in clips), last]
     zero = jnp.zeros((), s.dtype)
     places = [zero, *(clip.at for clip in clips), zero + 1]
-    any_direction = jnp.array([1.0, 0.0, 0.0], s.dtype)
+    axes = scene_axes(scene)
     held: list[Support] = [scene.start]
     for before, clip, after in zip(positions, clips, positions[2:], strict=False):
         tangent = clip.direction
         if tangent is None:
             line = (clip.position if after is None else after) - (clip.position if before is None else before)
-            tangent = _direction(line, any_direction)
+            tangent = _direction(line, axes[:, 2])
         held.append(Swivel(clip.position, tangent))
     held.append(scene.end)
     shape = jnp.zeros((len(s), 3), s.dtype)
@@ -133,14 +134,16 @@ def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
                 eqx.tree_at(lambda held: held.position, held, held.position / length) for held in (start, end)
             )
             gravity = None if scene.gravity is None else scene.gravity * length**3
-            piece = length * _bent_arc(start, end, gravity, jnp.clip((s - a) / length, 0.0, 1.0))
+            piece = length * _bent_arc(start, end, gravity, axes, jnp.clip((s - a) / length, 0.0, 1.0))
         shape = jnp.where(s >= a, piece, shape)
     return shape
 
 
-def _bent_arc(start: Held, end: Held, gravity: Float[Array, "3"] | None, u: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
+def _bent_arc(
+    start: Held, end: Held, gravity: Float[Array, "3"] | None, axes: Float[Array, "3 3"], u: Float[Array, "k 1"]
+) -> Float[Array, "k 3"]:
     """The arc of length 1 between the ends, bent near them towards the tangents that they hold."""
-    arc, arc_start, arc_end = _arc(start, end, gravity, u)
+    arc, arc_start, arc_end = _arc(start, end, gravity, axes, u)
     if isinstance(start, Directed):
         arc += u * (1 - u) ** 4 * (start.tangent - arc_start)[None]
     if isinstance(end, Directed):
@@ -177,21 +180,24 @@ def _pull(scene: Scene) -> Float[Array, "3"]:
 
 
 def _arc(
-    start: Held, end: Held, gravity: Float[Array, "3"] | None, u: Float[Array, "k 1"]
+    start: Held, end: Held, gravity: Float[Array, "3"] | None, axes: Float[Array, "3 3"], u: Float[Array, "k 1"]
 ) -> tuple[Float[Array, "k 3"], Float[Array, "3"], Float[Array, "3"]]:
-    """The circular arc of length 1 between the ends (a straight line where they are too far), and its end tangents."""
+    """The circular arc of length 1 between the ends (a straight line where they are too far), and its end tangents.
+
+    `axes`: of the scene, by which it sags where nothing else tells a direction.
+    """
     chord = end.position - start.position
     span = jnp.sqrt(jnp.sum(chord**2))
     tangents = [end.tangent if isinstance(end, Directed) else jnp.zeros_like(chord) for end in (start, end)]
     # Coincident ends have no chord: then the arc is a circle that leaves and arrives along the tangents.
     coincident = span < 1e-6
-    along = _direction(jnp.where(coincident, -(tangents[0] + tangents[1]), chord), jnp.array([1.0, 0.0, 0.0]))
+    along = _direction(jnp.where(coincident, -(tangents[0] + tangents[1]), chord), axes[:, 2])
     sag = (tangents[0] - tangents[1]) / 2
     if gravity is not None:
         # A load of w L^3/EI = 100 sags a rod as much as its ends can bend it.
         sag += gravity / 100
     sag -= jnp.sum(sag * along) * along
-    across = jnp.eye(3, dtype=along.dtype)[jnp.argmin(jnp.abs(along))]
+    across = jnp.where(jnp.abs(jnp.sum(axes[:, 0] * along)) < 0.9, axes[:, 0], axes[:, 1])
     sag = _direction(sag, _direction(jnp.cross(along, across), along))
     half = _half_angle(jnp.minimum(span, 1.0))
     angle = half * (2 * u - 1)

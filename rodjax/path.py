@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.compilation import compiled
+from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.equilibrium import (
     Discretization,
     Options,
@@ -71,8 +72,8 @@ def solve_path(
 
     **Arguments:**
 
-    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames may turn by
-      less than pi from one to the next.
+    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The frames of ends and
+      clips may turn by less than pi from one to the next.
     - `at_critical`: `"jump"`: where the branch of equilibria loses its stability the path goes on with the minimum
         found beyond, as a cable does. `"stop"`: it ends with the last scene before the first critical point of the
         branch, see `rodjax.follow`; eager only.
@@ -169,14 +170,14 @@ def _structure(scene: Scene) -> str:
 def _solve_path(
     scenes: Scene,
     state: SolverState,
-    twist: Float[Array, ""],
+    first: FirstTwist,
     strain_limit: Float[Array, ""] | float,
     options: Options,
     progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     meter = _progress_meter() if progress else None
-    first = jax.tree.map(lambda leaf: leaf[0], scenes)
+    first_scene = jax.tree.map(lambda leaf: leaf[0], scenes)
 
     def step(carry, numbered):
         last, before, bar = carry
@@ -184,10 +185,11 @@ def _solve_path(
         found, substeps = _step(last, before, scene, options, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        return (_Station(scene, found.state, found.point.total_twist), last, bar), (found, substeps)
+        return (_Station(scene, found.state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
-    start = _Station(first, state, twist)
+    assert first.last is not None
+    start = _Station(first_scene, state, first.total_twist, first.last)
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
@@ -207,11 +209,12 @@ def path_from(
 
 
 class _Station(eqx.Module):
-    """A scene on the path and the state found for it."""
+    """A scene on the path, the state found for it, and what the next one carries on from there."""
 
     scene: Scene
     state: SolverState
     total_twist: Float[Array, ""]
+    last: Last
 
 
 class _Progress(eqx.Module):
@@ -220,6 +223,7 @@ class _Progress(eqx.Module):
     reached: SolverState
     begin: SolverState
     total_twist: Float[Array, ""]
+    last: Last
     fraction: Float[Array, ""]
     share: Float[Array, ""]
     is_last_try: Bool[Array, ""]
@@ -236,7 +240,8 @@ def _step(
     def attempt(progress: _Progress) -> _Progress:
         target = jnp.minimum(progress.fraction + progress.share, 1.0)
         here = jax.lax.cond(target < 1.0, lambda: between(last.scene, scene, target), lambda: scene)
-        found = solve_from(here, progress.begin, progress.total_twist, options)
+        first = FirstTwist(progress.total_twist, progress.last._replace(shape=progress.reached.shape))
+        found = solve_from(here, progress.begin, first, options)
         converged = is_converged(found.outcome.status)
         reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
         is_smallest = progress.share <= 0.5**MAX_SPLITS
@@ -244,6 +249,7 @@ def _step(
             reached=reached,
             begin=reached,
             total_twist=jnp.where(converged, found.point.total_twist, progress.total_twist),
+            last=jax.tree.map(lambda new, old: jnp.where(converged, new, old), last_of(here), progress.last),
             fraction=jnp.where(converged, target, progress.fraction),
             share=jnp.where(converged, 2 * progress.share, jnp.where(is_smallest, 1.0, progress.share / 2)),
             is_last_try=~converged & is_smallest,
@@ -265,6 +271,7 @@ def _step(
         reached=last.state,
         begin=_predicted(last, before, scene),
         total_twist=last.total_twist,
+        last=last.last,
         fraction=zero,
         share=jnp.ones_like(zero),
         is_last_try=no,

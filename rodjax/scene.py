@@ -21,6 +21,8 @@ from rodjax.units import Units
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
 # by half of its length.
 MAX_SPAN = 1.5
+# Positions nearer to one another than this part of the length are one place.
+ONE_PLACE = 1e-6
 
 
 class Scene(eqx.Module):
@@ -34,9 +36,11 @@ class Scene(eqx.Module):
     - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
-    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; `None`: the
-        total twist nearest to that of the initial guess, so that turns are carried along a path. Two clamps only, and
-        no clip with a frame between them: there an earlier equilibrium as a guess carries the turns of each span.
+    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an
+        earlier equilibrium whose scene states its turns too, beyond those. `None`: the turns of an earlier equilibrium,
+        whose frames turn by less than pi to those of this scene, so that turns are carried along a path; else the total
+        twist nearest to that of the initial shape. Two clamps only, and no clip with a frame between them: there an
+        earlier equilibrium as a guess carries the turns of each span.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
@@ -168,6 +172,25 @@ def _check_numbers(scene: Scene) -> None:
                 f"reaches at most {MAX_SPAN * length:g} m"
             )
     _check_clips(scene, length)
+    _check_turning(scene, length)
+
+
+def _check_turning(scene: Scene, length: float) -> None:
+    """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
+    if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
+        return
+    loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
+    loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
+    if loaded or any(clip.direction is not None for clip in scene.clips):
+        return
+    held = [
+        np.asarray(held.position) for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Pin | Clip)
+    ]
+    if max(float(np.max(np.abs(position - held[0]))) for position in held) <= ONE_PLACE * length:
+        raise ValueError(
+            f"all pins and clips are at one place, {held[0].tolist()} m: without gravity or a force the rod can turn "
+            "freely about it; move one of them or make one hold the tangent"
+        )
 
 
 def _check_clips(scene: Scene, length: float) -> None:
@@ -230,6 +253,52 @@ def held_position(scene: Scene) -> Float[Array, "3"]:
     held = scene.start if isinstance(scene.start, Held) else scene.end
     assert isinstance(held, Held), "a scene holds at least one position"
     return held.position
+
+
+def scene_axes(scene: Scene) -> Float[Array, "3 3"]:
+    """Three unit vectors, the columns, that turn with the scene: where a search has to choose a direction and none is
+    better than the others, its choice is one of these.
+
+    A held frame; else by the first two directions that the scene has, of gravity, held tangents, ways between
+    positions, and loads. In a scene that has no two, all across the one are alike.
+    """
+    start, end = scene.start, scene.end
+    frames = [held.frame for held in (start, end, *scene.clips) if isinstance(held, Clamp | Clip)]
+    for frame in frames:
+        if frame is not None:
+            return frame
+    directions = [] if scene.gravity is None else [scene.gravity]
+    directions += [end.tangent for end in (start, end) if isinstance(end, Swivel)]
+    directions += [clip.tangent for clip in scene.clips if clip.tangent is not None]
+    positions = [held.position for held in (start, *scene.clips, end) if isinstance(held, Held | Clip)]
+    directions += [position - positions[0] for position in positions[1:]]
+    directions += [load.force for load in scene.point_forces]
+    ends = [end for end in (start, end) if isinstance(end, Free) and not end.follower]
+    directions += [load for end in ends for load in (end.force, end.moment) if load is not None]
+    for load in scene.distributed:
+        if not load.follower:
+            directions.append(load.force if isinstance(load, DistributedForce) else load.couple)
+    identity = jnp.eye(3, dtype=scene.rod.length.dtype)
+    # Of none of these the last axis, and of one another one that is not along it.
+    along = _first_of(jnp.stack([*directions, identity[2]]))
+    others = jnp.stack([*directions, identity[0], identity[1]])
+    sizes = jnp.sqrt(jnp.sum(others**2, axis=1))
+    others /= jnp.where(sizes > LEAST_DIRECTION, sizes, 1.0)[:, None]
+    across = others - (others @ along)[:, None] * along[None]
+    d1 = _first_of(jnp.where(jnp.sum(across**2, axis=1) > LEAST_ANGLE**2, across.T, 0.0).T)
+    return jnp.stack([d1, jnp.cross(along, d1), along], axis=1)
+
+
+# Vectors in the units of the rod, and parts of unit vectors across others, that are taken for none: roundings are less.
+LEAST_DIRECTION = 1e-9
+LEAST_ANGLE = 1e-3
+
+
+def _first_of(vectors: Float[Array, "k 3"]) -> Float[Array, "3"]:
+    """The first that is not zero, at the length 1."""
+    sizes = jnp.sqrt(jnp.sum(vectors**2, axis=1))
+    k = jnp.argmax(sizes > LEAST_DIRECTION)
+    return vectors[k] / sizes[k]
 
 
 def held_at_both_ends(scene: Scene) -> bool:

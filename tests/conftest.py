@@ -2,8 +2,6 @@
 
 import gc
 import os
-from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import pytest
@@ -49,31 +47,6 @@ def pytest_collection_modifyitems(config, items):
         for item in items:
             if "slow" in item.keywords or "exhaustive" in item.keywords:
                 item.add_marker(skip)
-
-
-# A compiled program takes hundreds of memory maps, of which Linux allows a process 65530: beyond, compiling crashes it.
-MOST_MAPS = 30_000
-
-
-@pytest.fixture(autouse=True)
-def _few_compiled_programs():
-    """Drops all compiled programs where a worker has gathered very many; those needed again come from the cache."""
-    yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
-        jax.clear_caches()
-
-
-_COMPILED: list[float] = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, seconds, **_: _COMPILED.append(seconds) if event.endswith("backend_compile_duration") else None
-)
-
-
-@pytest.fixture
-def compiled_programs() -> Callable[[], int]:
-    """How many programs this process has compiled so far, those from the cache on disk too."""
-    return lambda: len(_COMPILED)
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,8 @@ import pytest
 
 import rodjax as rj
 from rodjax.along import Spline
+from rodjax.discretization.cells import ElementCells
+from rodjax.equilibrium import checked_options
 from rodjax.rod import torsion_constant
 from rodjax.scene import nondimensional
 
@@ -185,3 +187,30 @@ def test_a_curve_through_points_has_their_curvature():
     strains = rod.rest_shape.at(s, s, s) / float(rod.length)
     np.testing.assert_allclose(strains[1], np.full(9, 0.5), rtol=1e-3)
     np.testing.assert_allclose(strains[::2], np.zeros((2, 9)), rtol=0, atol=1e-10)
+
+
+def layered(jumps, **options) -> rj.Scene:
+    values = np.arange(1.0, len(jumps) + 2)
+    rod = rj.Rod(2.0, (rj.Steps(jumps, values), 1.0), 1.0, 1e4)
+    return rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free(force=(0, 0, 1)), **options)
+
+
+@pytest.mark.parametrize("jumps", [[1.0, 1.002], [0.002], [0.4, 1.998], [1.402]])
+def test_every_jump_has_a_node_or_is_refused(jumps):
+    """Jumps 0.001 L from one another, an end or a load were merged where elements are 20 times as long or more."""
+    scene = layered(jumps, point_forces=[rj.PointForce(1.4, (0, 0, 1))])
+    with pytest.raises(ValueError, match=r"jumps of Steps .*0.001 of the length.* needs segments = 51 or more"):
+        rj.solve(scene, segments=16)
+    options, _ = checked_options(scene, None, 1e-2, None, None, None, False)
+    assert options.segments == 64  # of the library's sizes
+    scaled, _ = nondimensional(scene)
+    nodes = ElementCells.of(scaled, jnp.linspace(0.0, 1.0, options.segments + 1)).s
+    for jump in jumps:
+        assert np.min(np.abs(nodes - jump / 2)) < 1e-15
+
+
+def test_jumps_too_near_for_any_mesh_are_refused():
+    with pytest.raises(ValueError, match=r"segments = 5001 or more, and the finest mesh of 512 segments"):
+        rj.solve(layered([1.0, 1.00002]))
+    with pytest.raises(ValueError, match=r"segments = 4 or more, and segments = 3"):
+        rj.solve(layered([0.5, 1.0, 1.5]), segments=3)

@@ -1,7 +1,13 @@
-"""The persistent compilation cache."""
+"""Compiled programs: the persistent cache, and as many in memory as a process has room for."""
 
 import subprocess
 import sys
+
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax import compilation
 
 
 def test_the_cache_is_filled(tmp_path):
@@ -13,3 +19,30 @@ def test_the_cache_is_filled(tmp_path):
     run = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == str(folder)
     assert any(folder.iterdir())
+
+
+@pytest.mark.skipif(compilation._most_maps() is None, reason="Linux alone counts the memory maps of a process")
+def test_programs_are_dropped_before_the_process_has_too_many_maps(monkeypatch, caplog):
+    """Without, some hundred meshes crash it: here as many as fit beside those that are there already."""
+
+    def solve(segments: int) -> rj.Equilibrium:
+        return rj.solve(rj.problems.cantilever(0.1), segments=segments, discretization="finite_difference")
+
+    compilation._say_once.cache_clear()
+    first = solve(5)
+    most = compilation._most_maps()
+    assert most is not None
+    # As if the process might have a program's maps more, and no others.
+    room = compilation._maps() + 50
+    monkeypatch.setattr(compilation, "SHARE_OF_MAPS", room / most)
+    for segments in (6, 7, 8):
+        assert solve(segments).converged
+        assert compilation._maps() <= room
+    assert len([record for record in caplog.records if "drops compiled programs" in record.message]) == 1
+    again = solve(5)
+    np.testing.assert_array_equal(again.nodes, first.nodes)
+
+
+def test_programs_are_kept_where_there_is_room(caplog):
+    rj.solve(rj.problems.cantilever(0.1), segments=5, discretization="finite_difference")
+    assert not caplog.records

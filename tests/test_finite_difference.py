@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_twist import FirstTwist
 from rodjax.scene import nondimensional
 
 N = 8
@@ -20,7 +21,7 @@ def begin(scene: Scene, seed: int = 0) -> tuple[FiniteDifference, Polyline]:
     s = np.linspace(0, 1, N + 1)
     rough = 0.01 * np.random.default_rng(seed).normal(size=(N + 1, 3))
     nodes = np.stack([0.5 * s, 0.2 * np.sin(4 * s), 0.3 * np.cos(3 * s)], axis=1) + rough
-    return FiniteDifference.begin(scaled, Polyline.through(jnp.asarray(nodes)), jnp.array(4.0))
+    return FiniteDifference.begin(scaled, Polyline.through(jnp.asarray(nodes)), FirstTwist(jnp.array(4.0)))
 
 
 @pytest.mark.parametrize("name", ["clamps", "clamp-swivel", "pins", "cantilever"])
@@ -76,7 +77,7 @@ def test_energy_is_invariant_under_rigid_motions():
     problem, polyline = begin(scene)
     turned_scene, _ = nondimensional(Scene(scene.rod, moved(scene.start), moved(scene.end), turns=1))
     turned = Polyline.through(polyline.nodes @ turn.T)
-    turned_problem, turned = FiniteDifference.begin(turned_scene, turned, jnp.array(4.0))
+    turned_problem, turned = FiniteDifference.begin(turned_scene, turned, FirstTwist(jnp.array(4.0)))
     energy = problem.energies(polyline).total
     # Energies of order 1e3; rounding of the edges, a few eps each, times EA.
     np.testing.assert_allclose(turned_problem.energies(turned).total, energy, rtol=1e-12)
@@ -99,7 +100,7 @@ def test_gauss_newton_is_the_hessian_where_nothing_is_strained(start, end, segme
     """In a straight unstressed rod the second derivatives of the strains play no part; torsion is finite and flat."""
     scaled, _ = nondimensional(Scene(problems.cable(20.0), start, end))
     nodes = jnp.linspace(jnp.zeros(3), jnp.array([1.0, 0, 0]), segments + 1)
-    problem, polyline = FiniteDifference.begin(scaled, Polyline.through(nodes), jnp.array(0.0))
+    problem, polyline = FiniteDifference.begin(scaled, Polyline.through(nodes), FirstTwist(jnp.array(0.0)))
     zero = problem.no_displacement(polyline)
     bending_and_stretch = lambda d: problem.energies(problem.moved(polyline, d)).elastic  # noqa: E731
     hessian = jax.jit(jax.hessian(bending_and_stretch))(zero)

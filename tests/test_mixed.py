@@ -12,6 +12,7 @@ import rodjax as rj
 from rodjax import Clamp, Free, PointForce, Scene, Swivel, frame, problems
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
@@ -174,7 +175,7 @@ def solved(request) -> tuple[MixedForm, FiniteDifference, Polyline, MixedPoint]:
     result = rj.solve(scene, segments=N, discretization="finite_difference", solver=rj.Newton(tolerance=0.0))
     assert result.converged
     scaled, _ = nondimensional(scene)
-    problem, polyline = FiniteDifference.begin(scaled, result.state.shape, result.total_twist)
+    problem, polyline = FiniteDifference.begin(scaled, result.state.shape, FirstTwist(result.total_twist))
     point = MixedPoint(problem.mixed_point(polyline).tangents, result.state.end_force, result.total_twist)
     return MixedForm.of(scaled, field(scaled)), problem, polyline, point
 

@@ -8,6 +8,7 @@ from scipy.interpolate import CubicSpline
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
+from rodjax.compilation import program_count
 from rodjax.equilibrium import TRACED_SEGMENTS, Discretization
 from rodjax.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
@@ -60,7 +61,7 @@ def test_a_tolerance_is_met_and_not_by_far(scene_and_truth):
 @pytest.mark.parametrize(
     ("discretization", "asked"), [("hermite", {}), ("finite_difference", dict(discretization="finite_difference"))]
 )
-def test_without_segments_the_error_is_below_a_thousandth(scene_and_truth, discretization, asked, compiled_programs):
+def test_without_segments_the_error_is_below_a_thousandth(scene_and_truth, discretization, asked):
     scene, truth = scene_and_truth
     result = rj.solve(scene, **asked)
     assert result.converged
@@ -68,10 +69,10 @@ def test_without_segments_the_error_is_below_a_thousandth(scene_and_truth, discr
     assert result.error_estimate < 1e-3
     # Seen 2.7e-4 and 3.1e-4 with 8 elements, 2.0e-4 and 2.2e-4 with 64 edges.
     assert true_error(result, truth) < 1e-3
-    programs = compiled_programs()
+    programs = program_count()
     again = rj.solve(scene, guess=result)
     # Before the comparison below, which JAX compiles.
-    assert compiled_programs() == programs
+    assert program_count() == programs
     assert again.discretization == discretization
     assert again.iterations == 0
 

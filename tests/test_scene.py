@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rodjax import Clamp, Free, Guess, Pin, PointForce, Rod, Scene, Swivel, frame, problems
+from rodjax import Clamp, Clip, Free, Guess, Pin, PointForce, Rod, Scene, Swivel, frame, problems
 from rodjax.scene import between, nondimensional
 
 ROD = Rod(2.0, EI=3.0, GJ=2.0, EA=500.0, mass_per_length=0.5)
@@ -60,6 +60,8 @@ GRAVITY = (0, 0, -9.81)
         (CLAMP, Free(), dict(point_forces=[PointForce(2.5, (0, 0, 1))]), r"point_forces\[0\].at must lie in 0 to 2 m"),
         (CLAMP, Free(), dict(point_forces=[(1, 2, 3)]), r"point_forces\[0\] must be a PointForce"),
         (CLAMP, "free", {}, "end must be a Support"),
+        (PIN, PIN, {}, "all pins and clips are at one place, .*: without gravity or a force the rod can turn freely"),
+        (PIN, Free(), dict(clips=[Clip(1.0, PIN.position)]), "all pins and clips are at one place"),
         (CLAMP, Free(), dict(gravity=9.81), r"gravity must be numbers of shape \(3,\)"),
     ],
 )
@@ -76,7 +78,7 @@ def test_scenes_without_an_equilibrium_are_refused(start, end, options, message)
         (SWIVEL, SWIVEL),
         (PIN, CLAMP),
         (PIN, SWIVEL),
-        (PIN, PIN),
+        (PIN, Pin((2, 0, 0))),
         (Free(), CLAMP),
         (SWIVEL, Free()),
     ],
@@ -185,7 +187,7 @@ def scenes_apart() -> dict[str, tuple[Scene, Scene]]:
             Scene(ROD, CLAMP, Free((0, 0, 1), (0, 2, 0))),
             Scene(ROD, Clamp((1, 0, 0), LEVEL), Free((1, 0, 0), (0, 0, 3))),
         ),
-        "pins": (Scene(ROD, PIN, PIN), Scene(ROD, PIN, Pin((1, 0, 0)))),
+        "pins": (Scene(ROD, PIN, Pin((2, 0, 0))), Scene(ROD, PIN, Pin((1, 0, 0)))),
     }
 
 

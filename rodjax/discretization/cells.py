@@ -10,16 +10,18 @@ mesh.
 Arrays have the components first, then the frames of a cell or its strain points, then the cells.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.along import Steps, stiffness_at
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
-from rodjax.discretization.nodes import with_nodes_at, with_nodes_at_clips
+from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod
@@ -325,6 +327,30 @@ def varying(scene: Scene) -> list[Float[Array, "k"]]:
     rod = scene.rod
     values = (*rod.bending_pair, rod.GJ, rod.EA, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
     return [value.jumps for value in values if isinstance(value, Steps)]
+
+
+def segments_for_jumps(scene: Scene) -> tuple[int, float] | None:
+    """The fewest elements of a mesh that has a node at each jump of a rod, of known numbers, and how near to another
+    place with a node such a jump lies, as a part of the length; `None` where nothing jumps. Also of stacked scenes.
+    """
+    jumps = [np.asarray(steps) for steps in varying(scene)]
+    if not jumps:
+        return None
+    length = np.asarray(scene.rod.length)[..., None]
+    others = [np.asarray(held.at)[..., None] for held in (*scene.clips, *scene.point_forces)]
+    places = np.concatenate([np.zeros_like(length), length, *others, *jumps], axis=-1) / length
+    is_jump = np.arange(places.shape[-1]) >= 2 + len(others)
+    order = np.argsort(places, axis=-1, kind="stable")
+    gaps = np.diff(np.take_along_axis(places, order, axis=-1), axis=-1)
+    is_apart = gaps > SAME_PLACE
+    of_jumps = is_jump[order[..., 1:]] | is_jump[order[..., :-1]]
+    gap = float(np.min(np.where(is_apart & of_jumps, gaps, 1.0)))
+    spans = int(np.max(np.sum(is_apart, axis=-1)))
+    return max(spans, math.ceil(LEAST_ELEMENT / gap * (1 + 1e-9))), gap
+
+
+# Arclengths that differ by less, as parts of the length, are the same but for rounding.
+SAME_PLACE = 1e-12
 
 
 def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:

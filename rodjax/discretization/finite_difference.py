@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes, load_energy
+from rodjax.discretization.edges import EdgeTangents
+from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, Form
 from rodjax.discretization.joints import (
     assembled,
@@ -29,10 +31,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import (
     FramedTangents,
     TwistReference,
-    angle_about,
-    nearest_twist,
     total_twist,
-    transport_along,
     twist_under_moment,
 )
 from rodjax.energy import axial_strain_under, density
@@ -68,6 +67,9 @@ class Polyline(Shape):
 
     def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
         return MixedPoint(self.tangents, end_force, total_twist)
+
+    def with_unknowns(self, point: MixedPoint) -> "Polyline":
+        return self  # whose edges have these tangents already
 
     def points(self, pieces: int) -> Float[Array, "k 3"]:
         return resampled(self.nodes, pieces)
@@ -121,14 +123,14 @@ class FiniteDifference(eqx.Module):
     reference: TwistReference | None
 
     @staticmethod
-    def begin(scene: Scene, guess: Polyline, guess_twist: Float[Array, ""]) -> tuple["FiniteDifference", Polyline]:
+    def begin(scene: Scene, guess: Polyline, first: FirstTwist) -> tuple["FiniteDifference", Polyline]:
         """The discretized scene, and the polyline from which to seek its solution: the guess moved to the held ends.
 
-        The total twist is, of those which the end frames allow on that polyline, the one nearest to `guess_twist`
-        [rad], or that of `scene.turns`.
+        The total twist is, of those which the end frames allow on that polyline, the one carried from the last
+        equilibrium or nearest to that of `first`, or that of `scene.turns`.
         """
         polyline = _moved_to_ends(guess, scene)
-        return FiniteDifference(scene, _twist_reference(scene, polyline, guess_twist)), polyline
+        return FiniteDifference(scene, _twist_reference(scene, guess, polyline, first)), polyline
 
     # --- unknowns: the one place that knows which nodes move -------------------------------------------------------
 
@@ -301,10 +303,9 @@ def _framed_tangents(scene: Scene, polyline: Polyline) -> FramedTangents:
     return FramedTangents(with_held_tangents(scene, tangents), start_d1, end_d1)
 
 
-def _twist_reference(scene: Scene, polyline: Polyline, guess_twist: Float[Array, ""]) -> TwistReference | None:
-    state = _framed_tangents(scene, polyline)
-    if state.start_d1 is None or state.end_d1 is None:
+def _twist_reference(scene: Scene, guess: Polyline, polyline: Polyline, first: FirstTwist) -> TwistReference | None:
+    if not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
         return None
-    carried = transport_along(state.start_d1, state.tangents)[:, -1]
-    principal = angle_about(state.tangents[:, -1], carried, state.end_d1)
-    return TwistReference(state, nearest_twist(principal, guess_twist, scene.turns))
+    field = EdgeTangents.of(scene, len(polyline.edges))
+    twist = twist_on(scene, field, guess, polyline.tangents, first)
+    return TwistReference(_framed_tangents(scene, polyline), twist)

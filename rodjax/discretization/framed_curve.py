@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
 from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.first_twist import FirstTwist, more_turns
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.hermite import Curve
@@ -17,7 +18,7 @@ from rodjax.discretization.twist import nearest_twist
 from rodjax.guess import cubic, first_shape
 from rodjax.rest import RestStrain
 from rodjax.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
-from rodjax.scene import Scene, held_at_both_ends
+from rodjax.scene import Scene, held_at_both_ends, scene_axes
 from rodjax.supports import Clamp, Directed, Held, Swivel
 from rodjax.vectors import dot
 
@@ -35,6 +36,9 @@ class FramedCurve(Shape):
 
     def point(self, end_force: Float[Array, "3 *spans"], total_twist: Float[Array, ""]) -> FramePoint:
         return FramePoint(self.quaternions, end_force, total_twist)
+
+    def with_unknowns(self, point: FramePoint) -> "FramedCurve":
+        return FramedCurve(self.nodes, point.quaternions, self.s)
 
     def in_units(self, scale: Float[Array, ""], shift: Float[Array, "3"]) -> "FramedCurve":
         return FramedCurve(self.nodes * scale + shift[None], self.quaternions, self.s)
@@ -68,25 +72,30 @@ class FramedCurve(Shape):
     def cells(self) -> Cells:
         return _cells(self.s, self.is_of_joints)
 
-    def turned_to_ends(self, form: FrameForm, twist: Float[Array, ""]) -> Float[Array, "4 m"]:
-        """The frames turned to those that the supports hold, by less and less away from them; and between two clamps
-        spun by whole turns to the total twist nearest to `twist`, or to the turns of the scene.
+    def turned_to_ends(self, form: FrameForm, first: FirstTwist) -> Float[Array, "4 m"]:
+        """The frames turned to those that the supports hold, by less and less away from them.
 
-        With clips: so between neighbouring supports, and the twist of each span between two that hold it is the
-        nearest to the one that it had, with its part of what all of the rod shall have beyond that.
+        From an earlier equilibrium each held frame turns by its smallest rotation, so that the turns of each span
+        between two of them stay. Other first shapes are spun by whole turns: between two clamps to the total twist
+        nearest to `first`, or to the turns of the scene; with clips in each span to the twist nearest to the one that
+        it had, with its part of what all of the rod shall have beyond that.
         """
-        scene, cells = form.scene, form.field
+        scene, cells, last = form.scene, form.field, first.last
+        reference = self.quaternions
+        if last is not None and last.shape is not None:
+            assert isinstance(last.shape, FramedCurve)
+            reference = last.shape.quaternions
         if isinstance(form, ClippedFrameForm):
-            q = _turned_to_supports(form, self.quaternions, twist)
-            return q if scene.turns is None else _with_turns(scene, cells, q, twist)
+            q = _turned_to_supports(form, self.quaternions, first, reference)
+            return q if scene.turns is None else _with_turns(scene, cells, q, first)
         q, places = self.quaternions, cells.places
         for end, k, part in ((scene.start, 0, 1.0 - places), (scene.end, -1, places)):
             if isinstance(end, Directed):
-                first = q[:, k]
-                held = swung(first, end.tangent)
+                here = q[:, k]
+                held = swung(here, end.tangent)
                 if isinstance(end, Clamp):
-                    held = nearer(from_frame(end.frame), first)
-                change = product(held, inverse(first))
+                    held = nearer(from_frame(end.frame), reference[:, k])
+                change = product(held, inverse(here))
                 # Half of the angle, and the same bits where there is none.
                 size = jnp.sqrt(jnp.sum(change[1:] ** 2))
                 is_turned = size > jnp.finfo(size.dtype).eps * 8
@@ -95,7 +104,7 @@ class FramedCurve(Shape):
                 turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half)[None] * axis[:, None]])
                 q = jnp.where(is_turned, product(turn, q), q)
         if isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp):
-            q = _with_turns(scene, cells, q, twist)
+            q = _with_turns(scene, cells, q, first)
         return q
 
 
@@ -103,20 +112,31 @@ def _cells(s: Float[Array, "n+1"], of_joints: bool) -> Cells:
     return JointCells(s) if of_joints else ElementCells(s)
 
 
-def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], twist: Float[Array, ""]) -> Float[Array, "4 m"]:
-    """Frames between two clamps, spun by whole turns to the total twist nearest to `twist`, or to the turns given."""
-    here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
-    principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
-    turns = jnp.round((nearest_twist(principal, twist, scene.turns) - here) / (2 * jnp.pi))
+def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], first: FirstTwist) -> Float[Array, "4 m"]:
+    """Frames between two clamps, spun by whole turns: those by which the scene has more than the last one; without a
+    last one to the total twist nearest to that of `first`, or to the turns of the scene.
+    """
+    turns = more_turns(scene, first.last)
+    if turns is None:
+        if first.last is not None and scene.turns is None:
+            return q
+        here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
+        principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
+        turns = jnp.round((nearest_twist(principal, first.total_twist, scene.turns) - here) / (2 * jnp.pi))
     return jnp.where(turns != 0, spun(q, 2 * jnp.pi * turns * cells.places), q)
 
 
-def _turned_to_supports(form: ClippedFrameForm, q: Float[Array, "4 m"], twist: Float[Array, ""]) -> Float[Array, "4 m"]:
+def _turned_to_supports(
+    form: ClippedFrameForm, q: Float[Array, "4 m"], first: FirstTwist, reference: Float[Array, "4 m"]
+) -> Float[Array, "4 m"]:
     """Frames swung to the tangents that ends and clips hold, by less and less towards the supports beside each, then
     spun about their tangents to the frames that are held, linearly between these.
+
+    `reference`: those of the last equilibrium.
     """
     cells, places = form.field, form.field.places
     had = cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2]
+    is_carried = first.last is not None
     zero, last = jnp.zeros((), int), jnp.asarray(len(places) - 1)
     supports = jnp.stack([zero, *(2 * form.clip_nodes), last])
     numbered = [(held, jnp.asarray(held.number) % len(places)) for held in form.held_frames]
@@ -135,16 +155,19 @@ def _turned_to_supports(form: ClippedFrameForm, q: Float[Array, "4 m"], twist: F
     numbers = jnp.stack([number for _, number in spinning])
     order = jnp.argsort(numbers)
     at = places[numbers[order]]
-    spins = jnp.stack([_spin_between(q[:, number], frame) for frame, number in spinning])[order]
+    nearby = reference if is_carried else q
+    held = [nearer(from_frame(frame), nearby[:, number]) for frame, number in spinning]
+    spins = jnp.stack([_spin_between(q[:, number], q_held) for q_held, (_, number) in zip(held, spinning, strict=True)])
+    spins = spins[order]
     q = jnp.where(jnp.any(spins != 0), spun(q, jnp.interp(places, at, spins)), q)
-    if len(spinning) == 1:
+    if is_carried or len(spinning) == 1:
         return q
     # Between two of them: the cells from the one to the other, and by how much they are twisted.
     nodes = numbers[order] // 2
     cell = jnp.arange(had.shape[1])
     is_between = (cell[None] >= nodes[:-1, None]) & (cell[None] < nodes[1:, None])
     here = stacked(cells.strains(of_cells(cells, q)))[2] * cells.lengths
-    more = (twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
+    more = (first.total_twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
     wanted = jnp.sum(jnp.where(is_between, (jnp.sum(had - here, axis=0) + more)[None], 0.0), axis=1)
     turns = jnp.concatenate([jnp.zeros_like(spins[:1]), jnp.cumsum(jnp.round(wanted / (2 * jnp.pi)))])
     return jnp.where(jnp.any(turns != 0), spun(q, 2 * jnp.pi * jnp.interp(places, at, turns)), q)
@@ -168,9 +191,11 @@ def _swung_partly(
     return jnp.where(is_turned, product(turn, q), q)
 
 
-def _spin_between(q: Float[Array, "4"], frame: Float[Array, "3 3"]) -> Float[Array, ""]:
-    """The angle [rad] about its tangent from a frame to another one of the same tangent; 0 where it is rounding."""
-    w, _, _, z = product(inverse(q), nearer(from_frame(frame), q))
+def _spin_between(q: Float[Array, "4"], other: Float[Array, "4"]) -> Float[Array, ""]:
+    """The angle [rad] about its tangent from a frame to another one of the same tangent, from -2 pi to 2 pi as the
+    signs of the quaternions have it; 0 where it is rounding.
+    """
+    w, _, _, z = product(inverse(q), other)
     angle = 2 * jnp.arctan2(z, w)
     return jnp.where(jnp.abs(angle) > 16 * jnp.finfo(angle.dtype).eps, angle, 0.0)
 
@@ -180,19 +205,42 @@ def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
     return (ClippedFrameForm if scene.clips else FrameForm).of(scene, cells)
 
 
-def framed_through(scene: Scene, points: Float[Array, "k 3"], of_joints: bool) -> FramedCurve:
-    """Through points, as many as a mesh has nodes, or nodes and middles of elements; twisted as the rod at rest."""
+def framed_through(
+    scene: Scene,
+    points: Float[Array, "k 3"],
+    of_joints: bool,
+    last: tuple[Float[Array, "3 3"], Float[Array, ""]] | None = None,
+) -> FramedCurve:
+    """Through points, as many as a mesh has nodes, or nodes and middles of elements, with the tangents that ends hold;
+    twisted as the rod at rest, and evenly beside that towards the frames that they hold. Where `last` gives the first
+    frame and the total twist [rad], twisted evenly by that.
+    """
     shape = (Polyline if of_joints else Curve).through(points)
     nodes, tangents = shape.nodes, shape.tangents
     if of_joints:
         tangents = jnp.concatenate([tangents[:, :1], tangents, tangents[:, -1:]], axis=1)
     s = jnp.linspace(0.0, 1.0, len(nodes), dtype=points.dtype)
-    first = from_frame(scene.start.frame) if isinstance(scene.start, Clamp) else jnp.eye(1, 4, dtype=s.dtype)[0]
+    places = _cells(s, of_joints).places
+    if last is not None:
+        frame, total_twist = last
+        return FramedCurve(nodes, spun(carried(from_frame(frame), tangents), total_twist * places), s)
+    start, end = scene.start, scene.end
+    if isinstance(shape, Curve):
+        # As a rod without frames begins.
+        tangents = shape.turned_to_ends(scene, places)
+    if isinstance(start, Directed):
+        tangents = tangents.at[:, 0].set(start.tangent)
+    if isinstance(end, Directed):
+        tangents = tangents.at[:, -1].set(end.tangent)
+    first = from_frame(start.frame if isinstance(start, Clamp) else scene_axes(scene))
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-    twist = _twist_at_rest(scene, _cells(s, of_joints).places)
-    return FramedCurve(nodes, spun(carried(first, tangents), twist), s)
+    q = spun(carried(first, tangents), _twist_at_rest(scene, places))
+    if isinstance(end, Clamp):
+        spin = _spin_between(q[:, -1], nearer(from_frame(end.frame), q[:, -1]))
+        q = spun(q, spin * places if isinstance(start, Clamp) else jnp.broadcast_to(spin, places.shape))
+    return FramedCurve(nodes, q, s)
 
 
 def rest_twist(scene: Scene) -> Float[Array, ""]:
@@ -226,7 +274,7 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     from_end = not isinstance(start, Held) or (isinstance(end, Clamp) and not isinstance(start, Directed))
     k, support = (-1, end) if from_end else (0, start)
     assert isinstance(support, Held)
-    held = q[:, k]
+    held = product(from_frame(scene_axes(scene)), q[:, k])
     if isinstance(support, Clamp):
         held = from_frame(support.frame)
     elif isinstance(support, Swivel):

@@ -284,6 +284,9 @@ class Curve(Shape):
     def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
         return MixedPoint(self.tangents, end_force, total_twist)
 
+    def with_unknowns(self, point: MixedPoint) -> "Curve":
+        return Curve(self.nodes, point.tangents, self.s)
+
     @staticmethod
     def through(points: Float[Array, "m 3"]) -> "Curve":
         # Every second point becomes a node.

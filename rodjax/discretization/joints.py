@@ -209,7 +209,12 @@ def _symmetric_outer(a: Float[Array, "2 k"], b: Float[Array, "2 k"]) -> Float[Ar
     return (outer(a, b) + outer(b, a)) / 2
 
 
-def generic_field(tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    """Directions along the rod that no symmetry of a scene shares."""
+def generic_field(tangents: Float[Array, "3 n"], axes: Float[Array, "3 3"] | None = None) -> Float[Array, "3 n"]:
+    """Directions along the rod that no symmetry of a scene shares, in these axes: the columns, `None` for the global
+    ones, where it does not matter which.
+    """
     s = jnp.linspace(0.0, 1.0, tangents.shape[1], dtype=tangents.dtype)
-    return jnp.stack([jnp.cos(1.0 + 2.0 * s), jnp.sin(2.0 + 3.0 * s), jnp.cos(3.0 + s)])
+    x, y, z = jnp.cos(1.0 + 2.0 * s), jnp.sin(2.0 + 3.0 * s), jnp.cos(3.0 + s)
+    if axes is None:
+        return jnp.stack([x, y, z])
+    return axes[:, :1] * x[None] + axes[:, 1:2] * y[None] + axes[:, 2:] * z[None]

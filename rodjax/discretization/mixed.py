@@ -27,8 +27,10 @@ from jaxtyping import Array, Float
 
 from rodjax.chain import ChainSystem
 from rodjax.discretization.dead_loads import total_force
+from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import outer, rotated, tangent_bases
+from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
@@ -195,15 +197,19 @@ class MixedForm(Form):
             lambda tension: axial_strain_under(self.scene.rod, tension), (tension,), (jnp.ones_like(tension),)
         )
 
-    def twist_near(
-        self, tangents: Float[Array, "3 m"], twist: Float[Array, ""], turns: Float[Array, ""] | None = None
-    ) -> Float[Array, ""]:
-        """The total twist [rad]: between two clamps the nearest to `twist`, or of so many turns; or under a moment."""
+    def twist_near(self, tangents: Float[Array, "3 m"], twist: Float[Array, ""]) -> Float[Array, ""]:
+        """The total twist [rad]: between two clamps the nearest to `twist`; or under a moment."""
         if not self.has_potential:
             return twist_under_moment(self.scene, tangents)
         if isinstance(self.scene.start, Clamp) and isinstance(self.scene.end, Clamp):
-            return nearest_twist(self.field.principal_twist(self.scene, tangents), twist, turns)
+            return nearest_twist(self.field.principal_twist(self.scene, tangents), twist, None)
         return jnp.zeros_like(twist)
+
+    def first_twist(self, begin: Shape, tangents: Float[Array, "3 m"], first: FirstTwist) -> Float[Array, ""]:
+        """The same where a solve begins, on tangents made of those of a shape."""
+        if self.has_potential and isinstance(self.scene.start, Clamp) and isinstance(self.scene.end, Clamp):
+            return twist_on(self.scene, self.field, begin, tangents, first)
+        return self.twist_near(tangents, first.total_twist)
 
     def moved(
         self,

@@ -19,6 +19,10 @@ class Shape(eqx.Module):
         """The unknowns of its form, with these."""
 
     @abstractmethod
+    def with_unknowns(self, point: Any) -> Self:
+        """With the tangents or frames of a point of its form."""
+
+    @abstractmethod
     def points(self, pieces: int) -> Float[Array, "k 3"]:
         """`pieces` + 1 equally spaced points of it."""
 

@@ -329,12 +329,14 @@ def beginnings(
         options, _ = checked_options(
             scene, structure.segments, None, structure.discretization, None, guess, structure.planar
         )
-        state, twist = first_state(scene, guess, options)
+        state, first = first_state(scene, guess, options)
         solve_it = functools.partial(
             solve, segments=structure.segments, discretization=structure.discretization, planar=structure.planar
         )
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solve_it, scene))
-        return eqx.tree_at(lambda result: (result.state, result.total_twist), blank, (state, twist))
+        return eqx.tree_at(
+            lambda result: (result.scene, result.state, result.total_twist), blank, (scene, state, first.total_twist)
+        )
 
     return tuple(
         jax.vmap(one)(group.experiments, own[here], guess)

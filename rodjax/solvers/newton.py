@@ -11,8 +11,9 @@ from rodjax.checks import not_negative, plain_number, whole_number
 from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
 from rodjax.linalg import factor, factor_and_solve
+from rodjax.scene import scene_axes
 from rodjax.status import Outcome, Status
-from rodjax.vectors import components
+from rodjax.vectors import components, dot
 
 
 class Newton(eqx.Module):
@@ -177,7 +178,7 @@ def _advanced(
     shift = jnp.where(state.tries == 0, first, jnp.maximum(SHIFT_GROWTH * state.shift, FIRST_SHIFT))
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near
-    pattern = components(here.bases, generic_field(point.tangents))
+    pattern = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
     factors, rotation, multipliers = factor_and_solve(
         here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure
@@ -193,7 +194,7 @@ def _advanced(
         again = is_pushed = jnp.array(False)
         is_sought = may_go_on = jnp.array(True)
     force_change = form.force_change(form.closure(multipliers))
-    largest = jnp.max(jnp.abs(rotation))
+    largest = jnp.sqrt(jnp.max(dot(rotation, rotation)))
     step = jnp.minimum(1.0, solver.max_rotation / largest)
     if _descends(form, find):
         force_change = step * force_change

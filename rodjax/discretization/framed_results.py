@@ -311,7 +311,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool =
     before = form.forces(q, point.end_force), ends, _strains_at_ends(form, point, ends)[0][:2]
     moments = _end_moments(lacking(1.0), there).at[:, 1].add(couple)
     after = form.forces(there.quaternions, there.end_force), moments, _strains_at_ends(form, there, moments)[0][:2]
-    changes = tuple(y - x for x, y in zip(before, after, strict=True))
+    changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
     return Errors(displacements.T, *relative, scale, is_soft, defects)

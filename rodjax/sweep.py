@@ -16,10 +16,11 @@ A table is CSV: a header of keys, then one row a case. Cases count from 0. All a
 need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the finest is counted.
 
 **The result**, HDF5, first axis the case: `case` its number, `status`, `converged`, `stable`, `iterations`, `residual`,
-`error_estimate` of the mesh, `energy`, `elastic_energy`, `total_twist`, `start_force`, `start_moment`, `end_force`,
-`end_moment`, `nodes` (cases, segments + 1, 3), as in `rodjax.Equilibrium`, `segments` of the mesh of each case (its
-`nodes` are those that the coarsest mesh has), and `parameters/<key>` in SI units; each has the attributes `units` and
-`description`. Attributes of the file: the texts `scene` and `over`, and what is in `Manifest`, with its `fingerprint`.
+`error_estimate`, `force_error`, `moment_error`, `curvature_error` of the mesh, `energy`, `elastic_energy`,
+`total_twist`, `start_force`, `start_moment`, `end_force`, `end_moment`, `nodes` (cases, segments + 1, 3), as in
+`rodjax.Equilibrium`, `segments` of the mesh of each case (its `nodes` are those that the coarsest mesh has), and
+`parameters/<key>` in SI units; each has the attributes `units` and `description`. Attributes of the file: the texts
+`scene` and `over`, and what is in `Manifest`, with its `fingerprint`.
 
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
 solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
@@ -52,8 +53,8 @@ from rodjax.batch import solve_batch
 from rodjax.checks import file_path, whole_number
 from rodjax.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.files import FIELDS
-from rodjax.refinement import ORDERS, SAFETY, SIZES
-from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, positions_at
+from rodjax.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
+from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, estimated_errors, positions_at
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
 from rodjax.scene_keys import unit_of
@@ -67,12 +68,17 @@ FORMAT = 2
 DEFAULT_CHUNK = 1024
 
 RESULTS = (
-    *("status", "converged", "stable", "iterations", "residual", "error_estimate", "energy", "elastic_energy"),
+    *("status", "converged", "stable", "iterations", "residual", "energy", "elastic_energy"),
     *("total_twist", "start_force", "start_moment", "end_force", "end_moment", "nodes"),
 )
+# Estimated errors of the mesh, each relative as in `Equilibrium`.
+ERRORS = ("error_estimate", "force_error", "moment_error", "curvature_error")
 DESCRIPTIONS = FIELDS | {
     "case": ("1", "number of the case, from 0"),
     "error_estimate": ("1", "of the mesh: largest distance of a node from the continuum, by the length"),
+    "force_error": ("1", "of the mesh: largest error of the force, by the largest force in the rod"),
+    "moment_error": ("1", "of the mesh: largest error of the moment, by the largest moment in the rod"),
+    "curvature_error": ("1", "of the mesh: largest error of the curvature, by the largest curvature"),
     "segments": ("1", "of the mesh on which the case was solved"),
 }
 
@@ -201,7 +207,7 @@ def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """What a file holds: number of cases, numbers of those that did not converge, largest error of the others.
+    """What a file holds: number of cases, numbers of those that did not converge, largest shape error of the others.
 
     `missed`: numbers of cases that converged, but not to `rtol`, which is 0 where none was asked for; `overstretched`:
     of those strained by more than `strain_limit`.
@@ -400,12 +406,30 @@ def _solved(reader: CaseReader, manifest: Manifest, cases: Int[np.ndarray, "k"])
         warnings.simplefilter("ignore", NotConvergedWarning)  # said in the end, for all together
         warnings.simplefilter("ignore", OverstretchedWarning)
         result = solve_batch(stacked, **settings)
-        arrays = {name: np.asarray(getattr(result, name))[: len(cases)] for name in RESULTS}
+        arrays = {name: values[: len(cases)] for name, values in _values(result).items()}
         arrays["segments"] = np.full(len(cases), manifest.segments)
         if manifest.rtol:
             arrays = _refined(arrays, stacked, result, manifest, settings)
     parameters = {f"parameters/{key}": values for key, values in reader.cases.of(cases).items()}
     return {"case": cases} | arrays | parameters
+
+
+def _values(result: Equilibrium) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(result, name)) for name in RESULTS} | _errors(result)
+
+
+def _errors(result: Equilibrium) -> dict[str, np.ndarray]:
+    """All estimated errors at once: each property of a result would compute the estimate anew."""
+    errors = estimated_errors(result)
+    shape = np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1)
+    sections = (np.asarray(error) for error in (errors.force, errors.moment, errors.curvature))
+    return dict(zip(ERRORS, (shape, *sections), strict=True))
+
+
+def _error_by_rtol(arrays: Arrays) -> Float[np.ndarray, "k"]:
+    """What `rtol` is to be kept by, as in `solve`."""
+    shape, *sections = (arrays[name] for name in ERRORS)
+    return np.maximum(shape, np.max(sections, axis=0) / SECTION_FACTOR)
 
 
 def _refined(
@@ -416,7 +440,7 @@ def _refined(
     segments, rtol, finest = manifest.segments, manifest.rtol, SIZES[manifest.discretization][-1]
     s, cases = np.asarray(result.s), np.arange(len(arrays["segments"]))
     while True:
-        error = arrays["error_estimate"][cases]
+        error = _error_by_rtol(arrays)[cases]
         which = np.flatnonzero(arrays["converged"][cases] & ~(error <= rtol))
         factor = _growth(error[which], manifest, finest // segments) if len(which) else 1
         if factor < 2:
@@ -425,8 +449,7 @@ def _refined(
         scenes, result = _rows((scenes, result), which)
         settings = settings | {"segments": segments}
         result = solve_batch(scenes, guess=result, **settings)
-        found = {name: np.asarray(getattr(result, name)) for name in RESULTS if name != "nodes"}
-        found |= {"nodes": _nodes_at(result, s[cases]), "segments": np.full(len(cases), segments)}
+        found = _values(result) | {"nodes": _nodes_at(result, s[cases]), "segments": np.full(len(cases), segments)}
         # What does not converge on a finer mesh stays as it was, above `rtol`.
         better = np.flatnonzero(found["converged"])
         for name, values in found.items():
@@ -537,7 +560,7 @@ def _arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> di
 
     with _opened(path) as file:
         file.visititems(add)
-    missing = [name for name in ("case", "segments", *RESULTS) if name not in arrays]
+    missing = [name for name in ("case", "segments", *RESULTS, *ERRORS) if name not in arrays]
     if missing:
         raise SweepError(f"{path} is damaged: it lacks {', '.join(missing)}")
     if not np.array_equal(arrays["case"], cases):
@@ -600,14 +623,14 @@ def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.
 
 def summary(path: Path) -> Summary:
     with _opened(path) as file:
-        names = ("case", "converged", "error_estimate", "status")
-        case, converged, error, status = (np.asarray(file[name]) for name in names)
+        case, converged, status = (np.asarray(file[name]) for name in ("case", "converged", "status"))
+        errors = {name: np.asarray(file[name]) for name in ERRORS}
         rtol = Manifest.of(file.attrs, path).rtol
     return Summary(
         cases=len(case),
         failed=case[~converged].tolist(),
-        error=float(np.max(error[converged], initial=0.0)),
+        error=float(np.max(errors["error_estimate"][converged], initial=0.0)),
         rtol=rtol,
-        missed=case[converged & ~(error <= rtol)].tolist() if rtol else [],
+        missed=case[converged & ~(_error_by_rtol(errors) <= rtol)].tolist() if rtol else [],
         overstretched=case[status == Status.OVERSTRETCHED].tolist(),
     )

@@ -2,6 +2,7 @@
 
 import gc
 import os
+from pathlib import Path
 
 import jax
 import pytest
@@ -28,16 +29,25 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the slow tests too")
 
 
-# Files whose tests share nothing: with `--dist loadgroup` each of their tests goes to the worker that is free first, at
-# the end. Those of all other files stay together, as their fixtures and programs are in the memory of one worker.
+# Files whose tests share nothing: each of their tests goes to the worker that is free first, at the end. Those of all
+# other files stay together, as their fixtures and programs are in the memory of one worker.
 APART = ("test_experiments", "test_validation", "test_readme")
 
 
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            path = nodeid.split("::", 1)[0]
+            return nodeid if Path(path).stem in APART else path
+
+    return ByFile(config, log)
+
+
 def pytest_collection_modifyitems(config, items):
     for item in items:
-        if item.path.stem not in APART:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
         if "optimized" in item.keywords and not IS_OPTIMIZED:
             item.add_marker(
                 pytest.mark.skip(reason="two programs are the same to the last bit only as users have them")

@@ -37,7 +37,7 @@ from rodjax.files import load, save
 from rodjax.quantities import QUANTITIES
 from rodjax.scene_file import read_scene_file
 from rodjax.scene_writing import write_scene
-from rodjax.sweep import sweep
+from rodjax.sweep import ERRORS, sweep
 
 # What hypothesis keeps for itself goes beside other temporary files, not into the tree.
 set_hypothesis_home_dir(os.path.join(tempfile.gettempdir(), "rodjax-hypothesis"))
@@ -113,6 +113,7 @@ def samples(tmp_path_factory) -> Samples:
     grid.write_text(GRID)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rodjax.sweep.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweep._errors", made_up_errors)
         for name, shard in (("whole", (1, 1)), ("1", (1, 2)), ("2", (2, 2))):
             sweep(scene_file, grid, folder / f"{name}.h5", shard=shard, chunk=2)
         patch.setattr("rodjax.sweep._assemble", lambda *_: sys.exit())
@@ -125,7 +126,7 @@ def made_up_batch(scenes: rj.Scene, segments: int, **_: Any) -> Any:
     """Numbers in the place of solutions, for each case its own."""
     count = len(scenes.rod.EI)
     numbers = np.asarray(scenes.rod.EI)[:, None] + np.arange(3.0)
-    names = ("residual", "error_estimate", "energy", "elastic_energy", "total_twist")
+    names = ("residual", "energy", "elastic_energy", "total_twist")
     vectors = ("start_force", "start_moment", "end_force", "end_moment")
     flags = ("converged", "stable")
     return types.SimpleNamespace(
@@ -135,6 +136,10 @@ def made_up_batch(scenes: rj.Scene, segments: int, **_: Any) -> Any:
         **{name: np.ones(count, int) for name in ("status", "iterations")},
         nodes=np.tile(numbers[:, None], (1, segments + 1, 1)),
     )
+
+
+def made_up_errors(result: Any) -> dict[str, np.ndarray]:
+    return dict.fromkeys(ERRORS, result.energy)
 
 
 @pytest.fixture
@@ -1104,6 +1109,7 @@ def damaged_parts(example, world):
     damage_to(f"out.h5.parts/{name}", damaged)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rodjax.sweep.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweep._errors", made_up_errors)
         code, err = world.run(*RESUME)
     if code == 0:
         assert contents("out.h5") == contents(world.samples.sweeps / "whole.h5")
@@ -1189,6 +1195,7 @@ def full_disks_of_a_sweep(part, world):
     whole = world.samples.sweeps / "whole.h5"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rodjax.sweep.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweep._errors", made_up_errors)
         with full_disk(int(part * whole.stat().st_size)):
             line = world.refused(*RESUME[:-1], "--chunk", 2)
         assert "File too large" in line
@@ -1232,6 +1239,7 @@ def unwritable_places(example, world):
         patch.setattr(rj, "solve", lambda scene, **options: world.samples.single)
         patch.setattr("rodjax.plot.plot_rod", lambda equilibrium: Picture())
         patch.setattr("rodjax.sweep.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweep._errors", made_up_errors)
         line = world.refused(*arguments)
     assert name.strip() in line
     assert Path("note").read_text() == "old"

@@ -69,7 +69,15 @@ def test_figure_1(figure_1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rtol", "intervals"), [(1e-10, 4), (1e-13, 16)])
+@pytest.mark.parametrize(
+    ("rtol", "intervals"),
+    [
+        (1e-10, 4),
+        (1e-13, 16),
+        pytest.param(1e-12, 32, marks=pytest.mark.exhaustive),
+        pytest.param(1e-12, 3, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_neither_tolerance_nor_intervals_matter(figure_1, rtol, intervals):
     scene, guess = figure_1
     result = solve_continuum(scene, guess, rtol=rtol, intervals=intervals, segments=10)

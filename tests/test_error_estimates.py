@@ -15,6 +15,9 @@ from rodjax.refinement import SECTION_FACTOR
 from rodjax.result import warn_of_unknown_mesh
 from rodjax.rotations import columns
 
+# Rods as soft as EA L^2/EI = 1e3 in tight spans are strained by up to 0.4.
+pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
+
 COUNT = 12
 # Twisted and buckled between clamps on one line, the far one turned by these angles: all of it can turn about the line.
 TURNED = (0.0, 1.0, 2.5, np.pi)

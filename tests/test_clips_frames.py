@@ -101,11 +101,11 @@ def test_a_path_and_a_batch_with_turning_clips():
     scenes = [straight(angle, 0.0, 0.5) for angle in angles]
     path = rj.solve_path(scenes, segments=8, solver=TIGHT)
     assert np.all(path.converged)
-    np.testing.assert_allclose(path.twist[:, 0], angles / 0.5, rtol=1e-3)  # as above
+    np.testing.assert_allclose(path.twist[:, 0], angles / 0.5, rtol=1e-3, atol=1e-12)  # as above; roundings
     np.testing.assert_allclose(path.total_twist, 0.0, atol=1e-8)
     batch = rj.solve_batch(scenes[:3], segments=8, solver=TIGHT)
-    np.testing.assert_allclose(batch.twist[:, 0], angles[:3] / 0.5, rtol=1e-4)
-    np.testing.assert_allclose(batch.clip_moments[:, 0, 0], 4 * GJ * angles[:3], rtol=1e-4)
+    np.testing.assert_allclose(batch.twist[:, 0], angles[:3] / 0.5, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(batch.clip_moments[:, 0, 0], 4 * GJ * angles[:3], rtol=1e-4, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -113,7 +113,7 @@ def test_vmap_over_frames_is_one_solve_after_another(twisted):
     angles = jnp.array([0.4, 1.2, 2.0])
     together = jax.vmap(lambda angle: rj.solve(straight(angle, 2.5), segments=8, solver=TIGHT))(angles)
     np.testing.assert_allclose(together.clip_moments[1], twisted.clip_moments, atol=1e-10)  # roundings
-    np.testing.assert_allclose(together.twist[:, 0], angles / 0.3, rtol=1e-6)
+    np.testing.assert_allclose(together.twist[:, 0], angles / 0.3, rtol=1e-6, atol=1e-12)
 
 
 # --- beside rods by tangents, cut rods, and the theory of beams ------------------------------------------------------

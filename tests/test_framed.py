@@ -307,7 +307,7 @@ def test_a_curve_without_stress_stays_where_it_is_and_comes_back(discretization)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("discretization", DISCRETIZATIONS)
+@pytest.mark.parametrize("discretization", ["hermite", pytest.param("finite_difference", marks=pytest.mark.exhaustive)])
 def test_derivatives_by_rest_shape_stiffnesses_and_jumps(discretization):
     """Beside fourth-order finite differences of the same mesh."""
 

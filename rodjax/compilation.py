@@ -81,10 +81,12 @@ def _make_room() -> None:
     if most is None or _maps() <= SHARE_OF_MAPS * most:
         return
     _say_once()
-    for programs in sorted(_compiled, key=lambda programs: programs.last_call):
-        if not programs.count:
-            continue
-        programs.clear()
+    by_age = sorted((programs for programs in _compiled if programs.count), key=lambda programs: programs.last_call)
+    # Half of the functions at a time: a collection takes seconds in a process that holds millions of objects.
+    half = (len(by_age) + 1) // 2
+    for oldest in (by_age[:half], by_age[half:]):
+        for programs in oldest:
+            programs.clear()
         gc.collect()
         if _maps() <= SHARE_OF_MAPS * most / 2:
             return

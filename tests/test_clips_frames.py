@@ -337,7 +337,7 @@ def numbers(result: rj.Equilibrium):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_plain", [False, True])
+@pytest.mark.parametrize("is_plain", [pytest.param(False, marks=pytest.mark.exhaustive), True])
 def test_derivatives_by_place_position_and_frame(is_plain):
     options = {"segments": 8, "solver": rj.Newton(tolerance=1e-13)}
     scene = precurved((0.0, 1.0, -9.81), (0.02, 0.03, 0.05))

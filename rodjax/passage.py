@@ -4,7 +4,8 @@ Every place of the rod, and with it every obstacle that moves, goes straight fro
 through where its way leads deeper into an obstacle than half of the rod's radius, and the surface where it leaves looks
 back at that where it enters: their normals are more than 120 degrees apart. Any two shapes on different sides of a long
 obstacle have such a place, whatever the true way was. A rod that slides so far around an obstacle in one step counts
-too. Nothing is said of a place that begins deep within the obstacle, and so on no side of it.
+too. A rod that begins within an obstacle, as a first shape of the library's own may, is on no side of it: nothing is
+said then but whether it ends within.
 """
 
 from collections.abc import Callable
@@ -129,7 +130,9 @@ def _through(
     passed = is_opposed & begins_on_a_side & (least < rim / 2)
     of_held = mapped(distance, jnp.ones_like(rim), beside)
     is_beside = ~jnp.isnan(beside[:, 0])
-    within = first[:, -1] < jnp.where(is_beside, jnp.minimum(of_held, 0.0), 0.0) - WITHIN * rim
+    least_distance = jnp.where(is_beside, jnp.minimum(of_held, 0.0), 0.0) - WITHIN * rim
+    within = first[:, -1] < least_distance
+    passed &= ~jnp.any(first[:, 0] < least_distance)
     spread = jnp.zeros(len(after), bool)
     depths = jnp.zeros_like(radius).at[::step].set(rim - least)
     return spread.at[::step].set(passed), spread.at[::step].set(within), depths

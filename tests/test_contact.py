@@ -139,14 +139,15 @@ def test_meshes_are_as_fine_as_contacts_between_nodes_need(scene):
 
 
 @pytest.mark.slow
-def test_an_edge_costs_no_finest_mesh():
-    """What no mesh without a node there helps is said, and not sought."""
+def test_a_rod_that_begins_across_a_box_and_stays_there_is_told():
+    """The library's first shape of so much slack crosses the box; contacts at nodes leave an element within it, which no
+    finer mesh would lead out: not converged, and not sought up to the finest mesh."""
     box = rj.Box((0.4, 0, -0.25), (0.1, 1, 0.6))
     scene = Scene(cable(1.2), Clamp((0, 0, 0.1), LEVEL), Clamp((0.8, 0, 0.1), LEVEL), GRAVITY, obstacles=[box])
-    result = rj.solve(scene)
-    assert result.converged
+    with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = "):
+        result = rj.solve(scene)
+    assert not result.converged
     assert len(result.s) - 1 < 512
-    assert "pressed into an obstacle by more than 0.0001 of the radius" in rj.describe(result)
 
 
 # --- over a cylinder -------------------------------------------------------------------------------------------------

@@ -54,7 +54,14 @@ from rodjax.checks import file_path, whole_number
 from rodjax.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.files import FIELDS
 from rodjax.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
-from rodjax.result import Equilibrium, NotConvergedWarning, OverstretchedWarning, estimated_errors, positions_at
+from rodjax.result import (
+    Equilibrium,
+    MeshWarning,
+    NotConvergedWarning,
+    OverstretchedWarning,
+    estimated_errors,
+    positions_at,
+)
 from rodjax.scene import Scene
 from rodjax.scene_file import SceneFile
 from rodjax.scene_keys import unit_of
@@ -198,6 +205,7 @@ def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # as a case of the sweep it is counted
         warnings.simplefilter("ignore", OverstretchedWarning)
+        warnings.simplefilter("ignore", MeshWarning)  # each case has its errors
         result = solve(first.scenes[0], rtol=manifest.rtol, discretization=first.discretization)
     return manifest._replace(segments=result.s.shape[-1] - 1, discretization=result.discretization)
 
@@ -405,6 +413,7 @@ def _solved(reader: CaseReader, manifest: Manifest, cases: Int[np.ndarray, "k"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConvergedWarning)  # said in the end, for all together
         warnings.simplefilter("ignore", OverstretchedWarning)
+        warnings.simplefilter("ignore", MeshWarning)  # each case has its errors
         result = solve_batch(stacked, **settings)
         arrays = {name: values[: len(cases)] for name, values in _values(result).items()}
         arrays["segments"] = np.full(len(cases), manifest.segments)

@@ -463,9 +463,7 @@ def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
     assert err == "rodjax: rough.h5: 2 of 5 cases above rtol = 0.01 on the finest mesh: 3, 4\n"
     assert summary(Path("rough.h5")).missed == [3, 4]
     # A batch is solved on one mesh, and says how many cases miss the tolerance there.
-    with pytest.warns(
-        rodjax.NotConvergedWarning, match=r"3.7e-01 .* above rtol = 0.01 in 2 of 5 cases on the"
-    ):
+    with pytest.warns(rodjax.NotConvergedWarning, match=r"3.7e-01 .* above rtol = 0.01 in 2 of 5 cases on the"):
         rodjax.solve_batch(scenes, rtol=0.01)
 
 

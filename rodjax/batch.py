@@ -44,8 +44,7 @@ from rodjax.result import (
     Found,
     SolverState,
     equilibrium,
-    warn_if_not_converged,
-    warn_if_overstretched,
+    warn_of_outcome,
 )
 from rodjax.scene import Scene, slides
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
@@ -138,8 +137,7 @@ def solve_stack(
 
     result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
-        warn_if_not_converged(result)
-        warn_if_overstretched(result, strain_limit)
+        warn_of_outcome(result, strain_limit)
     return differentiable(stacked, result)
 
 

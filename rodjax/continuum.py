@@ -31,7 +31,7 @@ from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.energy import axial_strain_under, dead_load_energy, density
 from rodjax.equilibrium import MAX_SEGMENTS, solve
-from rodjax.result import Equilibrium, NotConvergedWarning, warn_if_not_converged
+from rodjax.result import Equilibrium, NotConvergedWarning, warn_of_outcome
 from rodjax.rod import Rod
 from rodjax.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_places
 from rodjax.shooting import (
@@ -136,7 +136,7 @@ def solve_continuum(
         if intervals is None:
             intervals = _chosen_intervals(_growth, fixed_scene, guess)
         result = _solve(scene, guess, rtol, intervals, segments)
-    warn_if_not_converged(result)
+    warn_of_outcome(result)
     return result
 
 

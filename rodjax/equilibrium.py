@@ -47,8 +47,7 @@ from rodjax.result import (
     estimated_errors,
     passage_to,
     warn_if_coarse,
-    warn_if_not_converged,
-    warn_if_overstretched,
+    warn_of_outcome,
     warn_of_unknown_mesh,
 )
 from rodjax.scene import (
@@ -157,13 +156,12 @@ def solve(
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
-    if is_known(result):
+    if is_known(result.status):
         result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
     if fixed_scene is not scene:
         result = with_ranges(fixed_scene, result)
-    warn_if_not_converged(result)
-    warn_if_overstretched(result, strain_limit)
-    return differentiable(scene, result)
+    warn_of_outcome(result, strain_limit)
+    return result if fixed_scene is scene else differentiable(scene, result)
 
 
 def _looked_at(result: Equilibrium) -> Equilibrium:
@@ -327,18 +325,19 @@ def checked_options(
     one_of(discretization, "discretization", typing.get_args(Discretization))
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
-    if needs_frames(scene):
+    of_frames = needs_frames(scene)
+    if of_frames:
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a rod, loads or clips that need frames along the rod")
         if planar:
             raise ValueError("planar must be False for a rod, loads or clips that need frames along the rod")
     if scene.clips:
-        if needs_frames(scene) and discretization == "finite_difference":
+        if of_frames and discretization == "finite_difference":
             raise ValueError(
                 "discretization must be 'hermite' for clips on a rod, or with loads or clips, that need frames along "
                 "the rod"
             )
-        if needs_frames(scene) and slides(scene):
+        if of_frames and slides(scene):
             raise ValueError("clips must not be sliding for a rod, loads or clips that need frames along the rod")
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
@@ -359,7 +358,8 @@ def checked_options(
         rtol = DEFAULT_RTOL
     # A node for each clip, and where the mesh is chosen a few of them in each span.
     least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
-    least = _least_for_jumps(scene, segments, least) if discretization == "hermite" else least
+    if of_frames and discretization == "hermite":
+        least = _least_for_jumps(scene, segments, least)
     if segments is not None:
         segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
     elif isinstance(guess, Equilibrium):
@@ -383,7 +383,7 @@ def checked_options(
 
 def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
     """The fewest elements, or more where a rod whose numbers are known has `Steps` near to one another."""
-    needed = segments_for_jumps(scene) if needs_frames(scene) and is_known(scene) else None
+    needed = segments_for_jumps(scene) if is_known(scene) else None
     if needed is None or needed[0] <= (SIZES["hermite"][-1] if segments is None else segments):
         return least if needed is None else max(least, needed[0])
     count, gap = needed
@@ -412,8 +412,10 @@ def checked_rtol(rtol: Any) -> float:
 
 def checked_strain_limit(strain_limit: Any) -> Float[Array, ""] | float:
     """The largest |axial strain| that is allowed: infinite for `None`."""
-    if strain_limit is None or (isinstance(strain_limit, float) and strain_limit == math.inf):
+    if strain_limit is None:
         return math.inf
+    if isinstance(strain_limit, float) and strain_limit > 0:
+        return float(strain_limit)
     value = positive(strain_limit, "strain_limit")
     return float(value) if is_known(value) else jax.lax.stop_gradient(leaf(value))
 

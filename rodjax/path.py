@@ -36,8 +36,7 @@ from rodjax.result import (
     Found,
     SolverState,
     equilibrium,
-    warn_if_not_converged,
-    warn_if_overstretched,
+    warn_of_outcome,
 )
 from rodjax.scene import Scene, between, has_potential, nondimensional, slides
 from rodjax.solvers.newton import Find
@@ -104,8 +103,7 @@ def solve_path(
         return path_from(fixed_scenes, guess, strain_limit, options, progress)
 
     path = with_ranges(fixed_scenes, refined_together(solve, options, rtol))
-    warn_if_not_converged(path)
-    warn_if_overstretched(path, strain_limit)
+    warn_of_outcome(path, strain_limit)
     if at_critical == "stop":
         count = _before_critical(fixed_scenes, path)
         stacked, path = jax.tree.map(lambda leaf: leaf[:count], (stacked, path))
@@ -204,7 +202,8 @@ def path_from(
     progress: bool = False,
 ) -> Equilibrium:
     """A path on one mesh; the guess is for its first scene."""
-    first = jax.tree.map(lambda leaf: leaf[0], scenes)
+    # NumPy's, where the numbers are known: JAX takes as long for each of them as for a step.
+    first = jax.tree.map(lambda leaf: namespace(leaf).asarray(leaf)[0], scenes)
     return _solve_path(scenes, *first_state(first, guess, options), strain_limit, options, progress)
 
 

@@ -4,6 +4,7 @@ import functools
 import inspect
 import itertools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -31,11 +32,13 @@ def check_ranges(scenes: Scene) -> None:
     scenes = jax.tree.map(np.asarray, scenes)
     shape = scenes.rod.length.shape
     is_suspect = np.ones(shape, bool)
-    if shape and not _differs(scenes):
+    parts = jax.tree.leaves(_checked_when_made(scenes))
+    first = (0,) * len(shape)
+    if all(np.all(leaf == leaf[first]) for leaf in parts) and shape:
         with np.errstate(all="ignore"):
             is_suspect = np.asarray(_is_wrong(scenes) | _is_too_far(scenes))
         # What is the same in all of them is looked at in the first.
-        is_suspect[(0,) * len(shape)] = True
+        is_suspect[first] |= bool(parts)
     for case in np.argwhere(is_suspect):
         name = f"scenes{''.join(f'[{k}]' for k in case)}" if shape else "scene"
         _made(jax.tree.map(lambda leaf, case=case: leaf[tuple(case)], scenes), name)
@@ -60,7 +63,7 @@ def _made(part: Any, name: str) -> Any:
         return tuple(_made(one, f"{name}[{k}]") for k, one in enumerate(part))
     if not isinstance(part, eqx.Module) or isinstance(part, Law):
         return part
-    parameters = inspect.signature(type(part)).parameters
+    parameters = _parameters(type(part))
     if not all(hasattr(part, argument) for argument in parameters):
         return part
     arguments = {argument: _made(getattr(part, argument), f"{name}.{argument}") for argument in parameters}
@@ -72,11 +75,14 @@ def _made(part: Any, name: str) -> Any:
         raise ValueError(f"{name}: {error}") from None
 
 
-def _differs(scenes: Scene) -> bool:
-    """Whether stacked scenes have parts that only their making can check, and that are not the same in all of them."""
-    parts = [value for value in _values_of(scenes.rod) if isinstance(value, Along)], scenes.obstacles
-    first = (0,) * scenes.rod.length.ndim
-    return any(not np.all(leaf == leaf[first]) for leaf in jax.tree.leaves(parts))
+@functools.cache
+def _parameters(kind: type) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(kind).parameters
+
+
+def _checked_when_made(scenes: Scene) -> Any:
+    """The parts of scenes that only their making can check."""
+    return [value for value in _values_of(scenes.rod) if isinstance(value, Along)], scenes.obstacles
 
 
 def _values_of(rod: Rod) -> list[Any]:
@@ -90,31 +96,38 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     xp = namespace(scenes)
     rod, clips, length = scenes.rod, scenes.clips, scenes.rod.length
 
-    def each(holds: Bool[Numbers, "..."]) -> Bool[Numbers, "..."]:
-        """Of each scene whether it holds for all numbers."""
-        return xp.all(holds.reshape(*length.shape, -1), axis=-1)
-
-    def numbers(value: Any) -> Float[Numbers, "..."]:
-        return value.values if isinstance(value, Along) else value
-
-    good = [each(xp.isfinite(leaf)) for leaf in jax.tree.leaves(scenes) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    good = [
+        _each(xp.isfinite(leaf), scenes) for leaf in jax.tree.leaves(scenes) if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
     positive = [length, *rod.bending_pair, rod.GJ, rod.EA, *([] if rod.radius is None else [rod.radius])]
-    good += [each(numbers(value) > 0) for value in positive]
-    good.append(each(numbers(rod.mass_per_length) >= 0))
+    good += [_each(_numbers(value) > 0, scenes) for value in positive]
+    good.append(_each(_numbers(rod.mass_per_length) >= 0, scenes))
     places = [xp.zeros_like(length), *(clip.at for clip in clips), length]
     good += [before < after for before, after in itertools.pairwise(places)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]
     frames = [end.frame for end in (scenes.start, scenes.end) if isinstance(end, Clamp)]
-    good += [each(_is_rotation(frame)) for frame in (*frames, *(clip.frame for clip in clips)) if frame is not None]
+    good += [
+        _each(_is_rotation(frame), scenes) for frame in (*frames, *(clip.frame for clip in clips)) if frame is not None
+    ]
     if scenes.turns is not None:
         good.append(scenes.turns == xp.round(scenes.turns))
     for value in _values_of(rod):
         if isinstance(value, Steps):
-            good += [each(value.jumps > 0), each(value.jumps < length[..., None]), each(xp.diff(value.jumps) > 0)]
+            bounds = xp.concatenate([xp.zeros_like(length)[..., None], value.jumps, length[..., None]], axis=-1)
+            good.append(_each(xp.diff(bounds) > 0, scenes))
         if isinstance(value, Smooth):
-            good += [each(xp.diff(value.s) > 0), xp.abs(value.s[..., 0]) <= ARCLENGTH_TOLERANCE * length]
+            good += [_each(xp.diff(value.s) > 0, scenes), xp.abs(value.s[..., 0]) <= ARCLENGTH_TOLERANCE * length]
             good.append(xp.abs(value.s[..., -1] - length) <= ARCLENGTH_TOLERANCE * length)
     return ~functools.reduce(operator.and_, good)
+
+
+def _each(holds: Bool[Numbers, "..."], scenes: Scene) -> Bool[Numbers, "..."]:
+    """Of each scene whether it holds for all its numbers."""
+    return holds.reshape(*scenes.rod.length.shape, -1).all(-1)
+
+
+def _numbers(value: Any) -> Float[Numbers, "..."]:
+    return value.values if isinstance(value, Along) else value
 
 
 def _is_rotation(frame: Float[Numbers, "... 3 3"]) -> Bool[Numbers, "... 3"]:

@@ -574,18 +574,18 @@ def passage_to(
 def warn_if_coarse(equilibrium: Equilibrium) -> None:
     """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that."""
     curvature, s = np.asarray(equilibrium.curvature), np.asarray(equilibrium.s)
-    beside = np.maximum(curvature[..., 1:], curvature[..., :-1])
-    turns = np.max(beside * (s[..., 1:] - s[..., :-1]), axis=-1)
-    turns = turns[np.asarray(equilibrium.converged)]
+    along = np.maximum(curvature[..., 1:], curvature[..., :-1]) * (s[..., 1:] - s[..., :-1])
     most = MOST_TURN[equilibrium.discretization]
-    if np.any(turns > most):
-        many = (
-            f" in {np.sum(turns > most)} of {equilibrium.converged.size} scenes" if equilibrium.converged.ndim else ""
-        )
+    is_coarse = (along > most).any(-1)
+    if not is_coarse.any():
+        return
+    is_coarse &= np.asarray(equilibrium.converged)
+    if is_coarse.any():
+        many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
         warnings.warn(
-            f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {np.max(turns):.1f} rad "
-            "along one of them; more segments, or rtol in the place of segments, may help; rodjax.describe tells the "
-            "errors",
+            f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by "
+            f"{np.max(along[is_coarse]):.1f} rad along one of them; more segments, or rtol in the place of segments, "
+            "may help; rodjax.describe tells the errors",
             MeshWarning,
             stacklevel=4,
         )
@@ -603,17 +603,20 @@ def warn_of_unknown_mesh(segments: int) -> None:
     )
 
 
-def warn_if_not_converged(equilibrium: Equilibrium) -> None:
-    if is_known(equilibrium.converged) and not np.all(equilibrium.converged):
-        warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)
-
-
-def warn_if_overstretched(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float) -> None:
-    """Of a limit and statuses that are known."""
-    if not is_known(equilibrium.status, strain_limit) or not np.any(_is_overstretched(equilibrium)):
+def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT) -> None:
+    """Where statuses are known, of those that are not converged and of those above a strain."""
+    if not is_known(equilibrium.status):
         return
-    count = int(np.sum(_is_overstretched(equilibrium)))
-    rods = "the rod is" if not equilibrium.status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
+    status = np.asarray(equilibrium.status)
+    if not status.any():  # all CONVERGED
+        return
+    if not np.all(equilibrium.converged):
+        warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)
+    is_overstretched = status == Status.OVERSTRETCHED
+    if not is_overstretched.any() or not is_known(strain_limit):
+        return
+    count = int(np.sum(is_overstretched))
+    rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
     warnings.warn(
         f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}",
         OverstretchedWarning,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax.discretization.error import bulge
 from rodjax.path import stack_scenes
 from rodjax.refinement import SECTION_FACTOR
 from rodjax.result import warn_of_unknown_mesh
@@ -184,3 +185,21 @@ def test_the_tension_of_a_curved_rod_held_straight_is_known_to_be_off():
     largest = np.maximum(np.linalg.norm(found.end_force, axis=-1), 1.0)
     np.testing.assert_allclose(found.force_error, off / largest, rtol=1e-4)
     assert np.all(found.moment_error < 1e-6)
+
+
+def test_the_twist_of_a_curve_beyond_that_of_an_arc_is_the_area_between_them():
+    """Between a small circle of tangents and the great circle through its ends: the sector phi (1 - cos theta) of the
+    circle, theta from its pole, less the triangle of the pole and the ends (Girard's theorem); to fourth order.
+    """
+    theta, phi = 0.7, 1.2
+    half = np.tan(theta / 2) ** 2
+    triangle = 2 * np.arctan2(half * np.sin(phi), 1 + half * np.cos(phi))
+    exact = phi * (1 - np.cos(theta)) - triangle
+
+    def off(count: int) -> float:
+        angles = np.linspace(0.0, phi, count + 1)
+        tangents = [np.sin(theta) * np.cos(angles), np.sin(theta) * np.sin(angles), np.full(count + 1, np.cos(theta))]
+        return abs(float(bulge([jnp.array(tangent)[:, None] for tangent in np.transpose(tangents)])[0])) - exact
+
+    assert abs(off(4)) < 0.02 * exact
+    assert off(4) / off(8) == pytest.approx(16.0, rel=0.1)

@@ -225,7 +225,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
     closure = -form.of_force(form.along_spans(gap))
     if form.has_torsion:
-        missing = jnp.sum(_bulge(passed) - _bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
+        missing = jnp.sum(bulge(passed) - bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
         between = jnp.zeros(len(here.closure) - len(closure) - 1, closure.dtype)  # what pushes at the nodes
         closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
     elif len(here.closure) > len(closure):
@@ -349,7 +349,7 @@ def _integrated(
     return last, [first.tangent, *passed]
 
 
-def _bulge(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
+def bulge(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
     """By how much the twist of a curve through these tangents exceeds that of the arc from the first to the last."""
     whole, half = _fan(tangents), _fan(tangents[::2])
     return (4 * whole - half) / 3

@@ -90,11 +90,11 @@ def solve_batch(
     check_ranges(*not_differentiated(stacked))
     return solve_stack(
         stacked,
+        guess,
         segments=segments,
         rtol=rtol,
         discretization=discretization,
         solver=solver,
-        guess=guess,
         planar=planar,
         find=find,
         strain_limit=strain_limit,
@@ -105,17 +105,12 @@ def solve_batch(
 
 def solve_stack(
     stacked: Scene,
-    *,
-    segments: int | None = None,
-    rtol: float | None = None,
-    discretization: Discretization | None = None,
-    solver: Solver | None = None,
     guess: Guess | Equilibrium | None = None,
-    planar: bool = False,
-    find: Find = "minimum",
+    *,
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> Equilibrium:
     """The same of stacked scenes of which some may have supports that are too far apart, as in a search."""
     instance(progress, "progress", bool)
@@ -127,7 +122,7 @@ def solve_stack(
     count = given.rod.length.shape[0]
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
-    options, rtol = checked_options(given, segments, rtol, discretization, solver, guess, planar, find)
+    first_options, rtol = checked_options(given, guess=guess, **options)
     strain_limit = checked_strain_limit(strain_limit)
 
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
@@ -135,7 +130,7 @@ def solve_stack(
         begin = guess if last is None or last.s.ndim > 2 else last
         return _in_chunks(given, begin, strain_limit, options, mesh, progress)
 
-    result = with_ranges(given, refined_together(solve, options, rtol))
+    result = with_ranges(given, refined_together(solve, first_options, rtol))
     if is_here(result):
         warn_of_outcome(result, strain_limit)
     return differentiable(stacked, result)
@@ -210,7 +205,7 @@ def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Option
     return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None)
 
 
-@functools.partial(compiled, static_argnames=("options", "mesh"))
+@functools.partial(compiled, static_argnames=("mesh",))
 def _solve_many(
     scenes: Scene,
     guess: Guess | Equilibrium | None,
@@ -220,14 +215,14 @@ def _solve_many(
     mesh: Mesh | None,
 ) -> Equilibrium:
     """The first of the scenes, as many as `counts` tells each device; of the rest something without meaning."""
-    solve = functools.partial(_solve_here, options=options)
     if mesh is None:
-        return solve(scenes, guess, counts, strain_limit)
+        return _solve_here(scenes, guess, counts, strain_limit, options)
     # Not `jit` with sharded inputs, which would ask all devices in each turn whether all are done.
     shared = PartitionSpec(mesh.axis_names[0])
-    specs = (shared, shared if _is_stack(guess) else PartitionSpec(), shared, PartitionSpec())
-    many = jax.shard_map(solve, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
-    return many(scenes, guess, counts, jnp.asarray(strain_limit))
+    whole = PartitionSpec()
+    specs = (shared, shared if _is_stack(guess) else whole, shared, whole, whole)
+    many = jax.shard_map(_solve_here, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
+    return many(scenes, guess, counts, *jax.tree.map(jnp.asarray, (strain_limit, options)))
 
 
 def _solve_here(

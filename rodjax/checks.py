@@ -88,7 +88,9 @@ def number_list(value: Any, name: str) -> Float[Numbers, "k"]:
 
 
 def plain_number(name: str) -> Callable[[Any], float]:
-    """What makes Python's number of an option of that name: a solver is part of what a program is compiled for."""
+    """What makes Python's number of an option of that name, a solver's: Python compares it, and JAX takes its precision
+    from the scene's.
+    """
 
     def number(value: Any) -> float:
         number_array(value, name)

@@ -6,7 +6,7 @@ import math
 import typing
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -89,8 +89,16 @@ MOST_FAILURES = 3
 MAX_SEGMENTS = 100_000
 
 
-class Options(NamedTuple):
-    """How a scene is solved, and on what mesh: all that a compiled program depends on besides the scene's structure."""
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["solver"],
+    meta_fields=["segments", "discretization", "planar", "find"],
+)
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How a scene is solved, and on what mesh: all that a compiled program depends on besides the scene's structure,
+    but for the numbers of the solver, which it is given.
+    """
 
     segments: int
     discretization: Discretization
@@ -187,7 +195,9 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         if sinks and defects is not None and errors.depths is not None:
             defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
         lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
-        options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
+        options = dataclasses.replace(
+            options, segments=next_size(options.segments, lacking, rtol, options.discretization)
+        )
         finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
@@ -220,7 +230,9 @@ def refined_together(
             _warn_if_inaccurate(error, rtol, options, f" in {missed} of {sizes.size} cases")
             break
         lacking = max(error, sinks * rtol / SAFETY)
-        options = options._replace(segments=next_size(options.segments, lacking, rtol, options.discretization))
+        options = dataclasses.replace(
+            options, segments=next_size(options.segments, lacking, rtol, options.discretization)
+        )
         result = solve(options, result)
     return result
 
@@ -244,7 +256,7 @@ def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str 
         )
 
 
-@functools.partial(compiled, static_argnames=("options",))
+@compiled
 def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Options) -> SolverState:
     """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
     state = coarse.state
@@ -306,12 +318,12 @@ def _of_elements(
 
 def checked_options(
     scene: Scene,
-    segments: int | None,
-    rtol: float | None,
-    discretization: Discretization | None,
-    solver: Solver | None,
-    guess: Guess | Equilibrium | None,
-    planar: bool,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
     find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
@@ -486,7 +498,7 @@ def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
     return isinstance(shape, _kind(options))
 
 
-@functools.partial(compiled, static_argnames=("options",))
+@compiled
 def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
     """Cold starts look like warm ones, so that both have one program."""
     state, first = _unsettled_state(scene, guess, options)
@@ -670,7 +682,7 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
         scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
 
     tolerance = options.solver.tolerance
-    inner = options._replace(solver=dataclasses.replace(options.solver, tolerance=INNER_TOLERANCE * tolerance))
+    inner = eqx.tree_at(lambda options: options.solver.tolerance, options, INNER_TOLERANCE * tolerance)
 
     def find_at(scene: Scene, last: Found) -> Found:
         return _found(scene, last.state, FirstTwist(last.point.total_twist), inner)
@@ -713,7 +725,7 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
-@functools.partial(compiled, static_argnames=("options",))
+@compiled
 def _solve(
     scene: Scene,
     state: SolverState,

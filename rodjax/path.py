@@ -164,7 +164,7 @@ def _structure(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-@functools.partial(compiled, static_argnames=("options", "progress"))
+@functools.partial(compiled, static_argnames=("progress",))
 def _solve_path(
     scenes: Scene,
     state: SolverState,

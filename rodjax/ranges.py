@@ -123,7 +123,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
 
 def _each(holds: Bool[Numbers, "..."], scenes: Scene) -> Bool[Numbers, "..."]:
     """Of each scene whether it holds for all its numbers."""
-    return holds.reshape(*scenes.rod.length.shape, -1).all(-1)
+    return namespace(holds).all(holds.reshape(*scenes.rod.length.shape, -1), axis=-1)
 
 
 def _numbers(value: Any) -> Float[Numbers, "..."]:

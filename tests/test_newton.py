@@ -7,6 +7,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
+from rodjax.compilation import program_count
 from rodjax.solvers import newton
 
 # The twisting moment M L/EI up to which a rod between two clamps stays straight: smallest root of tan(M/2) = M/2.
@@ -148,6 +149,19 @@ def test_too_few_iterations_are_flagged():
     assert not result.converged
     assert not result.stable
     assert result.iterations == 1
+
+
+def test_all_numbers_of_a_solver_have_one_program():
+    """And are obeyed: residuals below each tolerance, more iterations for smaller ones and for smaller steps."""
+    options = dict(segments=10, discretization="finite_difference", guess=problems.figure_1_start())
+    solvers = [rj.Newton(tolerance=1e-4), rj.Newton(tolerance=1e-9), rj.Newton(tolerance=1e-9, max_rotation=0.1)]
+    first = rj.solve(problems.omega(0.5, 0.0), **options)
+    programs = program_count()
+    results = [rj.solve(problems.omega(0.5, 0.0), solver=solver, **options) for solver in solvers]
+    assert program_count() == programs
+    assert all(result.residual <= solver.tolerance for result, solver in zip(results, solvers, strict=True))
+    assert results[0].iterations < results[1].iterations < results[2].iterations
+    np.testing.assert_allclose(results[2].energy, first.energy, rtol=1e-10)  # EA L^2/EI = 1.6e5 roundings
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,14 @@ from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.continuum_frames import growth_of_frames, solve_frames
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve, HermiteElements
-from rodjax.energy import axial_strain_under, dead_load_energy, density
+from rodjax.energy import (
+    axial_strain_under,
+    curvature_under,
+    dead_load_energy,
+    density,
+    torque_at,
+    twist_under,
+)
 from rodjax.equilibrium import MAX_SEGMENTS, solve
 from rodjax.result import Equilibrium, NotConvergedWarning, warn_of_outcome
 from rodjax.rod import Rod
@@ -188,7 +195,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
         force = piece.force if piece.gravity is None else piece.force - u * piece.length * piece.gravity
         t = rotation_of(end.quaternion)[:, 2]
         bending = end.moment - jnp.sum(end.moment * t) * t
-        curvature = bending / rod.EI
+        curvature = curvature_under(rod, bending)
         axial_strain = axial_strain_under(rod, jnp.sum(force * t))
         dphi = (1 + axial_strain) * t
         weight = zero if piece.gravity is None else dead_load_energy(piece.gravity, end.position)
@@ -232,7 +239,7 @@ def _piece(scene: Scene, section: Section, length: Float[Array, ""]) -> Piece:
 
 def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEnd) -> Section:
     """The cross section at the other end of that piece."""
-    spin = section.torque / scene.rod.GJ * length
+    spin = twist_under(scene.rod, section.torque) * length
     return Section(
         position=section.position + section.frame @ end.position,
         frame=section.frame @ rotation_of(end.quaternion) @ _about_tangent(spin),
@@ -347,7 +354,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     ends = (guess.start_moment / fixed_units.energy, guess.end_moment / fixed_units.energy)
     moments = moments.at[0].set(ends[0]).at[-1].set(ends[1])
     across = moments - jnp.sum(moments * tangents, axis=1)[:, None] * tangents
-    moments = across + fixed.rod.GJ * guess.total_twist * tangents
+    moments = across + torque_at(fixed.rod, guess.total_twist) * tangents
     force = jnp.stack([jnp.interp(fixed_s, x, component) for component in node_force.T], axis=1)
     moment = jnp.stack([jnp.interp(fixed_s, x, component) for component in moments.T], axis=1)
     if scene.clips:
@@ -423,12 +430,12 @@ def _equilibrium(
         jumps = _reached(scaled, start, sections, ends).moment[start.clips - 1] - sections.moment[start.clips]
         is_directed = np.array([clip.tangent is not None for clip in scaled.clips])
         clip_moments = jnp.where(is_directed[:, None], jumps, 0.0)
-    twist = sections.torque[0] / rod.GJ
+    twist = twist_under(rod, sections.torque[0])
     moments = nodes.moment - nodes.torque[:, None] * nodes.tangent
     result = Reached(
         s=s,
         nodes=nodes,
-        curvature=root(jnp.sum(moments**2, axis=1)) / rod.EI,
+        curvature=root(jnp.sum(curvature_under(rod, moments) ** 2, axis=1)),
         twist=jnp.full_like(s, twist),
         axial_strain=axial_strain_under(rod, nodes.tension),
         total_twist=twist,

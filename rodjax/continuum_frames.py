@@ -25,7 +25,7 @@ from rodjax.along import Smooth, Spline, Steps, Value
 from rodjax.discretization.cells import ElementCells, varying
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.discretization.framed_results import own_moments, strains_under
+from rodjax.discretization.framed_results import own_moments
 from rodjax.energy import Sections, dead_load_energy
 from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rest import RestStrain, SpaceCurve, SplinedCurve
@@ -82,7 +82,7 @@ class Material(eqx.Module):
             prepared = (k1, k2, twist)
         elif isinstance(rest, SpaceCurve):
             prepared = rest.splined
-        EI1, EI2, GJ, EA = (_prepared(value) for value in (*rod.bending_pair, rod.GJ, rod.EA))
+        EI1, EI2, GJ, EA = (_prepared(value) for value in rod.stiffnesses)
         return Material(
             (EI1, EI2, GJ, EA),
             _prepared(rod.mass_per_length),
@@ -174,7 +174,7 @@ def _strained(
     moment: Float[Array, "3"],
 ) -> Strained:
     sections = material.sections(s, interval)
-    beyond_rest, axial = strains_under(sections, frame.T @ moment, jnp.sum(force * frame[:, 2]))
+    beyond_rest, axial = sections.strains_under(frame.T @ moment, jnp.sum(force * frame[:, 2]))
     return Strained(sections, beyond_rest, beyond_rest + material.rest_strains(s, interval), axial)
 
 

@@ -1,5 +1,7 @@
 """The energy of a rod: its density and the work of dead loads. Every force and derivative comes from these."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,8 +9,10 @@ from jaxtyping import Array, Float
 
 from rodjax.rod import Law, Rod
 
-# Steps of Newton's method for the axial strain under a law: a law that is quadratic in it takes one.
+# Steps of Newton's method under a law for the axial strain, and for the other strains under a moment: a law that is
+# quadratic in them takes one.
 AXIAL_STEPS = 4
+LAW_STEPS = 6
 
 
 def density(
@@ -31,18 +35,40 @@ def density(
     return sum(terms[1:], terms[0])
 
 
+def torque_at(rod: Rod, twist: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """dw/d(twist) [N m]."""
+    return jax.grad(lambda twist: jnp.sum(density(rod, twist=twist)))(twist)
+
+
+def bending_moment_at(rod: Rod, curvature: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """dw/d(t x t') [N m], of vectors by component."""
+    return jax.grad(lambda curvature: jnp.sum(density(rod, squared_curvature=curvature**2)))(curvature)
+
+
 def axial_strain_under(rod: Rod, tension: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The axial strain [1] at which the tension dw/d(axial strain) is the given one [N].
+    """The axial strain [1] at which the tension dw/d(axial strain) is the given one [N]."""
+    return _strain_under(lambda strain: density(rod, axial_strain=strain), tension)
 
-    One Newton step from zero strain, exact for a density quadratic in it.
-    """
 
-    def tension_at(strain):
-        return jax.grad(lambda strain: jnp.sum(density(rod, axial_strain=strain)))(strain)
+def twist_under(rod: Rod, torque: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The twist [rad/m] at which the torque is the given one [N m]."""
+    return _strain_under(lambda twist: density(rod, twist=twist), torque)
 
-    at_rest = jnp.zeros_like(tension)
-    first, stiffness = jax.jvp(tension_at, (at_rest,), (jnp.ones_like(tension),))
-    return (tension - first) / stiffness
+
+def curvature_under(rod: Rod, moment: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The curvature t x t' [1/m] at which the bending moment is the given one [N m], of vectors by component."""
+    return _strain_under(lambda curvature: density(rod, squared_curvature=curvature**2), moment)
+
+
+def _strain_under(energy: Callable[[Array], Array], stress: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """One step of Newton's method from zero strain, exact for a density quadratic in it."""
+
+    def stress_at(strain):
+        return jax.grad(lambda strain: jnp.sum(energy(strain)))(strain)
+
+    at_rest = jnp.zeros_like(stress)
+    first, stiffness = jax.jvp(stress_at, (at_rest,), (jnp.ones_like(stress),))
+    return (stress - first) / stiffness
 
 
 def dead_load_energy(force: Float[Array, "3"], position: Float[Array, "3"]) -> Float[Array, ""]:
@@ -101,3 +127,33 @@ class Sections(eqx.Module):
         for _ in range(AXIAL_STEPS):
             strain = jax.lax.stop_gradient(improved(strain, *fixed))
         return improved(strain, tension, curvature, twist)
+
+    def strains_under(
+        self, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
+    ) -> tuple[Float[Array, "3 *k"], Float[Array, "*k"]]:
+        """What the strains exceed those at rest by, under a moment in material axes, and the axial strain."""
+        strains = moment / jnp.concatenate([self.EI, self.GJ[None]])
+        if self.law is None:
+            return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+
+        def improved(strains: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+            def enthalpy(strains):
+                axial = self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+                return jnp.sum(self.density((strains[0], strains[1]), strains[2], axial) - tension * (1 + axial))
+
+            first, by_all = jax.linearize(jax.grad(enthalpy), strains)
+            directions = jnp.eye(3, dtype=strains.dtype).reshape(3, 3, *[1] * tension.ndim)
+            directions *= jnp.ones_like(strains)[None]
+            second = jax.vmap(by_all)(directions)
+            lacking = jnp.moveaxis(moment - first, 0, -1)[..., None]
+            moved = jnp.linalg.solve(jnp.moveaxis(second, (0, 1), (-1, -2)), lacking)
+            return strains + jnp.moveaxis(moved[..., 0], -1, 0)
+
+        for _ in range(LAW_STEPS):
+            strains = improved(strains)
+        return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
+
+    @property
+    def stiffest(self) -> Float[Array, ""]:
+        """The largest stiffness against bending or torsion."""
+        return jnp.maximum(jnp.max(self.EI), jnp.max(self.GJ))

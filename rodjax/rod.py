@@ -141,6 +141,11 @@ class Rod(eqx.Module):
         return self.EI if isinstance(self.EI, tuple) else (self.EI, self.EI)
 
     @property
+    def stiffnesses(self) -> tuple[Value, Value, Value, Value]:
+        """Against bending about d1 and d2, torsion and stretching."""
+        return (*self.bending_pair, self.GJ, self.EA)
+
+    @property
     def rest_shape(self) -> RestShape | None:
         if self.rest_centerline is not None:
             return self.rest_centerline

@@ -175,10 +175,11 @@ class JointCells(eqx.Module):
 
     def sections(self, rod: Rod) -> Sections:
         a, b = self.places[:-1], self.places[1:]
-        joints = [stiffness_at(value, (a + b) / 2, a, b) for value in (*rod.bending_pair, rod.GJ)]
+        *of_joints, of_edges = rod.stiffnesses
+        joints = [stiffness_at(value, (a + b) / 2, a, b) for value in of_joints]
         # The strain of an edge is one, in both of its joints.
         a, b = self.s[:-1], self.s[1:]
-        edges = stiffness_at(rod.EA, (a + b) / 2, a, b)
+        edges = stiffness_at(of_edges, (a + b) / 2, a, b)
         EA = jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
         EI1, EI2, GJ = (jnp.stack([joint, joint]) for joint in joints)
         return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law)
@@ -274,7 +275,7 @@ class ElementCells(eqx.Module):
     def sections(self, rod: Rod) -> Sections:
         s = self.strain_places
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
-        EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in (*rod.bending_pair, rod.GJ, rod.EA))
+        EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in rod.stiffnesses)
         return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
@@ -325,7 +326,7 @@ def _rotation_vector(q: Quaternion) -> tuple[Vector, Callable[[Vector], Vector]]
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
     """The arclengths of the jumps of a rod and of loads along it."""
     rod = scene.rod
-    values = (*rod.bending_pair, rod.GJ, rod.EA, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
+    values = (*rod.stiffnesses, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
     return [value.jumps for value in values if isinstance(value, Steps)]
 
 

@@ -18,7 +18,7 @@ from rodjax.discretization.joints import (
 from rodjax.discretization.nodes import held_nodes, with_nodes_at_clips
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, swept_twist, transport_along
-from rodjax.energy import density
+from rodjax.energy import curvature_under, density
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Directed, Free, Held
 from rodjax.vectors import dot
@@ -73,7 +73,7 @@ class EdgeTangents(eqx.Module):
         energy = self._bending_energy(scene, tangents)
         for end, edge in ((scene.start, 0), (scene.end, -1)):
             if isinstance(end, Free) and end.moment is not None:  # bends the half edge there
-                curvature = jnp.cross(end.moment, tangents[:, edge]) / scene.rod.EI
+                curvature = curvature_under(scene.rod, jnp.cross(end.moment, tangents[:, edge]))
                 energy += self.finest / 2 * density(scene.rod, squared_curvature=jnp.sum(curvature**2))
         return energy
 

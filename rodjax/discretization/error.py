@@ -26,7 +26,7 @@ from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import clip_moments, positions_between, resultants
 from rodjax.discretization.touching import TouchingForm
 from rodjax.discretization.twist import transport
-from rodjax.energy import axial_strain_under
+from rodjax.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.linalg import factor_and_solve, short_sum
 from rodjax.scene import slides
 from rodjax.stability import Motion, neutral_turn
@@ -175,8 +175,9 @@ def errors_of_differences(
         moments += list(clip_moments(elements, end) - clip_moments(form, point))
     error = Sizes(longest(_with_jumps(change)), longest(jnp.stack(moments, axis=1)), curvature)
     forces = elements.with_end_force(end, field.forces_in_elements(scene))
-    bending, torque = jnp.max(better.curvature), scene.rod.GJ * end.total_twist
-    scale = Sizes(longest(forces), jnp.sqrt(bending**2 + torque**2), bending).as_scale()
+    curvature = jnp.max(better.curvature)
+    moment = bending_moment_at(scene.rod, curvature), torque_at(scene.rod, end.total_twist)
+    scale = Sizes(longest(forces), jnp.sqrt(moment[0] ** 2 + moment[1] ** 2), curvature).as_scale()
     shift = elements.nodes(elements.edges(end)) - nodes
     return Errors(shift, *error.relative_to(scale), scale, is_soft, None, _axial_error(elements, form, end, point))
 
@@ -185,7 +186,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     field, scene, tangents = form.field, form.scene, point.tangents
     assert isinstance(field, HermiteElements)
     rod, h = scene.rod, field.h
-    torque = rod.GJ * point.total_twist
+    torque = torque_at(rod, point.total_twist)
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
 
     def forces_of(end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 3 n"]:
@@ -216,9 +217,10 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
 
     here = form.linearized(point)
     # To turn it back takes moments at both ends, which differ as force and torque go with the tangent.
-    bending, shear = (rod.EI / h)[None], h[None] / 6 * cross(back, force)
-    at_start = bending * transport(turn, nodes[:, 1:], nodes[:, :-1]) - torque / 2 * back - shear
-    at_end = couple - bending * turn - torque / 2 * back - 2 * shear
+    shear = h[None] / 6 * cross(back, force)
+    turned_back = transport(turn, nodes[:, 1:], nodes[:, :-1])
+    at_start = bending_moment_at(rod, turned_back / h[None]) - torque / 2 * back - shear
+    at_end = couple - bending_moment_at(rod, turn / h[None]) - torque / 2 * back - 2 * shear
     none = jnp.zeros_like(couple[:, :1])
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
@@ -253,8 +255,12 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     relative, scale = of_sections(
         forces,
         bending_moments + torque * at_ends,
-        bending_moments / rod.EI,
-        (section_change, bending_change + torque_change * at_ends + torque * turned_ends, bending_change / rod.EI),
+        curvature_under(rod, bending_moments),
+        (
+            section_change,
+            bending_change + torque_change * at_ends + torque * turned_ends,
+            curvature_under(rod, bending_change),
+        ),
         has_clips=bool(scene.clips),
     )
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
@@ -329,7 +335,7 @@ def _integrated(
         n = force - weight[:, None] * s[None]
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
         way = (1 + axial_strain_under(rod, dot(n, tangent)))[None] * tangent
-        turn = cross(section.moment, tangent) / rod.EI
+        turn = cross(curvature_under(rod, section.moment), tangent)
         return Section(way, turn, -cross(way, n) - torque * turn)
 
     def ahead(section: Section, slope: Section, distance: Float[Array, "n"]) -> Section:

@@ -439,6 +439,6 @@ class FrameForm(Form):
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
         largest = jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
-        stiffest = jnp.maximum(jnp.max(self.sections.EI), jnp.max(self.sections.GJ))
         eps = jnp.finfo(largest.dtype).eps
-        return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 * jnp.maximum(stiffest, 1.0) / self.field.finest**2)
+        stiffest = jnp.maximum(self.sections.stiffest, 1.0)
+        return FLOOR_SAFETY * eps * 4.0 * (largest + stiffest / self.field.finest**2)

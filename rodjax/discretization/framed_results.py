@@ -98,7 +98,7 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
         lambda leaf: jnp.concatenate([leaf[..., 0, :], leaf[..., 2, -1:]], axis=-1), _arrays(form.sections)
     )
     sections = eqx.combine(sections, form.sections)
-    strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
+    strains, axial = sections.strains_under(rotated(inverse(q), moments), tension)
     rest = form.scene.rod.rest_shape
     if rest is not None:
         last_cell = jnp.concatenate([a, a[-1:]]), jnp.concatenate([b, b[-1:]])
@@ -131,7 +131,7 @@ def _strains_at_ends(
     tension = dot(form.forces(point.quaternions, point.end_force)[:, ::2], tangent(q))
     sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
     sections = eqx.combine(sections, form.sections)
-    strains, axial = strains_under(sections, rotated(inverse(q), moments), tension)
+    strains, axial = sections.strains_under(rotated(inverse(q), moments), tension)
     rest = form.scene.rod.rest_shape
     if rest is not None:
         s = field.strain_places[::2]
@@ -185,41 +185,12 @@ def _strains_at_end(
     q = point.quaternions[:, k, None]
     sections = eqx.combine(jax.tree.map(lambda leaf: leaf[..., k, k, None], _arrays(form.sections)), form.sections)
     tension = dot(force[:, None], tangent(q))
-    strains, axial = strains_under(sections, rotated(inverse(q), moment[:, None]), tension)
+    strains, axial = sections.strains_under(rotated(inverse(q), moment[:, None]), tension)
     rest = form.scene.rod.rest_shape
     if rest is not None:
         s = form.field.s
         strains += rest.at(s[k, None], s[[0, -2][k], None], s[[1, -1][k], None])
     return strains, axial, tension
-
-
-def strains_under(
-    sections: Sections, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
-) -> tuple[Float[Array, "3 *k"], Float[Array, "*k"]]:
-    """What the strains exceed those at rest by, under a moment in material axes, and the axial strain."""
-    stiffness = jnp.concatenate([sections.EI, sections.GJ[None]])
-    strains = moment / stiffness
-    if sections.law is None:
-        return strains, sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-
-    def improved(strains: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-        def enthalpy(strains):
-            axial = sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-            return jnp.sum(sections.density((strains[0], strains[1]), strains[2], axial) - tension * (1 + axial))
-
-        first, by_all = jax.linearize(jax.grad(enthalpy), strains)
-        directions = jnp.eye(3, dtype=strains.dtype).reshape(3, 3, *[1] * tension.ndim) * jnp.ones_like(strains)[None]
-        second = jax.vmap(by_all)(directions)
-        moved = jnp.linalg.solve(jnp.moveaxis(second, (0, 1), (-1, -2)), jnp.moveaxis(moment - first, 0, -1)[..., None])
-        return strains + jnp.moveaxis(moved[..., 0], -1, 0)
-
-    for _ in range(LAW_STEPS):
-        strains = improved(strains)
-    return strains, sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-
-
-# Steps of Newton's method for the strains under a moment where there is a law.
-LAW_STEPS = 6
 
 
 def positions_between_frames(
@@ -340,7 +311,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         force = parabola(x, forces)
         here = jax.tree.map(lambda leaf: parabola(x, leaf), _arrays(sections))
         here = eqx.combine(here, sections)
-        strains, axial = strains_under(here, rotated(inverse(q), pose.moment), dot(force, t))
+        strains, axial = here.strains_under(rotated(inverse(q), pose.moment), dot(force, t))
         if rest is not None:
             strains += rest.at(field.s[:-1] + x * h, field.s[:-1], field.s[1:])
         rate = product(q, jnp.concatenate([jnp.zeros_like(t[:1]), strains])) / 2

@@ -11,7 +11,7 @@ from rodjax.discretization.joints import Joints, bending_derivatives, tangent_ba
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.twist import angle_about, transport, transport_along
-from rodjax.energy import axial_strain_under
+from rodjax.energy import axial_strain_under, curvature_under, torque_at
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.supports import Clamp, Directed, Free, Support
@@ -45,11 +45,12 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     """Moments are the derivatives of the energy of the element beside by the tangent of a node: of fourth order too."""
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
-    torque = rod.GJ * point.total_twist
+    torque = torque_at(rod, point.total_twist)
     section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
     by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
-    curvature = root(dot(moments, moments)) / rod.EI
+    curvatures = curvature_under(rod, moments)
+    curvature = root(dot(curvatures, curvatures))
     moments += torque * nodes
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
@@ -78,7 +79,7 @@ def positions_between(
     field, scene = form.field, form.scene
     assert isinstance(field, HermiteElements)
     rod, tangents = scene.rod, point.tangents
-    torque = rod.GJ * point.total_twist
+    torque = torque_at(rod, point.total_twist)
     section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
     by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     forces = form.with_end_force(point, field.forces_in_elements(scene))
@@ -86,7 +87,7 @@ def positions_between(
     cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
 
     def derivatives(tangent, force, moment) -> tuple[Float[Array, "3 k"], Float[Array, "3 k"]]:
-        turn = cross(moment, tangent) / rod.EI
+        turn = cross(curvature_under(rod, moment), tangent)
         strain, softening = jax.jvp(
             lambda tension: axial_strain_under(rod, tension),
             (dot(force, tangent),),
@@ -119,7 +120,7 @@ def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
     directed = held_nodes(scene, field.clip_nodes)
     if isinstance(field, HermiteElements):
         section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
-        by_ends = field.by_end_tangents(scene, tangents, section_forces, scene.rod.GJ * point.total_twist)
+        by_ends = field.by_end_tangents(scene, tangents, section_forces, torque_at(scene.rod, point.total_twist))
         for k, node, _ in directed:
             moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])
     else:
@@ -153,10 +154,10 @@ def _on_edges(
     n = tangents.shape[1]
     is_equal = field.places is None
     h, last_h = (1 / n, 1 / n) if is_equal else (field.weights[0], field.weights[-1])
-    start_moment = _end_moment(scene.start, rod, tangents[:, 0], h, rod.GJ * twist, at_start=True)
-    end_moment = _end_moment(scene.end, rod, tangents[:, -1], last_h, rod.GJ * twist, at_start=False)
-    start_tangent = _end_tangent(scene.start, tangents[:, 0], h)
-    end_tangent = _end_tangent(scene.end, tangents[:, -1], last_h)
+    start_moment = _end_moment(scene.start, rod, tangents[:, 0], h, torque_at(rod, twist), at_start=True)
+    end_moment = _end_moment(scene.end, rod, tangents[:, -1], last_h, torque_at(rod, twist), at_start=False)
+    start_tangent = _end_tangent(scene.start, rod, tangents[:, 0], h)
+    end_tangent = _end_tangent(scene.end, rod, tangents[:, -1], last_h)
     inner = field.tangents_at_nodes(scene, tangents)
     spacing = jnp.full(n - 1, h, tangents.dtype) if is_equal else (field.weights[:-1] + field.weights[1:]) / 2
     inner_joints = Joints(tangents[:, :-1], tangents[:, 1:], spacing)
@@ -165,9 +166,9 @@ def _on_edges(
         inner_curvatures = inner_curvatures.at[edge - 1].set(halves.squared_curvature[0])
     at_nodes = jnp.concatenate([start_tangent[:, None], inner, end_tangent[:, None]], axis=1)
     squared_curvatures = [
-        _squared(_across(start_moment, start_tangent) / rod.EI)[None],
+        _squared(curvature_under(rod, _across(start_moment, start_tangent)))[None],
         inner_curvatures,
-        _squared(_across(end_moment, end_tangent) / rod.EI)[None],
+        _squared(curvature_under(rod, _across(end_moment, end_tangent)))[None],
     ]
     end_tensions = [jnp.sum(force * t)[None] for force, t in zip(end_forces, (start_tangent, end_tangent), strict=True)]
     tension = jnp.concatenate([end_tensions[0], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1]])
@@ -212,12 +213,14 @@ def _end_moment(
     return sign * cross(end.tangent[:, None], along)[:, 0] + spin * end.tangent
 
 
-def _end_tangent(end: Support, edge_tangent: Float[Array, "3"], h: float | Float[Array, ""]) -> Float[Array, "3"]:
+def _end_tangent(
+    end: Support, rod: Rod, edge_tangent: Float[Array, "3"], h: float | Float[Array, ""]
+) -> Float[Array, "3"]:
     """The tangent at an end: prescribed, or that of the edge, turned by what a dead moment bends half an edge."""
     if isinstance(end, Directed):
         return end.tangent
     if isinstance(end, Free) and end.moment is not None:
-        turned = edge_tangent + h / 2 * jnp.cross(end.moment, edge_tangent)
+        turned = edge_tangent + h / 2 * jnp.cross(curvature_under(rod, end.moment), edge_tangent)
         return turned / jnp.sqrt(_squared(turned))
     return edge_tangent
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.joints import tangent_bases
+from rodjax.energy import twist_under
 from rodjax.scene import Scene, dead_end_moment
 from rodjax.strain import swept_angle
 from rodjax.supports import Free
@@ -93,4 +94,4 @@ def twist_under_moment(scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Arr
     moment = dead_end_moment(scene)
     assert moment is not None
     sign, edge = (-1, 0) if isinstance(scene.start, Free) else (1, -1)
-    return sign * jnp.sum(moment * tangents[:, edge]) / scene.rod.GJ
+    return twist_under(scene.rod, sign * jnp.sum(moment * tangents[:, edge]))

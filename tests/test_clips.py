@@ -287,7 +287,7 @@ def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
     ("discretization", "end", "sliding"),
     [
         pytest.param("hermite", None, (False, False), marks=pytest.mark.exhaustive),
-        ("hermite", Free(), (False, False)),
+        pytest.param("hermite", Free(), (False, False), marks=pytest.mark.exhaustive),
         ("hermite", None, (False, True)),
         ("finite_difference", None, (False, False)),
     ],

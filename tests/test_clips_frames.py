@@ -108,7 +108,7 @@ def test_a_path_and_a_batch_with_turning_clips():
     np.testing.assert_allclose(batch.clip_moments[:, 0, 0], 4 * GJ * angles[:3], rtol=1e-4, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_vmap_over_frames_is_one_solve_after_another(twisted):
     angles = jnp.array([0.4, 1.2, 2.0])
     together = jax.vmap(lambda angle: rj.solve(straight(angle, 2.5), segments=8, solver=TIGHT))(angles)
@@ -194,7 +194,11 @@ def test_supports_carry_the_weight(both):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "with_tangent"),
-    [(None, True), (Free(), False), pytest.param(Pin((0.6, 0.2, 0.0)), True, marks=pytest.mark.exhaustive)],
+    [
+        (None, True),
+        pytest.param(Free(), False, marks=pytest.mark.exhaustive),
+        pytest.param(Pin((0.6, 0.2, 0.0)), True, marks=pytest.mark.exhaustive),
+    ],
 )
 def test_the_difference_to_a_rod_by_tangents_is_of_fourth_order(end, with_tangent):
     scene = in_space((1.0, 0.3, 0.4) if with_tangent else None, end=end)

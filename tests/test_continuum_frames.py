@@ -48,7 +48,7 @@ def test_the_bend_of_45_degrees():
     assert rj.solve(scene, segments=64, guess=result).iterations <= 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_plain_rod_is_the_same():
     supports = (Clamp(ORIGIN, LEVEL), Clamp((0.8, 0.1, 0.05), frame((1, 0.3, 0.2))))
     scenes = [

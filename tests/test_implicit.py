@@ -113,7 +113,7 @@ def test_second_derivatives_and_batches():
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name in ("clamps", "pins", "end moment") else pytest.mark.exhaustive)
+        pytest.param(name, marks=() if name in ("clamps", "end moment") else pytest.mark.exhaustive)
         for name in SCENES
     ],
 )

@@ -59,15 +59,13 @@ def pytest_xdist_make_scheduler(config, log):
 
 def pytest_collection_modifyitems(config, items):
     for item in items:
-        if "optimized" in item.keywords and not IS_OPTIMIZED:
+        marks = {mark.name for mark in item.iter_markers()}  # not `keywords`, which has the names of folders too
+        if "optimized" in marks and not IS_OPTIMIZED:
             item.add_marker(
                 pytest.mark.skip(reason="two programs are the same to the last bit only as users have them")
             )
-    if not config.getoption("--slow"):
-        skip = pytest.mark.skip(reason="slow: run with --slow")
-        for item in items:
-            if "slow" in item.keywords or "exhaustive" in item.keywords:
-                item.add_marker(skip)
+        if marks & {"slow", "exhaustive"} and not config.getoption("--slow"):
+            item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 
 
 @pytest.fixture(scope="session")

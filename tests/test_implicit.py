@@ -112,10 +112,7 @@ def test_second_derivatives_and_batches():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=() if name in ("clamps", "end moment") else pytest.mark.exhaustive)
-        for name in SCENES
-    ],
+    [pytest.param(name, marks=() if name in ("clamps", "end moment") else pytest.mark.exhaustive) for name in SCENES],
 )
 def test_second_derivatives_forward_and_reverse(name):
     """Of a nonlinear function of a result, on a scene of each kind, along two changes of its numbers."""

@@ -1,0 +1,100 @@
+"""What every form of a scene promises to a search: a change of the force, and the turn of a whole rod."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax import Clip, Pin, Rod, Scene
+from rodjax.result import form_and_point
+
+AXIS = jnp.array([1.0, 0.0, 0.0])
+CLIP = Clip(0.4, (0.3, 0.0, 0.0))
+# Pressed together between pins on one line, about which all of the rod can turn. In a clip on the line the force has
+# another direction on each side.
+KINDS = {
+    "tangents": Scene(Rod(1.0, 1.0, 0.7, 1e4), Pin((0, 0, 0)), Pin((0.8, 0, 0))),
+    "tangents in a clip": Scene(Rod(1.0, 1.0, 0.7, 1e4), Pin((0, 0, 0)), Pin((0.8, 0, 0)), clips=[CLIP]),
+    "frames": Scene(Rod(1.0, (1.0, 2.0), 0.7, 1e4), Pin((0, 0, 0)), Pin((0.8, 0, 0))),
+    "frames in a clip": Scene(Rod(1.0, (1.0, 2.0), 0.7, 1e4), Pin((0, 0, 0)), Pin((0.8, 0, 0)), clips=[CLIP]),
+}
+
+
+@functools.cache
+def solved(kind: str) -> rj.Equilibrium:
+    result = rj.solve(KINDS[kind], segments=8, solver=rj.Newton(tolerance=1e-10))
+    assert result.converged
+    return result
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_rod_that_turns_as_a_whole_stays_in_equilibrium(kind):
+    """Rotations and forces turned with it are a motion that the linearised equilibrium does not resist."""
+
+    @jax.jit
+    def resisted(result):
+        form, point = form_and_point(result)
+        here = form.linearized(point)
+        rotation = form.turn(point, here.bases, AXIS)
+        multipliers = form.multipliers_turned(point, AXIS, jnp.zeros_like(here.closure))
+        of_rotation, of_multipliers = here.system.times(rotation, multipliers)
+        forces = jnp.linalg.norm(jnp.cross(AXIS[:, None], jnp.atleast_2d(point.end_force.T).T, axis=0), axis=0)
+        return jnp.abs(of_rotation), jnp.abs(of_multipliers), forces
+
+    rotation, multipliers, forces = resisted(solved(kind))
+    # The residual of the solve, 1e-10; without the turned forces the rotations are resisted by these times h.
+    assert np.max(rotation) < 1e-8
+    assert np.max(multipliers) < 1e-8
+    if "clip" in kind:
+        assert np.min(forces) > 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_another_force_changes_is_that_of_the_lagrangian(kind):
+    random = np.random.default_rng(0)
+
+    @eqx.filter_jit
+    def changes(result, numbers, change):
+        form, point = form_and_point(result)
+        bases = form.bases_at(point)
+        rotation = numbers[: bases.shape[1] * bases.shape[2]].reshape(bases.shape[1:])
+        here = form.under_force(point, bases, rotation, change)
+        trial = dataclasses.replace(point, end_force=point.end_force + change)
+        energy = form.linearized(trial).energy - form.linearized(point).energy
+        closure = form.closure(form.linearized(trial).closure)
+
+        def at(step):
+            moved = form.moved(point, bases, step * rotation, jnp.zeros_like(change))
+            lacking, _, more, _ = form.under_force(moved, form.bases_at(moved), jnp.zeros_like(rotation), change)
+            return lacking, more
+
+        step = 1e-5
+        rates = jax.tree.map(lambda a, b: (a - b) / (2 * step), at(step), at(-step))
+        return here, (closure, rates[0], energy, rates[1])
+
+    result = solved(kind)
+    numbers = jnp.asarray(random.normal(size=100))
+    change = jnp.asarray(random.normal(size=result.state.end_force.shape))
+    found, expected = changes(result, numbers, change)
+    for value, truth in zip(found, expected, strict=True):
+        # Of differences over 2e-5: roundings of 1e-15/1e-5, and (1e-5)^2 of the third derivative.
+        np.testing.assert_allclose(value, truth, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rounding_floor_is_near_to_what_rounding_leaves(kind):
+    """A search that may go on as long as it finds less ends within a thirtieth of it: a tenth was seen, and a third."""
+
+    @jax.jit
+    def floor(result):
+        form, point = form_and_point(result)
+        return form.rounding_floor(point)
+
+    lowest = rj.solve(KINDS[kind], segments=8, solver=rj.Newton(tolerance=0.0))
+    assert lowest.status == rj.Status.ROUNDING_FLOOR
+    assert 1 / 30 < lowest.residual / floor(lowest) < 1

@@ -203,8 +203,7 @@ class Equilibrium(eqx.Module):
 
     @property
     def moment_error(self) -> Float[Array, "..."]:
-        errors = estimated_errors(self)
-        return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
+        return _moment_error(estimated_errors(self))
 
     @property
     def curvature_error(self) -> Float[Array, "..."]:
@@ -317,9 +316,13 @@ def estimated_errors(equilibrium: Equilibrium) -> Errors:
     if is_known(equilibrium):
         errors = _errors(equilibrium)
         # Few rods can turn as a whole: the program that looks for such a turn is theirs.
-        if not np.any(errors.is_soft):
+        if not np.asarray(errors.is_soft).any():
             return errors
     return _errors_beside_turns(equilibrium)
+
+
+def _moment_error(errors: Errors) -> Float[Array, "..."]:
+    return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
 
 
 @over_leading_axes
@@ -470,7 +473,7 @@ def describe(equilibrium: Equilibrium) -> str:
     Of several: each with its count, and the largest errors of those that converged.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
-    examination = _examination(equilibrium)
+    examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
     converged = np.asarray(equilibrium.converged)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
@@ -478,7 +481,9 @@ def describe(equilibrium: Equilibrium) -> str:
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
-        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(equilibrium.axial_strain, -1)
+        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(
+            np.asarray(equilibrium.axial_strain), axis=-1
+        )
         <= -1,
         f"pressed into an obstacle by more than {MOST_PENETRATION:g} of the radius": _penetration(equilibrium)
         > MOST_PENETRATION,
@@ -512,8 +517,14 @@ def _errors_told(equilibrium: Equilibrium) -> list[str]:
     converged = np.asarray(equilibrium.converged)
     if equilibrium.discretization == "continuum" or not np.any(converged):
         return []
-    names = ("error_estimate", "force_error", "moment_error", "curvature_error")
-    shape, *others = (float(np.max(np.asarray(getattr(equilibrium, name))[converged])) for name in names)
+    errors = estimated_errors(equilibrium)
+    sizes = (
+        np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1),
+        errors.force,
+        _moment_error(errors),
+        errors.curvature,
+    )
+    shape, *others = (float(np.max(np.asarray(size)[converged])) for size in sizes)
     force, moment, curvature = (f"{100 * error:.2g} %" for error in others)
     return [
         f"estimated errors on {equilibrium.s.shape[-1] - 1} segments: shape {shape:.1e} of the length, forces {force}, "
@@ -613,7 +624,8 @@ def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | f
     if not np.all(equilibrium.converged):
         warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)
     is_overstretched = status == Status.OVERSTRETCHED
-    if not is_overstretched.any() or not is_known(strain_limit):
+    # In the continuum strains may be traced where the status is not.
+    if not is_overstretched.any() or not is_known(equilibrium.axial_strain, strain_limit):
         return
     count = int(np.sum(is_overstretched))
     rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"

@@ -147,6 +147,9 @@ def test_a_mesh_far_too_coarse_is_told_without_an_estimate():
     with pytest.warns(rj.MeshWarning, match=r"the mesh of 4 segments is too coarse: the rod turns by 3\.\d rad"):
         found = rj.solve(coil, segments=4)
     assert found.converged
+    # Of an edge as long it is 2 arctan(14/8), as their curvature is that of a tangent.
+    with pytest.warns(rj.MeshWarning, match=r"the rod turns by 2\.1 rad"):
+        rj.solve(coil, segments=4, discretization="finite_difference")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rj.solve(coil, segments=8)

@@ -110,9 +110,12 @@ def solve_stack(
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     progress: bool = False,
-    **options: Any,
+    **settings: Any,
 ) -> Equilibrium:
-    """The same of stacked scenes of which some may have supports that are too far apart, as in a search."""
+    """The same of stacked scenes of which some may have supports that are too far apart, as in a search.
+
+    `settings`: the other arguments of `solve_batch`.
+    """
     instance(progress, "progress", bool)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -122,7 +125,7 @@ def solve_stack(
     count = given.rod.length.shape[0]
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
-    first_options, rtol = checked_options(given, guess=guess, **options)
+    options, rtol = checked_options(given, guess=guess, **settings)
     strain_limit = checked_strain_limit(strain_limit)
 
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
@@ -130,7 +133,7 @@ def solve_stack(
         begin = guess if last is None or last.s.ndim > 2 else last
         return _in_chunks(given, begin, strain_limit, options, mesh, progress)
 
-    result = with_ranges(given, refined_together(solve, first_options, rtol))
+    result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
         warn_of_outcome(result, strain_limit)
     return differentiable(stacked, result)

@@ -88,9 +88,7 @@ def number_list(value: Any, name: str) -> Float[Numbers, "k"]:
 
 
 def plain_number(name: str) -> Callable[[Any], float]:
-    """What makes Python's number of an option of that name, a solver's: Python compares it, and JAX takes its precision
-    from the scene's.
-    """
+    """Converts an option of a solver to a Python number, which takes the precision of the scene in a program."""
 
     def number(value: Any) -> float:
         number_array(value, name)

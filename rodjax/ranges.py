@@ -17,7 +17,7 @@ from rodjax.along import Along, Smooth, Steps
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
 from rodjax.result import Equilibrium
 from rodjax.rod import ARCLENGTH_TOLERANCE, Law, Rod
-from rodjax.scene import MAX_SPAN, Scene
+from rodjax.scene import MAX_SPAN, ONE_PLACE, Scene
 from rodjax.status import Status
 from rodjax.supports import Clamp, Free
 
@@ -34,9 +34,9 @@ def check_ranges(scenes: Scene) -> None:
     is_suspect = np.ones(shape, bool)
     parts = jax.tree.leaves(_checked_when_made(scenes))
     first = (0,) * len(shape)
-    if all(np.all(leaf == leaf[first]) for leaf in parts) and shape:
+    if shape and all(np.all(leaf == leaf[first]) for leaf in parts):
         with np.errstate(all="ignore"):
-            is_suspect = np.asarray(_is_wrong(scenes) | _is_too_far(scenes))
+            is_suspect = np.asarray(_is_wrong(scenes) | _is_misplaced(scenes))
         # What is the same in all of them is looked at in the first.
         is_suspect[first] |= bool(parts)
     for case in np.argwhere(is_suspect):
@@ -138,12 +138,16 @@ def _is_rotation(frame: Float[Numbers, "... 3 3"]) -> Bool[Numbers, "... 3"]:
     return (xp.max(xp.abs(products - one), axis=-1) <= ROTATION_TOLERANCE) & (volume > 0)
 
 
-def _is_too_far(scenes: Scene) -> Bool[np.ndarray, "..."]:
-    """Which scenes have neighbouring supports further apart than the rod between them is taken to reach."""
+def _is_misplaced(scenes: Scene) -> Bool[np.ndarray, "..."]:
+    """Which scenes have neighbouring supports further apart than the rod between them is taken to reach, or all of
+    them at one place, which some may not.
+    """
     length = scenes.rod.length
     ends = [(np.zeros_like(length), scenes.start), *((clip.at, clip) for clip in scenes.clips), (length, scenes.end)]
     held = [(s, end.position) for s, end in ends if not isinstance(end, Free)]
-    found = np.zeros(length.shape, bool)
+    found = np.full(length.shape, len(held) > 1)
+    for _, position in held[1:]:
+        found &= np.max(np.abs(position - held[0][1]), axis=-1) <= ONE_PLACE * length
     for (s, position), (other_s, other) in itertools.pairwise(held):
         found |= ~(np.linalg.norm(other - position, axis=-1) <= MAX_SPAN * (other_s - s))
     return found

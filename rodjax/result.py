@@ -475,17 +475,14 @@ def describe(equilibrium: Equilibrium) -> str:
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
-    converged = np.asarray(equilibrium.converged)
+    converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
         "a saddle: there are motions that lower the energy": examination.index > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
-        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.min(
-            np.asarray(equilibrium.axial_strain), axis=-1
-        )
-        <= -1,
+        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.any(axial_strain <= -1, axis=-1),
         f"pressed into an obstacle by more than {MOST_PENETRATION:g} of the radius": _penetration(equilibrium)
         > MOST_PENETRATION,
     }

@@ -1,5 +1,6 @@
 """Scenes that are stacked, or made of traced numbers, are checked as those that are made one by one."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,3 +112,12 @@ def test_what_a_derivative_is_taken_by_is_checked(monkeypatch):
     monkeypatch.setattr("rodjax.equilibrium._solve", lambda *_: pytest.fail("solved"))
     with pytest.raises(ValueError, match=r"scene: the ends are 1\.6 m apart"):
         jax.grad(lambda end: rj.solve(hanging(end, 1.0, 0.3), **MESH).energy)(1.6)
+
+
+def test_pins_at_one_place_are_refused_in_any_of_a_stack():
+    scene = rj.Scene(rj.Rod(1.0, 1.0, 1.0, 1e4), rj.Pin((0, 0, 0)), rj.Pin((0.5, 0, 0)))
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), scene)
+    ends = jnp.array([[0.5, 0, 0], [0, 0, 0], [0.5, 0, 0]])
+    stack = eqx.tree_at(lambda scene: scene.end.position, stack, ends)
+    with pytest.raises(ValueError, match=r"scenes\[1\]: all pins and clips are at one place"):
+        rj.solve_batch(stack, segments=8)

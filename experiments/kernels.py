@@ -129,7 +129,7 @@ def kernels(segments: int) -> Iterator[Kernel]:
         yield Kernel(f"linearized, {name}", linearized, at.form, at.point)
     for name in ("bending and stretch", "gravity"):
         at = given[name]
-        planar = at.form.along(plane(at.form.scene)[1])
+        planar = at.form.in_axes(plane(at.form.scene)[1])
         yield Kernel(f"linearized, {name}, in a plane", linearized, planar, at.point)
     at = given["torsion"]
     yield Kernel("derivatives of all joints, written out", written_out, at.form, at.point)

@@ -293,7 +293,7 @@ def stepped(
         share = jnp.where(is_given, 0.0, -inner(weights, across, back)) / squared
         motion = added(back, follows, share)
         part = jnp.minimum(1.0, MAX_ROTATION / jnp.max(jnp.abs(motion.rotation)))
-        force_change = form.force_change(form.closure(part * motion.multipliers))
+        force_change = form.layout.forces(form.closure(part * motion.multipliers))
         moved = form.moved(point, here.bases, part * motion.rotation, force_change)
         least = jnp.maximum(TOLERANCE, STAGNATION * form.rounding_floor(point))
         is_there = (here.residual <= least) & form.is_closed(here.closure, 0.0)

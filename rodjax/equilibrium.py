@@ -18,7 +18,6 @@ from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_numb
 from rodjax.compilation import compiled
 from rodjax.contact_search import find_touching
 from rodjax.discretization.cells import segments_for_jumps
-from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist, last_of
 from rodjax.discretization.form import Form, Point
@@ -26,9 +25,9 @@ from rodjax.discretization.forms import field_of, form_of
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
-from rodjax.discretization.parted import PartedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import Guess, first_shape, resampled
@@ -53,8 +52,6 @@ from rodjax.result import (
 from rodjax.scene import (
     Scene,
     dead_end_moment,
-    force_shape,
-    held_at_both_ends,
     needs_frames,
     nondimensional,
     slid,
@@ -282,8 +279,8 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
 
 
 def _on_its_side(
-    last: Equilibrium, shape: Shape, end_force: Float[Array, "3 *parts"]
-) -> tuple[Shape, Float[Array, "3 *parts"]]:
+    last: Equilibrium, shape: Shape, end_force: Float[Array, "3 parts"]
+) -> tuple[Shape, Float[Array, "3 parts"]]:
     """What a solve on another mesh begins from: where the last one came through an obstacle, what that began from."""
     state = last.state
     if state.before is None or not isinstance(shape, Curve):
@@ -491,7 +488,8 @@ def _kind(options: Options) -> type[Polyline] | type[Curve]:
 def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
     """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
     shape = guess.state.shape
-    if guess.state.end_force.shape != force_shape(scene, options.segments) or _sliding(guess.scene) != _sliding(scene):
+    parts = force_parts(scene, options.segments)
+    if guess.state.end_force.shape[1] != parts or _sliding(guess.scene) != _sliding(scene):
         return False
     if needs_frames(scene):
         return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
@@ -517,12 +515,13 @@ def _unsettled_state(
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
-    no_force = jnp.zeros(force_shape(scene, options.segments), scene.rod.length.dtype)
+    parts = force_parts(scene, options.segments)
+    no_force = jnp.zeros((3, parts), scene.rod.length.dtype)
     if needs_frames(scene):
         return _first_frames(scaled, units, guess, options)
     before = _before(scene, guess)
     if guess is None:
-        no_twist = jnp.zeros_like(no_force[0]) if no_force.ndim == 1 else jnp.zeros((), no_force.dtype)
+        no_twist = jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
         return SolverState(shape, no_force, units, sliding_places(scaled), before=before), FirstTwist(no_twist)
     if isinstance(guess, Guess):
@@ -536,21 +535,13 @@ def _unsettled_state(
         shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
     else:
         shape = kind.through(state.shape.points(pieces))
-    end_force = _in_spans(state.end_force, no_force.shape)
+    end_force = in_parts(state.end_force, parts)
     places = sliding_places(scaled)
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
     if scene.obstacles:
         shape, end_force = _on_its_side(guess, shape, end_force)
     return SolverState(shape, end_force, state.units, places, before=before), last_twist(guess)
-
-
-def _in_spans(end_force: Float[Array, "3 *spans"], shape: tuple[int, ...]) -> Float[Array, "3 *others"]:
-    """What is known of the force at s = L; of a scene with other clips: the force at the end in all spans."""
-    if end_force.shape == shape:
-        return end_force
-    last = end_force if end_force.ndim == 1 else end_force[:, -1]
-    return last if len(shape) == 1 else jnp.broadcast_to(last[:, None], shape)
 
 
 def _first_frames(
@@ -560,11 +551,12 @@ def _first_frames(
     of_joints = options.discretization == "finite_difference"
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
-    no_force = jnp.zeros(force_shape(scene, options.segments), s.dtype)
+    parts = force_parts(scene, options.segments)
+    no_force = jnp.zeros((3, parts), s.dtype)
     if isinstance(guess, Equilibrium):
         shape, first = guess.state.shape, last_twist(guess)
         if isinstance(shape, FramedCurve):
-            end_force = _in_spans(guess.state.end_force, no_force.shape)
+            end_force = in_parts(guess.state.end_force, parts)
             return SolverState(shape.on(s, of_joints), end_force, guess.state.units), first
         points = _in_units(guess.state, units).shape.points(pieces)
         start = guess.scene.start
@@ -614,7 +606,7 @@ class Search(eqx.Module):
         assert isinstance(point, MixedPoint)
         normal, axes = plane(scene, point.tangents)
         within = is_planar(scene, first.total_twist)
-        return Search(form.along(axes), point.flattened(axes), shape, guess.units, within, normal)
+        return Search(form.in_axes(axes), point.flattened(axes), shape, guess.units, within, normal)
 
     def found(self, end: NewtonEnd) -> Found:
         point, outcome, stable = self.form.settled(end.point), end.outcome, end.is_stable
@@ -625,7 +617,7 @@ class Search(eqx.Module):
         shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
         if self.normal is not None and self.is_within_plane is not None:
             assert isinstance(self.form, MixedForm)
-            stable &= is_stable(self.form.along(self.normal[:, None]), point)
+            stable &= is_stable(self.form.in_axes(self.normal[:, None]), point)
             # Inside a user's own jit the scene could not be checked before.
             status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
@@ -693,35 +685,23 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
 
 
 def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:
-    """The shape from which to seek the solution, and the same as the unknowns of the mixed form."""
+    """The shape from which to seek the solution, and the same as the unknowns of its form."""
     scene, shape, field = form.scene, guess.shape, form.field
+    end_force = form.layout.forces(form.layout.components(guess.end_force))
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        quaternions = shape.turned_to_ends(form, first)
-        if isinstance(form, ClippedFrameForm):
-            end_force = form.force_change(form.of_force(guess.end_force))
-        else:
-            end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
-        return shape, form.holding(FramePoint(quaternions, end_force, first.total_twist))
-    if isinstance(form, PartedForm):
-        end_force = form.force_change(form.of_force(guess.end_force))
-        if isinstance(shape, Curve):
-            assert isinstance(field, HermiteElements)
-            tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
-        else:
-            assert isinstance(shape, Polyline)
-            tangents = shape.tangents
-        return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
-    if isinstance(shape, Polyline):
-        problem, start = FiniteDifference.begin(scene, shape, first)
-        return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), guess.end_force)
-    assert isinstance(field, HermiteElements)
-    assert isinstance(shape, Curve)
+        return shape, form.holding(FramePoint(shape.turned_to_ends(form, first), end_force, first.total_twist))
     assert isinstance(form, MixedForm)
-    tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
-    total_twist = form.first_twist(shape, tangents, first)
-    end_force = guess.end_force if held_at_both_ends(scene) else jnp.zeros_like(guess.end_force)
-    return shape, MixedPoint(tangents, end_force, total_twist)
+    if isinstance(shape, Curve):
+        assert isinstance(field, HermiteElements)
+        tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
+    else:
+        assert isinstance(shape, Polyline)
+        if not scene.clips:
+            problem, start = FiniteDifference.begin(scene, shape, first)
+            return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
+        tangents = shape.tangents
+    return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.

@@ -37,7 +37,7 @@ from rodjax.triangle_mesh import Mesh
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 8
+FORMAT = 9
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -70,7 +70,7 @@ FIELDS = {
     "state/shape/s": ("1", "Hermite elements and frames: arclength of the nodes as a part of the length"),
     "state/end_force": (
         "1",
-        "force at s = L between held ends, with clips for each span, with obstacles for each element, solver's units",
+        "force at s = L as each span between held places sees it, with obstacles each element, solver's units",
     ),
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
@@ -229,6 +229,9 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
     # What h5py raises for a file that is not HDF5, is cut short or damaged.
     except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
+    forces = equilibrium.state.end_force
+    if forces.ndim == equilibrium.s.ndim:  # of a rod without clips, until format 8: of its one span
+        equilibrium = eqx.tree_at(lambda result: result.state.end_force, equilibrium, forces[..., None])
     return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
 
 

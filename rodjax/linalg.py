@@ -7,7 +7,7 @@ H couples neighbours, n blocks of b x b; the k columns of A are few and full: wh
 be indefinite, and the number of negative eigenvalues of the whole follows from the factorisation (Haynsworth 1968).
 Loads without a potential have other rows than columns in the border.
 
-Every level eliminates the blocks of odd number, all at once: log2(n) levels of a few loops each, where block Thomas
+Every level eliminates every second block, all at once: log2(n) levels of a few loops each, where block Thomas
 elimination would take n steps one after another. The inverses of blocks are explicit, and arrays have the place along
 the rod as their last axis, (b, b, n): all loops are then vector loops along the rod, on a processor or an accelerator.
 Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tridiagonal linear systems" (1976).
@@ -185,11 +185,34 @@ def _factor(system: SaddlePointSystem, right_sides: Float[Array, "b j n"]) -> tu
 
 
 class _Level(eqx.Module):
-    """One level: the inverses of the odd blocks D, and D^-1 times the blocks that couple them to their neighbours."""
+    """One level: the inverses of the blocks D that go, every second one from the number `first` on, and D^-1 times the
+    blocks that couple them to their neighbours before and after.
+    """
 
     inverse: Float[Array, "b b m"]
-    left: Float[Array, "b b m"]
-    right: Float[Array, "b b m"]
+    before: Float[Array, "b b m"]
+    after: Float[Array, "b b m"]
+    first: int = eqx.field(static=True)
+
+    def parted(self, x: Float[Array, "*c n"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c k"]]:
+        """What goes, and what stays."""
+        return x[..., self.first :: 2], x[..., 1 - self.first :: 2]
+
+    def joined(self, goes: Float[Array, "*c m"], stays: Float[Array, "*c k"]) -> Float[Array, "*c n"]:
+        n = goes.shape[-1] + stays.shape[-1]
+        half = (n + 1) // 2
+        both = _padded(stays, half), _padded(goes, half)
+        pairs = jnp.stack(both if self.first else both[::-1], axis=-1)
+        return pairs.reshape(*goes.shape[:-1], 2 * half)[..., :n]
+
+    def around(self, stays: Float[Array, "*c k"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c m"]]:
+        """What stays before and after each that goes, zero where nothing does."""
+        m = self.inverse.shape[-1]
+        return _padded(_shifted(stays, 1 - self.first), m), _padded(_shifted(stays, -self.first), m)
+
+    def added(self, before: Float[Array, "*c m"], after: Float[Array, "*c m"], k: int) -> Float[Array, "*c k"]:
+        """Sums over those that go beside each of the k that stay: contributions to the one before and the one after."""
+        return _padded(_shifted(before, self.first - 1), k) + _padded(_shifted(after, self.first), k)
 
 
 class _Elimination(eqx.Module):
@@ -200,19 +223,16 @@ class _Elimination(eqx.Module):
         """H^-1 f for j right sides."""
         eliminated = []
         for level in self.levels:
-            odd = f[..., 1::2]
-            eliminated.append(_product(level.inverse, odd))
-            from_neighbours = _transpose_product(level.left, odd), _transpose_product(level.right, odd)
-            f = _less_neighbours(f[..., 0::2], *from_neighbours)
+            goes, f = level.parted(f)
+            eliminated.append(_product(level.inverse, goes))
+            beside = _transpose_product(level.before, goes), _transpose_product(level.after, goes)
+            f -= level.added(*beside, f.shape[-1])
         return self.back_substituted(_product(self.last_inverse, f), eliminated)
 
     def back_substituted(self, x: Float[Array, "b j 1"], eliminated: list[Array]) -> Float[Array, "b j n"]:
-        for level, odd in zip(reversed(self.levels), reversed(eliminated), strict=True):
-            n_odd, n_even = odd.shape[-1], x.shape[-1]
-            after = _padded(x[..., 1:], n_odd)
-            odd = odd - _product(level.left, x[..., :n_odd]) - _product(level.right, after)
-            pairs = jnp.stack([x, _padded(odd, n_even)], axis=-1)
-            x = pairs.reshape(*x.shape[:-1], 2 * n_even)[..., : n_odd + n_even]
+        for level, goes in zip(reversed(self.levels), reversed(eliminated), strict=True):
+            before, after = level.around(x)
+            x = level.joined(goes - _product(level.before, before) - _product(level.after, after), x)
         return x
 
 
@@ -224,26 +244,31 @@ def _eliminate(
 ) -> tuple[_Elimination, Int[Array, ""], Float[Array, "b j n"]]:
     """The factorisation of H, how many negative eigenvalues it has, and H^-1 right_sides, in one sweep.
 
-    Diagonal and right sides stand side by side in `rows`, so that a level is few and large loops.
+    Diagonal and right sides stand side by side in `rows`, so that a level is few and large loops. After the middles of
+    elements the first, third, ... go: were it the others, the middle of the rod would be one of the last, and of a
+    symmetric rod that can turn as a whole both halves be singular.
     """
     b = len(diagonal)
     rows = jnp.concatenate([diagonal, right_sides], axis=1)
     levels, eliminated = [], []
     negative = jnp.zeros((), int)
     while rows.shape[-1] > 1:
-        odd, even = rows[..., 1::2], rows[..., 0::2]
-        left = lower[..., 0::2][..., : odd.shape[-1]]  # blocks (odd, odd - 1)
-        right = _padded(jnp.swapaxes(lower[..., 1::2], 0, 1), odd.shape[-1])  # (odd, odd + 1), none beyond the last
-        inverse, below = _inverse(odd[:, :b])
-        scaled = _product(inverse, jnp.concatenate([left, right, odd[:, b:]], axis=1))
-        level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b])
+        first = 0 if across is None else 1
+        goes, stays = rows[..., first::2], rows[..., 1 - first :: 2]
+        m, k = goes.shape[-1], stays.shape[-1]
+        # Blocks (goes, the one before) and (goes, the one after), none beyond the ends.
+        before = _padded(_shifted(lower[..., 1 - first :: 2], 1 - first), m)
+        after = _padded(jnp.swapaxes(lower[..., first::2], 0, 1), m)
+        inverse, below = _inverse(goes[:, :b])
+        scaled = _product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
+        level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b], first)
         levels.append(level)
         eliminated.append(scaled[:, 2 * b :])
         negative += below
-        from_left = _transpose_product(left, jnp.concatenate([level.left, eliminated[-1]], axis=1))
-        from_right = _transpose_product(right, scaled[:, b:])
-        rows = _less_neighbours(even, from_left, from_right)
-        lower = -_transpose_product(right, level.left)[..., : even.shape[-1] - 1]
+        to_before = _transpose_product(before, jnp.concatenate([level.before, eliminated[-1]], axis=1))
+        to_after = _transpose_product(after, scaled[:, b:])
+        rows = stays - level.added(to_before, to_after, k)
+        lower = -_shifted(_transpose_product(after, level.before), first - 1)[..., : k - 1]
         if across is not None:
             lower, across = lower + across, None
     last_inverse, below = _inverse(rows[:, :b])
@@ -303,13 +328,16 @@ def _transpose_product(a: Float[Array, "k i m"], b: Float[Array, "k j m"]) -> Fl
     return functools.reduce(jnp.add, (a[k, :, None] * b[k, None] for k in range(a.shape[0])))
 
 
-def _less_neighbours(even: Array, from_left: Array, from_right: Array) -> Array:
-    """The even entries less what the odd one to the right (its left side) and the one to the left contribute."""
-    n = even.shape[-1]
-    shifted = jnp.concatenate([jnp.zeros_like(from_right[..., :1]), from_right], axis=-1)
-    return even - _padded(from_left, n) - shifted[..., :n]
+def _shifted(x: Array, by: int) -> Array:
+    """One place later with a zero before, or one earlier, or as it is."""
+    if by < 0:
+        return x[..., 1:]
+    return jnp.concatenate([jnp.zeros_like(x[..., :1]), x], axis=-1) if by else x
 
 
 def _padded(x: Array, length: int) -> Array:
+    """Of this length, with zeros at the end where it is shorter."""
     missing = length - x.shape[-1]
-    return x if missing == 0 else jnp.concatenate([x, jnp.zeros((*x.shape[:-1], missing), x.dtype)], axis=-1)
+    return (
+        x[..., :length] if missing <= 0 else jnp.concatenate([x, jnp.zeros((*x.shape[:-1], missing), x.dtype)], axis=-1)
+    )

@@ -91,7 +91,7 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     bases, free = here.bases, here.gradient  # of the shape of the rotations
 
     def nodes(rotation: Float[Array, "3 m"], closure: Float[Array, "c"]) -> Float[Array, "3n"]:
-        moved = form.moved(point, bases, rotation * form.is_free, form.force_change(closure))
+        moved = form.moved(point, bases, rotation * form.is_free, form.layout.forces(closure))
         return form.nodes(form.edges(moved)).reshape(-1)
 
     by_rotation, by_force = jax.jacfwd(nodes, argnums=(0, 1))(jnp.zeros_like(free), jnp.zeros_like(here.closure))
@@ -125,7 +125,7 @@ def mode_of(
     units: Units,
 ) -> Mode:
     """A motion of an equilibrium and its nondimensional stiffness, as a `Mode`."""
-    force_change = form.force_change(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.closure(motion.multipliers))
 
     def nodes(amount: Float[Array, ""]) -> Float[Array, "n+1 3"]:
         return form.nodes(form.edges(form.moved(point, here.bases, amount * motion.rotation, amount * force_change)))

@@ -81,15 +81,16 @@ class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
-    are unknown; `end_force`: the force at s = L between held ends, else zero; with clips one for each span, (3, spans),
-    with the forces of the clips beyond it, with obstacles one for each segment, with those of clips and contacts;
+    are unknown; `end_force`: the forces of the layout (`discretization.layout`): the force at s = L as each span sees
+    it, with the forces of the clips beyond, zero where that ends freely; with obstacles as each segment sees it, with
+    those of clips and contacts;
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it.
     """
 
     shape: Shape
-    end_force: Float[Array, "... 3"] | Float[Array, "... 3 spans"]
+    end_force: Float[Array, "... 3 parts"] | Float[Array, "... 3"]  # the second only in files, until format 8
     units: Units
     places: Float[Array, "... slides"] | None = None
     clip_moments: Float[Array, "... clips 3"] | None = None

@@ -306,15 +306,6 @@ def held_at_both_ends(scene: Scene) -> bool:
     return isinstance(scene.start, Held) and isinstance(scene.end, Held)
 
 
-def force_shape(scene: Scene, segments: int) -> tuple[int, ...]:
-    """The shape of what a solver knows of the force at s = L: with clips one vector for each span between supports,
-    with obstacles one for each segment.
-    """
-    if scene.obstacles:
-        return (3, segments)
-    return (3, len(scene.clips) + 1) if scene.clips else (3,)
-
-
 def slides(scene: Scene) -> bool:
     """Whether the rod slides through a clip."""
     return any(clip.sliding for clip in scene.clips)

@@ -309,7 +309,7 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     from_origin = sections.position + (units.origin / units.length)[None]
     energy = reached.elastic_energy + reached.load_energy + _energy_at(scaled, start, from_origin)
     nodes = reached.nodes
-    end_force = last.force if held_at_both_ends(scene) else jnp.zeros_like(last.force)
+    end_force = (last.force if held_at_both_ends(scene) else jnp.zeros_like(last.force))[:, None]
     if scene.clips:
         end_force = _end_forces_of_spans(scaled, start, sections)
     none = jnp.zeros((), int)

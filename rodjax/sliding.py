@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import clip_moments, resultants
@@ -69,6 +68,6 @@ def slide(scene: Scene, shape: Shape, point: MixedPoint) -> Slide:
 
 def axial_forces(form: Form, point: Point) -> Float[Array, "slides"]:
     """What the sliding clips apply along the rod."""
-    assert isinstance(form, ClippedForm)
+    assert isinstance(form, MixedForm)
     assert isinstance(point, MixedPoint)
     return form.axial_forces(point)

@@ -51,7 +51,7 @@ def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None =
     begin = form.holding(point)
     if motion is None:
         return form, begin
-    force_change = form.force_change(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.closure(motion.multipliers))
     return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
 
 

@@ -43,7 +43,7 @@ def test_a_rod_that_turns_as_a_whole_stays_in_equilibrium(kind):
         rotation = form.turn(point, here.bases, AXIS)
         multipliers = form.multipliers_turned(point, AXIS, jnp.zeros_like(here.closure))
         of_rotation, of_multipliers = here.system.times(rotation, multipliers)
-        forces = jnp.linalg.norm(jnp.cross(AXIS[:, None], jnp.atleast_2d(point.end_force.T).T, axis=0), axis=0)
+        forces = jnp.linalg.norm(jnp.cross(AXIS[:, None], point.end_force, axis=0), axis=0)
         return jnp.abs(of_rotation), jnp.abs(of_multipliers), forces
 
     rotation, multipliers, forces = resisted(solved(kind))

@@ -483,9 +483,9 @@ def test_without_torsion_no_angle_is_traced():
         def moved_and_linearized(scaled, point, rotation):
             form = MixedForm.of(scaled, HermiteElements.of(scaled, jnp.linspace(0.0, 1.0, 5)))
             here = form.linearized(point)
-            return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros(3))).gradient
+            return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
 
-        point = MixedPoint(jnp.ones((3, 9)), jnp.zeros(3), jnp.array(0.0))
+        point = MixedPoint(jnp.ones((3, 9)), jnp.zeros((3, 1)), jnp.array(0.0))
         return str(jax.make_jaxpr(moved_and_linearized)(scaled, point, jnp.zeros((2, 9))))
 
     bare = text(Scene(rod, clamp, Swivel((0.8, 0, 0), (1, 0, 0))))

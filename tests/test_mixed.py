@@ -46,7 +46,7 @@ def begin(name: str, kind: str = "edges") -> tuple[MixedForm, MixedPoint]:
     twist = 4.0 if form.has_torsion else 0.0
     if not form.has_potential:
         twist = float(twist_under_moment(scene, tangents))
-    return form, MixedPoint(tangents, jnp.array(force), jnp.array(twist))
+    return form, MixedPoint(tangents, jnp.array(force)[:, None], jnp.array(twist))
 
 
 linearized = eqx.filter_jit(MixedForm.linearized)
@@ -78,7 +78,7 @@ def derivatives(form: MixedForm, point: MixedPoint, function):
     """The linearization at the point, and `function`s of that at a moved point by the rotations and the force."""
 
     def at(rotation, force_change):
-        return function(form.linearized(form.moved(point, here.bases, rotation, force_change)))
+        return function(form.linearized(form.moved(point, here.bases, rotation, force_change[:, None])))
 
     here = linearized(form, point)
     return here, at, (jnp.zeros_like(here.gradient), jnp.zeros(3))
@@ -135,7 +135,7 @@ def test_gradient_with_a_dead_moment_is_that_of_the_work_on_the_end_frame(name):
     bare = Scene(scene.rod, *ends, scene.gravity)
     only_force = MixedForm.of(bare, field(bare))
     for sign in (1, -1):
-        moved = form.moved(point, here.bases, sign * step * direction, jnp.zeros(3))
+        moved = form.moved(point, here.bases, sign * step * direction, jnp.zeros((3, 1)))
         energies.append(float(linearized(only_force, moved).energy))
         tangents = moved.tangents if free is scene.end else moved.tangents[:, ::-1]
         frames.append(last_frame_without_twist(clamp.frame, tangents))
@@ -207,7 +207,7 @@ def test_residual_is_the_largest_component_of_the_gradient_by_nodes(solved):
     form, problem, _, point = solved
     here = linearized(form, point)
     rotation = 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=(2, N)))
-    moved = form.moved(point, here.bases, rotation, jnp.zeros(3))
+    moved = form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))
     edges = form.edges(moved)
     _, gradient = eqx.filter_jit(problem.energy_and_gradient)(Polyline(form.nodes(edges), edges))
     residual = linearized(form, moved).residual
@@ -225,9 +225,9 @@ def jaxpr_text(scene: Scene) -> str:
     def moved_and_linearized(scaled, point, rotation):
         form = MixedForm.of(scaled, field(scaled))
         here = form.linearized(point)
-        return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros(3))).gradient
+        return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
 
-    point = MixedPoint(jnp.ones((3, N)), jnp.zeros(3), jnp.array(0.0))
+    point = MixedPoint(jnp.ones((3, N)), jnp.zeros((3, 1)), jnp.array(0.0))
     return str(jax.make_jaxpr(moved_and_linearized)(scaled, point, jnp.zeros((2, N))))
 
 

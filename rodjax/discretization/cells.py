@@ -44,6 +44,11 @@ class Cells(Protocol):
         ...
 
     @property
+    def clip_nodes(self) -> Int[Array, "clips"] | None:
+        """The numbers of the nodes at which clips hold the rod; `None` without clips."""
+        ...
+
+    @property
     def places(self) -> Float[Array, "m"]:
         """Arclengths of the frames."""
         ...
@@ -111,6 +116,10 @@ class JointCells(eqx.Module):
     """n equal edges, n + 2 frames: of the start, of the edges and of the end; cells are the joints between them."""
 
     s: Float[Array, "n+1"]
+
+    @property
+    def clip_nodes(self) -> None:
+        return None
 
     @property
     def segments(self) -> int:

@@ -143,9 +143,6 @@ class EdgeTangents(eqx.Module):
         held = with_held_tangents(scene, tangents)
         return angle_about(held[:, -1], transport_along(scene.start.frame[:, 0], held)[:, -1], scene.end.frame[:, 0])
 
-    def ways(self, slopes: Float[Array, "3 n"]) -> Float[Array, "n 3"]:
-        return slopes.T / self.segments if self.places is None else slopes.T * self.weights[:, None]
-
     @property
     def side_weights(self) -> Float[Array, "1 n"]:
         return self.weights[None]
@@ -171,19 +168,8 @@ class EdgeTangents(eqx.Module):
     def of_points(self, by_side: Float[Array, "... 1 n"]) -> Float[Array, "... n"]:
         return by_side[..., 0, :]
 
-    def side_forces(self, scene: Scene) -> Float[Array, "3 1 n"]:
-        return self.forces_beyond(scene)[:, None]
-
-    def forces_beyond(self, scene: Scene) -> Float[Array, "3 n"]:
-        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.places).T)
-
-    def force_spread(self, scene: Scene) -> None:
-        return None
-
-    def ways_of_spread(
-        self, scene: Scene, tangents: Float[Array, "3 n"], softness: Float[Array, "n"]
-    ) -> Float[Array, "n 3"]:
-        return jnp.zeros_like(tangents.T)
+    def loads_beyond(self, scene: Scene) -> Float[Array, "3 1 n"]:
+        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.places).T)[:, None]
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 n"], lengths: Float[Array, "n"]) -> Float[Array, ""]:
         """Largest component of the force on a free node."""

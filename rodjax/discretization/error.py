@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
@@ -161,12 +160,12 @@ def errors_of_differences(
 ) -> Errors:
     """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
     scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
-    elements = type(form).of(scene, field)
+    elements = MixedForm.of(scene, field)
     tangents = interleaved(at_nodes, point.tangents)
     begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
     here = elements.linearized(begin)
     motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
-    change = elements.force_change(elements.closure(motion.multipliers))
+    change = elements.layout.forces(elements.closure(motion.multipliers))
     end = elements.moved(begin, here.bases, motion.rotation, change)
     found, better = resultants(form, point), resultants(elements, end)
     curvature = jnp.max(jnp.abs(better.curvature - found.curvature))
@@ -174,7 +173,7 @@ def errors_of_differences(
     if scene.clips:
         moments += list(clip_moments(elements, end) - clip_moments(form, point))
     error = Sizes(longest(_with_jumps(change)), longest(jnp.stack(moments, axis=1)), curvature)
-    forces = elements.with_end_force(end, field.forces_in_elements(scene))
+    forces = elements.forces(end)
     curvature = jnp.max(better.curvature)
     moment = bending_moment_at(scene.rod, curvature), torque_at(scene.rod, end.total_twist)
     scale = Sizes(longest(forces), jnp.sqrt(moment[0] ** 2 + moment[1] ** 2), curvature).as_scale()
@@ -189,8 +188,8 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     torque = torque_at(rod, point.total_twist)
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
 
-    def forces_of(end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 3 n"]:
-        return form.with_end_force(MixedPoint(tangents, end_force, torque), field.forces_in_elements(scene))
+    def forces_of(end_force: Float[Array, "3 parts"]) -> Float[Array, "3 3 n"]:
+        return form.forces(MixedPoint(tangents, end_force, torque))
 
     def bent(tangents: Float[Array, "3 m"], forces: Float[Array, "3 3 n"], torque: Float[Array, ""]):
         """The bending moments at both ends of the elements."""
@@ -225,7 +224,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
     gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
-    closure = -form.of_force(form.along_spans(gap))
+    closure = -form.layout.components(form.layout.sums(gap))
     if form.has_torsion:
         missing = jnp.sum(bulge(passed) - bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
         between = jnp.zeros(len(here.closure) - len(closure) - 1, closure.dtype)  # what pushes at the nodes
@@ -234,7 +233,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
     motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
 
-    force_change = form.force_change(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.closure(motion.multipliers))
     turned = short_sum(here.bases * motion.rotation[None], axis=1)
     end_force = point.end_force + force_change
     ways, change = jax.jvp(
@@ -305,9 +304,8 @@ def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n
     return jnp.maximum(jnp.max(depths, axis=1), 0.0)
 
 
-def _with_jumps(end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 k"]:
+def _with_jumps(spans: Float[Array, "3 parts"]) -> Float[Array, "3 k"]:
     """The forces in the spans, and those of the clips between them."""
-    spans = end_force.reshape(3, -1)
     return jnp.concatenate([spans, spans[:, 1:] - spans[:, :-1]], axis=1)
 
 
@@ -316,8 +314,6 @@ def _axial_error(
 ) -> Float[Array, "slides"] | None:
     if not slides(form.scene):
         return None
-    assert isinstance(form, ClippedForm)
-    assert isinstance(other, ClippedForm)
     return form.axial_forces(point) - other.axial_forces(other_point)
 
 
@@ -326,7 +322,7 @@ def _integrated(
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
     scene, rod = form.scene, form.scene.rod
-    force = form.with_end_force(point, field.forces_in_elements(scene)[:, 0])
+    force = form.forces(point)[:, 0]
     weight = jnp.zeros(3, force.dtype) if scene.gravity is None else scene.gravity
     step = field.h / STEPS
 

@@ -65,7 +65,7 @@ class Polyline(Shape):
     def tangents(self) -> Float[Array, "3 n"]:
         return self.edges.T / self.lengths[None]
 
-    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
+    def point(self, end_force: Float[Array, "3 parts"], total_twist: Float[Array, ""]) -> MixedPoint:
         return MixedPoint(self.tangents, end_force, total_twist)
 
     def with_unknowns(self, point: MixedPoint) -> "Polyline":
@@ -244,7 +244,7 @@ class FiniteDifference(eqx.Module):
             on_end = forces_on_nodes(self.scene, len(polyline.edges))[-1]
             elastic = lambda edges: self.energies(Polyline(polyline.nodes, edges)).elastic  # noqa: E731
             end_force = jax.grad(elastic)(polyline.edges)[-1] - on_end
-        return MixedPoint(tangents, end_force, self.total_twist(polyline))
+        return MixedPoint(tangents, end_force[:, None], self.total_twist(polyline))
 
 
 class Preconditioner(eqx.Module):

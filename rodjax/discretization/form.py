@@ -5,12 +5,13 @@ from typing import Any, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
+from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
 from rodjax.linalg import AnySystem
-from rodjax.scene import Scene, held_at_both_ends
-from rodjax.supports import Free, Held
+from rodjax.scene import Scene
+from rodjax.supports import Free
 
 # Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
 # a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
@@ -46,10 +47,8 @@ class Point(Protocol):
     def tangents(self) -> Float[Array, "3 m"]: ...
 
     @property
-    def end_force(self) -> Float[Array, "3 *spans"]:
-        """The force at s = L between held ends, else zero; with clips, for each span in turn, with the forces of the
-        clips beyond it.
-        """
+    def end_force(self) -> Float[Array, "3 parts"]:
+        """The force at s = L as each part of the layout sees it, with what clips and contacts beyond it apply."""
         ...
 
     @property
@@ -59,15 +58,14 @@ class Point(Protocol):
 
 
 class Form(eqx.Module):
-    """A scene whose unknowns are rotations along the rod, and the force at s = L where both ends are held.
+    """A scene whose unknowns are rotations along the rod, and forces through it where it is held at several places.
 
-    The border of its system has one column for each multiplier; the last ones are components of that force. `axes`:
-    those in which it lies, `None` for all of space.
+    The border of its system has one column for each multiplier; the last ones are the unknown forces of the layout.
     """
 
     scene: eqx.AbstractVar[Scene]
     field: eqx.AbstractVar[Any]
-    axes: eqx.AbstractVar[Float[Array, "3 a"] | None]
+    layout: eqx.AbstractVar[ForceLayout]
 
     @property
     @abstractmethod
@@ -96,7 +94,7 @@ class Form(eqx.Module):
         point: Any,
         bases: Float[Array, "3 b m"],
         rotation: Float[Array, "b m"],
-        force_change: Float[Array, "3"],
+        force_change: Float[Array, "3 parts"],
     ) -> Any:
         """The point turned by rotations in its bases, and under another force."""
 
@@ -114,10 +112,10 @@ class Form(eqx.Module):
 
     @abstractmethod
     def under_force(
-        self, point: Any, bases: Float[Array, "3 b m"], rotation: Float[Array, "b m"], change: Float[Array, "3"]
+        self, point: Any, bases: Float[Array, "3 b m"], rotation: Float[Array, "b m"], change: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        """With another end force: what the rod lacks of its span and the rate of that as it begins to turn; by how much
-        L differs, and by how much the rate of L does.
+        """Under other forces: what the rod lacks of its spans and the rate of that as it begins to turn; by how much L
+        differs, and by how much the rate of L does.
         """
 
     @abstractmethod
@@ -139,47 +137,43 @@ class Form(eqx.Module):
     def load_energy(self, point: Any) -> Float[Array, ""]:
         """The potential of gravity and dead forces, zero at the origin."""
 
+    @property
+    def clip_nodes(self) -> Int[Array, "clips"] | None:
+        """The numbers of the nodes at which clips hold the rod; `None` without clips."""
+        return self.field.clip_nodes
+
+    @property
+    def held_places(self) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
+        """The positions that are held along the rod, and the numbers of the nodes there."""
+        return held_places(self.scene, self.field.s, self.clip_nodes)
+
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
-        """Nodes along the edges, between held ends to the last digit."""
-        start, end = self.scene.start, self.scene.end
-        if not isinstance(start, Held):
-            assert isinstance(end, Held), "a scene holds at least one position"
-            return jnp.concatenate([end.position[None] - jnp.cumsum(edges[::-1], axis=0)[::-1], end.position[None]])
-        nodes = start.position[None] + jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        if isinstance(end, Held):
-            s = jnp.linspace(0.0, 1.0, len(nodes), dtype=nodes.dtype)[:, None]
-            nodes = (nodes + s * (end.position - nodes[-1])[None]).at[-1].set(end.position)
-        return nodes
+        """Nodes along the edges, at held places to the last digit."""
+        return nodes_along(self.scene, self.field.s, self.clip_nodes, edges)
+
+    def loads_on_all(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """All loads together, and the given force on an end that is free."""
+        given = jnp.zeros(3, point.tangents.dtype)
+        for end in (self.scene.start, self.scene.end):
+            if isinstance(end, Free) and end.force is not None:
+                given = end.force
+        return total_force(self.scene), given
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""
-        total = total_force(self.scene)
-        for end, sign in ((self.scene.start, -1), (self.scene.end, 1)):
-            if isinstance(end, Free):
-                given = jnp.zeros_like(total) if end.force is None else sign * end.force
-                return (given, -total) if sign < 0 else (total, given)
-        return point.end_force + total, point.end_force
-
-    @property
-    def _closures(self) -> int:
-        """How many of the multipliers are components of the end force: the last ones."""
-        if not held_at_both_ends(self.scene):
-            return 0
-        return 3 if self.axes is None else self.axes.shape[1]
+        total, given = self.loads_on_all(point)
+        first, last = point.end_force[:, 0], point.end_force[:, -1]
+        if isinstance(self.scene.start, Free):
+            return -given, last - total
+        return first + total, given if isinstance(self.scene.end, Free) else last
 
     def closure(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
-        """The part for the end force, of what is given for all multipliers."""
-        return multipliers[len(multipliers) - self._closures :]
-
-    def of_force(self, vector: Float[Array, "3 *spans"]) -> Float[Array, "c"]:
-        """The components of a vector, with clips one for each span, that belong to the end force."""
-        if not self._closures:
-            return jnp.zeros(0, vector.dtype)
-        return vector if self.axes is None else vector @ self.axes
+        """The part for the forces of the layout, of what is given for all multipliers."""
+        return multipliers[len(multipliers) - self.layout.size :]
 
     def force_turned(self, point: Any, axis: Float[Array, "3"]) -> Float[Array, "c"]:
-        """The components of what the end force changes by as the whole rod turns about an axis."""
-        return self.of_force(jnp.cross(axis, point.end_force))
+        """The components of what the forces change by as the whole rod turns about an axis."""
+        return self.layout.components(jnp.cross(axis[:, None], point.end_force, axis=0))
 
     def multipliers_turned(
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
@@ -187,12 +181,6 @@ class Form(eqx.Module):
         """The same with zeros, as many as `multipliers`, before it."""
         of_force = self.force_turned(point, axis)
         return multipliers.at[len(multipliers) - len(of_force) :].set(of_force)
-
-    def force_change(self, closure: Float[Array, "c"]) -> Float[Array, "3 *spans"]:
-        """A change of the end force from its components."""
-        if not self._closures:
-            return jnp.zeros(3, closure.dtype)
-        return closure if self.axes is None else self.axes @ closure
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         """Whether the polyline spans its ends as well as befits a residual of this tolerance."""

@@ -1,6 +1,5 @@
 """The form of a scene on the mesh of a shape: by tangents where these say all, else by frames."""
 
-from rodjax.discretization.clipped import ClippedForm
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed_curve import FramedCurve, form_of_frames
@@ -18,7 +17,7 @@ def form_of(scene: Scene, shape: Shape) -> Form:
         return form_of_frames(scene, shape)
     if scene.obstacles:
         return TouchingForm.of(scene, field_of(scene, shape))
-    return (ClippedForm if scene.clips else MixedForm).of(scene, field_of(scene, shape))
+    return MixedForm.of(scene, field_of(scene, shape))
 
 
 def field_of(scene: Scene, shape: Shape) -> TangentField:

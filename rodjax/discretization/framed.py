@@ -2,11 +2,13 @@
 
 The mixed form of `mixed`, with a frame R in the place of each tangent. An equilibrium is a saddle point of
 
-    L(R, F) = sum h [w(strains(R), e) - n . t (1 + e)] - sum n . R rest + F . span,
+    L(R, F) = sum h [w(strains(R), e) - n . t (1 + e)] - sum n . R rest + sum F . span,
 
-a minimum over the frames and a maximum over the force F at s = L; the axial strain e is the one at which dw/de = n . t.
+a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t.
 A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
-frames (`cells`): each cell is one function of its few rotations and F, which JAX differentiates twice, all at once.
+frames (`cells`): each cell is one function of its few rotations and F, which JAX differentiates twice, all at once. A
+clip holds a node, where it holds the direction of the rod two of the three rotations of the frame there, and where it
+holds the twist all three, as a clamp does at an end; clips need elements.
 
 Couples, follower loads and dead moments have no potential. Their virtual work enters the gradient; what follower forces
 change far away makes the matrix full, and the method Newton's own on all of it.
@@ -23,6 +25,8 @@ from rodjax.discretization.cells import REFERENCE, Cells, Frames, of_cells, stac
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.framed_parts import parts_of
+from rodjax.discretization.layout import ForceLayout, SpanForces
+from rodjax.discretization.nodes import held_nodes
 from rodjax.energy import Sections
 from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
@@ -34,10 +38,10 @@ from rodjax.vectors import components, dot
 
 
 class FramePoint(eqx.Module):
-    """Frames along the rod; the force at s = L between held ends, else zero; the total twist [rad], where known."""
+    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known."""
 
     quaternions: Float[Array, "4 m"]
-    end_force: Float[Array, "3 *spans"]
+    end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
 
     @property
@@ -78,7 +82,7 @@ class FrameForm(Form):
     rest_strains: Float[Array, "3 k n"] | None
     rest_ways: Float[Array, "3 n"] | None
     loads: Float[Array, "3 k n"]
-    axes: Float[Array, "3 a"] | None = None
+    layout: ForceLayout
 
     @classmethod
     def of(cls, scene: Scene, field: Cells) -> "FrameForm":
@@ -99,10 +103,15 @@ class FrameForm(Form):
     @property
     def held_frames(self) -> list[HeldFrame]:
         ends = ((self.scene.start, 0), (self.scene.end, -1))
-        return [
+        of_ends = [
             HeldFrame(k, end.tangent, end.frame if isinstance(end, Clamp) else None)
             for end, k in ends
             if isinstance(end, Directed)
+        ]
+        clips = self.scene.clips
+        return of_ends + [
+            HeldFrame(2 * held.node, held.tangent, clips[held.clip].frame)
+            for held in held_nodes(self.scene, self.clip_nodes)
         ]
 
     def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
@@ -134,43 +143,25 @@ class FrameForm(Form):
         point: FramePoint,
         bases: Float[Array, "3 3 m"],
         rotation: Float[Array, "3 m"],
-        force_change: Float[Array, "3 *spans"],
+        force_change: Float[Array, "3 parts"],
     ) -> FramePoint:
         # Rounding would grow with every step.
         quaternions = unit(turned(point.quaternions, rotation))
         return FramePoint(quaternions, point.end_force + force_change, point.total_twist)
 
-    # --- forces, and what the ends lack ------------------------------------------------------------------------------
-
-    def through(self, end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
-        """The force through the cells besides that of the loads."""
-        return end_force[:, None, None]
+    # --- forces, and what the spans lack -----------------------------------------------------------------------------
 
     @property
-    def spans(self) -> Float[Array, "3 *spans"]:
-        """The ways between held ends."""
-        start, end = self.scene.start, self.scene.end
-        assert isinstance(start, Held)
-        assert isinstance(end, Held)
-        return end.position - start.position
+    def spans(self) -> Float[Array, "3 parts"]:
+        """Between held places."""
+        assert isinstance(self.layout, SpanForces)
+        return self.layout.spans(self.held_places[0])
 
-    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3 *spans"]:
-        """What the cells add up to between held ends."""
-        return jnp.stack([jnp.sum(component) for component in ways])
+    def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
+        """The force through the cells besides that of the loads."""
+        return self.layout.of_cells(end_force)[:, None]
 
-    def work_of_spans(self, end_force: Float[Array, "3 *spans"]) -> Float[Array, ""]:
-        """Of the force at s = L on the way between held ends."""
-        return jnp.sum(end_force * self.spans)
-
-    def by_spans(self, by_cell: Float[Array, "3 3 p n"]) -> Float[Array, "3 c p n"]:
-        """By the components of the force in cells, as by those of the end force."""
-        return by_cell
-
-    def compliance(self, by_cell: Float[Array, "3 3 n"]) -> Float[Array, "c c"]:
-        """The same of what the cells give way by."""
-        return jnp.sum(by_cell, axis=2)
-
-    def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]) -> Float[Array, "3 k n"]:
+    def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> Float[Array, "3 k n"]:
         """The force through the rod at the strain points."""
         forces = self.through(end_force) + self.loads
         following = self._following(quaternions)
@@ -265,16 +256,8 @@ class FrameForm(Form):
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
 
-    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The section forces at s = 0 and s = L."""
-        total, given = self._loads_on_all(point.quaternions)
-        if isinstance(self.scene.start, Free):
-            return -given, -total
-        return (total, given) if isinstance(self.scene.end, Free) else (point.end_force + total, point.end_force)
-
-    def _loads_on_all(self, q: Float[Array, "4 m"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """All loads together, and the given force on an end that is free."""
-        scene = self.scene
+    def loads_on_all(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        scene, q = self.scene, point.quaternions
         total = total_force(scene)
         given = jnp.zeros_like(total)
         for load in scene.distributed:
@@ -292,7 +275,7 @@ class FrameForm(Form):
     # --- derivatives -------------------------------------------------------------------------------------------------
 
     def by_rotations(
-        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]
+        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]
     ) -> Float[Array, "3 p n"]:
         """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
         frames = of_cells(self.field, quaternions)
@@ -301,7 +284,7 @@ class FrameForm(Form):
         return stacked(jax.grad(lambda rotations: jnp.sum(self._by_cells(frames, rotations, forces)))(nothing))
 
     def _unbalanced(
-        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 *spans"]
+        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         """What is out of balance at the frames, in their axes, and what the rod lacks of its span."""
         gradient = self.field.assembled(self.by_rotations(quaternions, end_force))
@@ -309,9 +292,9 @@ class FrameForm(Form):
         if couples is not None:
             gradient -= couples
         closure = jnp.zeros(0, end_force.dtype)
-        if self._closures:
+        if self.layout.size:
             edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros((), end_force.dtype)))
-            closure = self.of_force(self.spans - self.along_spans(edges.T))
+            closure = self.layout.components(self.spans - self.layout.sums(edges.T))
         return gradient * self.is_free, closure
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
@@ -326,7 +309,8 @@ class FrameForm(Form):
         frames = of_cells(field, point.quaternions)
         loads = unstacked(self.loads)
         p, n = field.lengths.shape
-        closures = self._closures
+        assert isinstance(self.layout, SpanForces)
+        closures = self.layout.size
         of_cell = 3 if closures else 0
 
         def energies(rotations: tuple[Vector, ...], force: Vector) -> Float[Array, ""]:
@@ -357,11 +341,11 @@ class FrameForm(Form):
         closure, border = jnp.zeros(0, value.dtype), jnp.zeros((3, 0, free.shape[1]), value.dtype)
         compliance = jnp.zeros((0, 0), value.dtype)
         if closures:
-            value += self.work_of_spans(point.end_force)
-            closure = self.of_force(self.spans + self.along_spans(jnp.stack(first[1])))
+            value += jnp.sum(point.end_force * self.spans)
+            closure = self.layout.components(self.spans + self.layout.sums(jnp.stack(first[1])))
             by_force = by_rotation[3 * p :].transpose(2, 0, 1, 3)  # [a, component of the force, i]
-            border = field.assembled(self.by_spans(by_force)) * free[:, None]
-            compliance = -self.compliance(jnp.stack([component[3 * p :] for component in second[1]]))
+            border = field.assembled(self.layout.columns(by_force)) * free[:, None]
+            compliance = -self.layout.compliance(jnp.stack([component[3 * p :] for component in second[1]]))
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
@@ -379,7 +363,7 @@ class FrameForm(Form):
 
         def residual(unknowns: Float[Array, "3m+c"]) -> Float[Array, "3m+c"]:
             rotation = unknowns[: free.size].reshape(free.shape)
-            force = point.end_force + self.force_change(unknowns[free.size :])
+            force = point.end_force + self.layout.forces(unknowns[free.size :])
             gradient, closure = self._unbalanced(turned(q, rotation * free), force)
             return jnp.concatenate([gradient.reshape(-1), closure])
 
@@ -409,32 +393,34 @@ class FrameForm(Form):
         point: FramePoint,
         bases: Float[Array, "3 3 m"],
         rotation: Float[Array, "3 m"],
-        change: Float[Array, "3 *spans"],
+        change: Float[Array, "3 parts"],
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        """With another end force: what the rod lacks of its span and the rate of that as the frames begin to turn;
-        by how much L differs, and by how much the rate of L does.
-        """
         zero = jnp.zeros((), change.dtype)
-        if not self._closures:
+        if not self.layout.size:
             nothing = jnp.zeros(0, change.dtype)
             return nothing, nothing, zero, zero
         frames = of_cells(self.field, point.quaternions)
         turning = unstacked(self.field.of_cells(rotation))
 
-        def parts(amount: Float[Array, ""], force: Float[Array, "3 *spans"]) -> tuple[Array, Array]:
+        def parts(amount: Float[Array, ""], force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
             def value(force):
                 forces = unstacked(self.through(force) + self.loads)
                 cells = self._by_cells(frames, jax.tree.map(lambda x: amount * x, turning), forces)
-                return jnp.sum(cells) + self.work_of_spans(force)
+                return jnp.sum(cells) + jnp.sum(force * self.spans)
 
             return jax.value_and_grad(value)(force)
 
-        def rates(force: Float[Array, "3 *spans"]):
+        def rates(force: Float[Array, "3 parts"]):
             return jax.jvp(lambda amount: parts(amount, force), (zero,), (jnp.ones_like(zero),))
 
         (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
         (before, _), (rate_before, _) = rates(point.end_force)
-        return self.of_force(closure), self.of_force(closure_rate), energy - before, rate - rate_before
+        return (
+            self.layout.components(closure),
+            self.layout.components(closure_rate),
+            energy - before,
+            rate - rate_before,
+        )
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

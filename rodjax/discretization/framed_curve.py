@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
-from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.first_twist import FirstTwist, more_turns
 from rodjax.discretization.form import Form
@@ -85,7 +84,7 @@ class FramedCurve(Shape):
         if last is not None and last.shape is not None:
             assert isinstance(last.shape, FramedCurve)
             reference = last.shape.quaternions
-        if isinstance(form, ClippedFrameForm):
+        if scene.clips:
             q = _turned_to_supports(form, self.quaternions, first, reference)
             return q if scene.turns is None else _with_turns(scene, cells, q, first)
         q, places = self.quaternions, cells.places
@@ -127,7 +126,7 @@ def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], first: First
 
 
 def _turned_to_supports(
-    form: ClippedFrameForm, q: Float[Array, "4 m"], first: FirstTwist, reference: Float[Array, "4 m"]
+    form: FrameForm, q: Float[Array, "4 m"], first: FirstTwist, reference: Float[Array, "4 m"]
 ) -> Float[Array, "4 m"]:
     """Frames swung to the tangents that ends and clips hold, by less and less towards the supports beside each, then
     spun about their tangents to the frames that are held, linearly between these.
@@ -138,6 +137,7 @@ def _turned_to_supports(
     had = cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2]
     is_carried = first.last is not None
     zero, last = jnp.zeros((), int), jnp.asarray(len(places) - 1)
+    assert form.clip_nodes is not None
     supports = jnp.stack([zero, *(2 * form.clip_nodes), last])
     numbered = [(held, jnp.asarray(held.number) % len(places)) for held in form.held_frames]
     for held, number in numbered:
@@ -202,7 +202,7 @@ def _spin_between(q: Float[Array, "4"], other: Float[Array, "4"]) -> Float[Array
 
 def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
     cells = shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s)
-    return (ClippedFrameForm if scene.clips else FrameForm).of(scene, cells)
+    return FrameForm.of(scene, cells)
 
 
 def framed_through(

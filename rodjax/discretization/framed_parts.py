@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Along
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
+from rodjax.discretization.layout import SpanForces
 from rodjax.loads import DistributedForce
 from rodjax.rotations import inverse, rotated, tangent
 from rodjax.scene import Scene
@@ -23,6 +24,7 @@ def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
         "rest_strains": rest_strains,
         "rest_ways": rest_ways,
         "loads": _dead_loads(scene, field),
+        "layout": SpanForces.of(scene, field.clip_nodes, field.lengths.shape[1]),
     }
 
 

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells, JointCells
-from rodjax.discretization.clipped_frames import ClippedFrameForm
 from rodjax.discretization.error import (
     COUPLE_REACH,
     STEPS,
@@ -85,7 +84,7 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
     field = form.field
     own = own_moments(form, point)
     moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
-    if isinstance(form, ClippedFrameForm):
+    if form.clip_nodes is not None:
         moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
     forces = form.forces(point.quaternions, point.end_force)
@@ -141,8 +140,8 @@ def _strains_at_ends(
 
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
     """What the clips apply to the rod, nondimensional: the jumps of the section moment."""
-    assert isinstance(form, ClippedFrameForm)
     own, nodes = own_moments(form, point), form.clip_nodes
+    assert nodes is not None
     jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
     moments = []
     for k, clip in enumerate(form.scene.clips):
@@ -239,7 +238,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool =
         return _errors_of_joints(form, point, is_turn_held)
     ends = _end_moments(form, point)
     moments = ends[:, 0]
-    if not isinstance(form, ClippedFrameForm):
+    if not form.scene.clips:
         moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
     nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments), nodes[:, :-1], moments)
@@ -266,7 +265,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool =
     gradient += jnp.zeros_like(gradient).at[:, 2::2].set(rotated(inverse(nodes[:, 1:]), couple)) * form.is_free
     here = form.linearized(point)
     motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
-    change = form.force_change(form.closure(motion.multipliers))
+    change = form.layout.forces(form.closure(motion.multipliers))
 
     def reached(amount: Float[Array, ""]) -> Float[Array, "3 n"]:
         there = form.moved(point, here.bases, amount * motion.rotation, amount * change)
@@ -346,7 +345,7 @@ def _errors_of_joints(form: FrameForm, point: FramePoint, is_turn_held: bool) ->
     begin = FramePoint(jnp.concatenate([q, nodes[:, -1:]], axis=1), point.end_force, point.total_twist)
     here = elements.linearized(begin)
     motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
-    change = elements.force_change(elements.closure(motion.multipliers))
+    change = elements.layout.forces(elements.closure(motion.multipliers))
     end = elements.moved(begin, here.bases, motion.rotation, change)
     found, better = resultants_of_frames(form, point), resultants_of_frames(elements, end)
     moments = [better.start_moment - found.start_moment, better.end_moment - found.end_moment]

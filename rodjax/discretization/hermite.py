@@ -201,7 +201,7 @@ class HermiteElements(eqx.Module):
         carried = self.carried(scene.start.frame[:, 0], tangents)[:, -1]
         return angle_about(tangents[:, -1], carried, scene.end.frame[:, 0])
 
-    # --- points by elements, as clips part them ----------------------------------------------------------------------
+    # --- points by elements ------------------------------------------------------------------------------------------
 
     @property
     def side_weights(self) -> Float[Array, "3 n"]:
@@ -217,44 +217,9 @@ class HermiteElements(eqx.Module):
     def of_points(self, by_side: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
         return assembled(by_side[..., 0, :], by_side[..., 1, :], by_side[..., 2, :])
 
-    def side_forces(self, scene: Scene) -> Float[Array, "3 3 n"]:
-        return self.forces_in_elements(scene)
-
     # --- places and loads --------------------------------------------------------------------------------------------
 
-    def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:
-        """From node to node, of a curve with these derivatives by arclength at the points."""
-        parts = of_elements(slopes)
-        return (self.h[None] * sum(weight * part for weight, part in zip(SIMPSON, parts, strict=True))).T
-
-    def forces_beyond(self, scene: Scene) -> Float[Array, "3 m"]:
-        """What the loads beyond each point exert on it; where the start is free, less all of them."""
-        of_elements = self.forces_in_elements(scene)
-        parts = (weight * self.h[None] * of_elements[:, k] for k, weight in enumerate(SIMPSON))
-        return assembled(*parts) / self.weights[None]
-
-    def force_spread(self, scene: Scene) -> Float[Array, "3 3 m"] | None:
-        """The weighted products of what the forces on both sides of a point differ from `forces_beyond` by."""
-        if not scene.point_forces:
-            return None
-        differences = self._side_differences(scene)
-        products = differences[:, None] * differences[None]
-        return assembled(*(weight * self.h[None, None] * products[:, :, k] for k, weight in enumerate(SIMPSON)))
-
-    def ways_of_spread(
-        self, scene: Scene, tangents: Float[Array, "3 m"], softness: Float[Array, "m"]
-    ) -> Float[Array, "n 3"]:
-        """By how much the ways between nodes differ where the tension on their side of a point does."""
-        along = jnp.stack(of_elements(tangents), axis=1)
-        strain = jnp.stack(of_elements(softness)) * dot(self._side_differences(scene), along)
-        weights = jnp.array(SIMPSON, strain.dtype)[:, None] * self.h[None]
-        return short_sum((weights * strain)[None] * along, axis=1).T
-
-    def _side_differences(self, scene: Scene) -> Float[Array, "3 3 n"]:
-        return self.forces_in_elements(scene) - jnp.stack(of_elements(self.forces_beyond(scene)), axis=1)
-
-    def forces_in_elements(self, scene: Scene) -> Float[Array, "3 3 n"]:
-        """The same at start, middle and end of each element, on its side of a point force at a node."""
+    def loads_beyond(self, scene: Scene) -> Float[Array, "3 3 n"]:
         starts_held = isinstance(scene.start, Held)
         forces = jnp.zeros((3, 3, len(self.h)), self.s.dtype)
         if scene.gravity is not None:
@@ -281,7 +246,7 @@ class Curve(Shape):
     tangents: Float[Array, "3 m"]
     s: Float[Array, "n+1"]
 
-    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> MixedPoint:
+    def point(self, end_force: Float[Array, "3 parts"], total_twist: Float[Array, ""]) -> MixedPoint:
         return MixedPoint(self.tangents, end_force, total_twist)
 
     def with_unknowns(self, point: MixedPoint) -> "Curve":

@@ -1,50 +1,55 @@
 """The finite differences in other unknowns: unit tangents of the edges, and the force that runs through the rod.
 
-Under dead loads the force in every edge is known up to one vector, the force at s = L, and that follows from the
-closure of the polyline between two held ends. So an equilibrium is a saddle point of
+Under dead loads the force through the rod is known up to one vector F in each span between held places, which follows
+from the closure of the span (`layout`). So an equilibrium is a saddle point of
 
-    L(t, F) = bending(t) + torsion(t) + sum h [w(e) - n . t (1 + e)] + F . span,    n_i = F + loads beyond edge i,
+    L(t, F) = bending(t) + torsion(t) + sum h [w(e) - n . t (1 + e)] + sum F . span,    n_i = F + loads beyond edge i,
 
-a minimum over tangents t that close the polyline and a maximum over F (Lagrange's multiplier); the axial strain e of an
-edge is the one at which dw/de = n . t. Tension is in n and not in a difference of lengths, so that neither the
+a minimum over tangents t that close the spans and a maximum over the forces F (Lagrange's multipliers); the axial
+strain e is the one at which dw/de = n . t. Tension is in n and not in a difference of lengths, so that neither the
 iterations nor the rounding depend on EA: the mixed treatment of stretch (Magisano, Leonetti & Garcea 2017) carried
-through. Steps are rotations, in which bending is nearly quadratic even where new end tangents kink the rod.
+through. Steps are rotations, in which bending is nearly quadratic even where new end tangents kink the rod. Where a
+clip or a point force acts between two cells the force jumps, and with it the tension: so each point counts with the
+force on its side of a node, in each cell that it belongs to.
 
 A dead moment M on a free end has no potential. There the virtual work M . (rotation of the end) enters the gradient:
 the tangent t turns by t x dt, and the section spins about it by as much as keeps the torque M . t along the rod.
 
-The second derivatives couple neighbouring edges only, two numbers each; the closure and the torsion, which all edges
-share, are a border of four columns (`linalg.SaddlePointSystem`). Arrays along the rod have the components first.
+The second derivatives couple neighbouring edges only, two numbers each; the closures and the torsion, which many edges
+share, are a border of a few columns (`linalg.SaddlePointSystem`). Arrays along the rod have the components first.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.chain import ChainSystem
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
-from rodjax.discretization.joints import outer, rotated, tangent_bases
+from rodjax.discretization.joints import rotated, tangent_bases
+from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
 from rodjax.linalg import AnySystem, SaddlePointSystem, short_sum
 from rodjax.scene import Scene, dead_end_moment, held_position
-from rodjax.supports import Clamp, Free, Held
+from rodjax.supports import Clamp, Free
 from rodjax.vectors import components, dot
 
 
 class MixedPoint(eqx.Module):
-    """Unit tangents of the edges; the force at s = L between held ends, else zero; the total twist [rad], else zero."""
+    """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero."""
 
-    tangents: Float[Array, "3 n"]
-    end_force: Float[Array, "3"]
+    tangents: Float[Array, "3 m"]
+    end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "MixedPoint":
@@ -68,47 +73,51 @@ class Elastic(NamedTuple):
     softness: Float[Array, ""] | None
 
 
-class Stretched(NamedTuple):
-    """Parts of a `Linearization` and the lengths of the points; the last three are `None` without closure."""
+class ByCells(NamedTuple):
+    """Parts of a `Linearization`, and by the p points of n cells their lengths, tangents and softness against tension;
+    `by_force`: the derivatives of what a cell lacks of its way, by rotations of its points.
+    """
 
     energy: Float[Array, ""]
     gradient: Float[Array, "b m"]
     diagonal: Float[Array, "b b m"]
-    lengths: Float[Array, "m"]
-    border: Float[Array, "b c m"] | None
-    closure: Float[Array, "c"] | None
-    compliance: Float[Array, "c c"] | None
+    lengths: Float[Array, "p n"]
+    along: Float[Array, "3 p n"]
+    softness: Float[Array, "p n"]
+    by_force: Float[Array, "b 3 p n"]
+
+    @property
+    def compliance(self) -> Float[Array, "3 3 n"]:
+        """By which the way of each cell grows with the force through it."""
+        softer = self.softness[None] * self.along
+        return short_sum(softer[:, None] * self.along[None], axis=2)
 
 
 class MixedForm(Form):
     """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
-    `forces_beyond`: what the loads exert on what lies beyond each point; `force_spread`: as in `TangentField`, as the
-    energy of stretch is the mean of that on both sides of a point force; `axes`: unit vectors along which the rod may
-    leave its place, `None` for all of space: two for a rod in a plane, its normal for motions out of it. In a symmetric
-    scene the two kinds do not couple.
+    `loads_beyond`: what the loads exert on what lies beyond each point, on the side of a cell. The `axes` of the layout
+    are those along which the rod may leave its place: two for a rod in a plane, its normal for motions out of it. In a
+    symmetric scene the two kinds do not couple.
     """
 
     scene: Scene
     field: TangentField
-    forces_beyond: Float[Array, "3 m"]
-    force_spread: Float[Array, "3 3 m"] | None
-    axes: Float[Array, "3 a"] | None = None
+    layout: ForceLayout
+    loads_beyond: Float[Array, "3 p n"]
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "MixedForm":
-        return cls(
-            scene=scene, field=field, forces_beyond=field.forces_beyond(scene), force_spread=field.force_spread(scene)
-        )
+        layout = SpanForces.of(scene, field.clip_nodes, len(field.s) - 1)
+        return cls(scene=scene, field=field, layout=layout, loads_beyond=field.loads_beyond(scene))
 
-    def along(self, axes: Float[Array, "3 a"]) -> "MixedForm":
-        return MixedForm(
-            scene=self.scene,
-            field=self.field,
-            forces_beyond=self.forces_beyond,
-            force_spread=self.force_spread,
-            axes=axes,
-        )
+    def in_axes(self, axes: Float[Array, "3 a"]) -> "MixedForm":
+        assert isinstance(self.layout, SpanForces)
+        return dataclasses.replace(self, layout=dataclasses.replace(self.layout, axes=axes))
+
+    @property
+    def axes(self) -> Float[Array, "3 a"] | None:
+        return self.layout.axes if isinstance(self.layout, SpanForces) else None
 
     def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
         """Directions at right angles to each tangent, along the axes."""
@@ -146,56 +155,63 @@ class MixedForm(Form):
     def has_potential(self) -> bool:
         return dead_end_moment(self.scene) is None
 
-    def with_end_force(self, point: MixedPoint, loads: Float[Array, "3 *c n"]) -> Float[Array, "3 *c n"]:
-        """The force through the rod, from what the loads beyond exert; `n`: elements or edges."""
-        return point.end_force[(slice(None), *[None] * (loads.ndim - 1))] + loads
+    # --- forces and stretch ------------------------------------------------------------------------------------------
 
-    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3"]:
-        """What elements or edges add up to between held ends."""
-        return jnp.sum(ways, axis=1)
+    def forces(self, point: MixedPoint) -> Float[Array, "3 p n"]:
+        """The force through the rod at the points of each cell."""
+        return self.layout.of_cells(point.end_force)[:, None] + self.loads_beyond
 
-    def edge_tension(self, point: MixedPoint) -> Float[Array, "n"]:
-        return dot(point.end_force[:, None] + self.forces_beyond, point.tangents)
+    def forces_and_tensions(self, point: MixedPoint) -> tuple[Float[Array, "3 p n"], Float[Array, "p n"]]:
+        forces = self.forces(point)
+        return forces, dot(forces, self.field.of_sides(point.tangents))
+
+    def edge_tension(self, point: MixedPoint) -> Float[Array, "m"]:
+        """At the points, of a force that jumps there the mean."""
+        _, tension = self.forces_and_tensions(point)
+        return self.field.of_points(self.field.side_weights * tension) / self.field.weights
 
     def slopes(self, point: MixedPoint) -> Float[Array, "3 m"]:
         """The derivative of the centerline by arclength."""
         strain = axial_strain_under(self.scene.rod, self.edge_tension(point))
         return (1 + strain)[None] * point.tangents
 
+    def ways(self, point: MixedPoint) -> Float[Array, "3 p n"]:
+        """What the points of each cell add to the way from node to node."""
+        _, tension = self.forces_and_tensions(point)
+        lengths = self.field.side_weights * (1 + axial_strain_under(self.scene.rod, tension))
+        return lengths[None] * self.field.of_sides(point.tangents)
+
     def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
         """From node to node."""
-        ways = self.field.ways(self.slopes(point))
-        if self.force_spread is not None:
-            _, softness = self._strain(point)
-            ways += self.field.ways_of_spread(self.scene, point.tangents, softness)
-        return ways
+        return short_sum(self.ways(point), axis=1).T
+
+    @property
+    def spans(self) -> Float[Array, "3 parts"]:
+        """Between held places."""
+        assert isinstance(self.layout, SpanForces)
+        return self.layout.spans(self.held_places[0])
+
+    def axial_forces(self, point: MixedPoint) -> Float[Array, "slides"]:
+        """What the sliding clips apply to the rod along its tangent."""
+        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
+        along = dot(forces, self.field.tangents_in_clips(self.scene, point.tangents))
+        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
+
+    # --- energies ----------------------------------------------------------------------------------------------------
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
         """The potential of gravity and dead forces, zero at the origin."""
-        work = jnp.sum(self.field.weights * dot(self.forces_beyond, self.slopes(point)))
-        work += 2 * self.stretching_of_spread(point)
+        work = jnp.sum(self.loads_beyond * self.ways(point))
         return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod
-        strain = axial_strain_under(rod, self.edge_tension(point))
-        stretching = jnp.sum(self.field.weights * density(rod, axial_strain=strain)) + self.stretching_of_spread(point)
+        _, tension = self.forces_and_tensions(point)
+        stretching = density(rod, axial_strain=axial_strain_under(rod, tension))
         bending = self.field.bending_energy(self.scene, point.tangents)
-        return bending + stretching + density(rod, twist=point.total_twist)
+        return bending + jnp.sum(self.field.side_weights * stretching) + density(rod, twist=point.total_twist)
 
-    def stretching_of_spread(self, point: MixedPoint) -> Float[Array, ""]:
-        """What the energy of stretch on both sides of the points is above that of their mean tension."""
-        if self.force_spread is None:
-            return jnp.zeros((), point.tangents.dtype)
-        _, softness = self._strain(point)
-        return jnp.sum(softness * dot(_times(self.force_spread, point.tangents), point.tangents)) / 2
-
-    def _strain(self, point: MixedPoint) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
-        """The axial strain, and its derivative by tension."""
-        tension = self.edge_tension(point)
-        return jax.jvp(
-            lambda tension: axial_strain_under(self.scene.rod, tension), (tension,), (jnp.ones_like(tension),)
-        )
+    # --- twist -------------------------------------------------------------------------------------------------------
 
     def twist_near(self, tangents: Float[Array, "3 m"], twist: Float[Array, ""]) -> Float[Array, ""]:
         """The total twist [rad]: between two clamps the nearest to `twist`; or under a moment."""
@@ -216,7 +232,7 @@ class MixedForm(Form):
         point: MixedPoint,
         bases: Float[Array, "3 b n"],
         rotation: Float[Array, "b n"],
-        force_change: Float[Array, "3"],
+        force_change: Float[Array, "3 parts"],
     ) -> MixedPoint:
         tangents = rotated(point.tangents, bases, rotation)
         twist = point.total_twist
@@ -226,26 +242,18 @@ class MixedForm(Form):
             twist = twist_under_moment(self.scene, tangents)
         return MixedPoint(tangents, point.end_force + force_change, twist)
 
+    # --- derivatives -------------------------------------------------------------------------------------------------
+
     def linearized(self, point: MixedPoint) -> Linearization:
         scene, tangents = self.scene, point.tangents
+        assert isinstance(self.layout, SpanForces)
         bases, energy, blocks, torque_column, softness = self._elastic(point)
-        columns, closure, compliance = [], [], []
+        cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
+        energy, gradient = energy + cells.energy, cells.gradient
+        columns, closure, compliance, rows = [], [], [], None
         if softness is not None:
-            columns.append(torque_column)
-            closure.append(jnp.zeros(1, energy.dtype))
-            compliance.append(softness[None, None])
-        stretched = self._stretched(point, bases, self.field.weights, energy, blocks.gradient, blocks.diagonal)
-        energy, gradient, diagonal, lengths = (
-            stretched.energy,
-            stretched.gradient,
-            stretched.diagonal,
-            stretched.lengths,
-        )
-        if stretched.border is not None:
-            columns.append(stretched.border)
-            closure.append(stretched.closure)
-            compliance.append(stretched.compliance)
-        rows = None
+            assert torque_column is not None
+            columns, closure, compliance = [torque_column], [jnp.zeros(1, energy.dtype)], [softness[None, None]]
         moment = dead_end_moment(scene)
         if moment is not None:
             n = tangents.shape[1]
@@ -257,20 +265,31 @@ class MixedForm(Form):
             sign = -1 if edge == 0 else 1
             spin = jnp.sum(moment * tangent) / 2 * jnp.array([[1.0, 0.0], [0.0, -1.0]], energy.dtype)
             at_edge = jnp.zeros((2, 2, n), energy.dtype).at[:, :, edge]
+            assert torque_column is not None
             columns = [torque_column, at_edge.set(spin)]
             torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
-            rows = jnp.concatenate([torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))], axis=1)
+            rows = [torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))]
             closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
+        if self.layout.size:
+            energy += jnp.sum(point.end_force * self.spans)
+            ways = short_sum(cells.lengths[None] * cells.along, axis=1)
+            lacking = self.layout.components(self.spans - self.layout.sums(ways))
+            border = self.field.of_points(self.layout.columns(cells.by_force))
+            columns, closure = [*columns, border], [*closure, lacking]
+            compliance.append(self.layout.compliance(cells.compliance))
+            rows = None if rows is None else [*rows, border]
+        nothing = jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1]), energy.dtype)
+        lengths = self.field.of_points(cells.lengths)
         return Linearization(
             bases=bases,
             gradient=gradient,
             closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
-                self.field.held(scene, diagonal),
+                self.field.held(scene, cells.diagonal),
                 blocks.lower,
-                jnp.concatenate(columns, axis=1) if columns else jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1])),
+                jnp.concatenate(columns, axis=1) if columns else nothing,
                 jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
-                rows,
+                None if rows is None else jnp.concatenate(rows, axis=1),
                 blocks.across,
             ),
             energy=energy,
@@ -292,48 +311,31 @@ class MixedForm(Form):
             return Elastic(bases, energy, blocks, torque_column, None)
         return Elastic(bases, energy + torsion, blocks, torque_column, 1 / stiffness)
 
-    def _stretched(
+    def _by_cells(
         self,
         point: MixedPoint,
         bases: Float[Array, "3 b m"],
-        weights: Float[Array, "m"],
-        energy: Float[Array, ""],
         gradient: Float[Array, "b m"],
         diagonal: Float[Array, "b b m"],
-    ) -> Stretched:
-        """With what stretch, loads and closure add to the derivatives of bending and torsion."""
-        scene, rod, tangents = self.scene, self.scene.rod, point.tangents
-        forces = point.end_force[:, None] + self.forces_beyond
-        tension = dot(forces, tangents)
-        strain, softness = self._strain(point)
-        lengths = weights * (1 + strain)
-        across = components(bases, forces)
-        gradient -= lengths[None] * across
-        identity = jnp.eye(bases.shape[1], dtype=energy.dtype)[..., None]
-        diagonal += (lengths * tension)[None, None] * identity
-        diagonal -= (weights * softness)[None, None] * outer(across, across)
-        energy += jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
-        if self.force_spread is not None:
-            spread = _times(self.force_spread, tangents)
-            along = softness * dot(spread, tangents)
-            of_bases = short_sum(self.force_spread[:, :, None] * bases[None], axis=1)
-            energy -= jnp.sum(along) / 2
-            gradient -= softness[None] * components(bases, spread)
-            diagonal += along[None, None] * identity
-            diagonal -= softness[None, None] * short_sum(bases[:, :, None] * of_bases[:, None], axis=0)
-        if isinstance(scene.start, Held) and isinstance(scene.end, Held):
-            span = scene.end.position - scene.start.position
-            energy += jnp.sum(point.end_force * span)
-            lacking = span - tangents @ lengths
-            directions, along = jnp.swapaxes(bases, 0, 1), tangents
-            if self.axes is not None:
-                lacking = lacking @ self.axes
-                directions = short_sum(directions[:, None] * self.axes.T[None, :, :, None], axis=2)
-                along = self.axes.T @ tangents
-            border = -lengths[None, None] * directions - (weights * softness)[None, None] * outer(across, along)
-            compliance = ((weights * softness)[None] * along) @ along.T
-            return Stretched(energy, gradient, diagonal, lengths, border, lacking, compliance)
-        return Stretched(energy, gradient, diagonal, lengths, None, None, None)
+    ) -> ByCells:
+        """With what stretch and the forces through the cells add to the derivatives of bending and torsion."""
+        rod, field = self.scene.rod, self.field
+        weights = field.side_weights
+        forces, tension = self.forces_and_tensions(point)
+        strain, softness = jax.jvp(
+            lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
+        )
+        lengths, softness = weights * (1 + strain), weights * softness
+        along, directions = field.of_sides(point.tangents), field.of_sides(bases)
+        across = short_sum(directions * forces[:, None], axis=0)
+        gradient -= field.of_points(lengths[None] * across)
+        identity = jnp.eye(bases.shape[1], dtype=gradient.dtype)[..., None]
+        diagonal += field.of_points(lengths * tension)[None, None] * identity
+        diagonal -= field.of_points(softness[None, None] * across[:, None] * across[None])
+        by_force = -lengths[None, None] * jnp.swapaxes(directions, 0, 1)
+        by_force -= softness[None, None] * across[:, None] * along[None]
+        energy = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
+        return ByCells(energy, gradient, diagonal, lengths, along, softness, by_force)
 
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
@@ -341,42 +343,39 @@ class MixedForm(Form):
         return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
 
     def under_force(
-        self, point: MixedPoint, bases: Float[Array, "3 b n"], rotation: Float[Array, "b n"], change: Float[Array, "3"]
+        self,
+        point: MixedPoint,
+        bases: Float[Array, "3 b m"],
+        rotation: Float[Array, "b m"],
+        change: Float[Array, "3 parts"],
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        """With another end force: what the rod lacks of its span and the rate of that as the tangents begin to turn;
-        by how much L differs, and by how much the rate of L does.
-        """
-        start, end = self.scene.start, self.scene.end
-        if not (isinstance(start, Held) and isinstance(end, Held)):
-            nothing = jnp.zeros(0, change.dtype)
-            return nothing, nothing, jnp.zeros_like(change[0]), jnp.zeros_like(change[0])
-        span = end.position - start.position
-        weights = self.field.weights
+        rod, weights, layout = self.scene.rod, self.field.side_weights, self.layout
+        assert isinstance(layout, SpanForces)
+        zero = jnp.zeros((), change.dtype)
+        if not layout.size:
+            return zero[None][:0], zero[None][:0], zero, zero
+        spans = self.spans
 
-        def parts(tangents: Float[Array, "3 n"], force: Float[Array, "3"]) -> tuple[Array, Array]:
-            tension = dot(force[:, None] + self.forces_beyond, tangents)
-            strain = axial_strain_under(self.scene.rod, tension)
-            stretching = weights * (density(self.scene.rod, axial_strain=strain) - tension * (1 + strain))
-            return jnp.sum(stretching) + force @ span, span - tangents @ (weights * (1 + strain))
+        def parts(tangents: Float[Array, "3 m"], force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
+            _, tension = self.forces_and_tensions(MixedPoint(tangents, force, point.total_twist))
+            strain = axial_strain_under(rod, tension)
+            stretching = weights * (density(rod, axial_strain=strain) - tension * (1 + strain))
+            ways = short_sum((weights * (1 + strain))[None] * self.field.of_sides(tangents), axis=1)
+            return jnp.sum(stretching) + jnp.sum(force * spans), layout.components(spans - layout.sums(ways))
 
         turning = short_sum(bases * rotation[None], axis=1)
 
-        def rates(force: Float[Array, "3"]):
+        def rates(force: Float[Array, "3 parts"]):
             return jax.jvp(lambda tangents: parts(tangents, force), (point.tangents,), (turning,))
 
         (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
         (before, _), (rate_before, _) = rates(point.end_force)
-        return self.of_force(closure), self.of_force(closure_rate), energy - before, rate - rate_before
+        return closure, closure_rate, energy - before, rate - rate_before
 
     def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
-        """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""
-        largest = jnp.max(jnp.abs(point.end_force[:, None] + self.forces_beyond))
+        largest = jnp.max(jnp.abs(self.forces(point)))
         eps = jnp.finfo(largest.dtype).eps
         return FLOOR_SAFETY * eps * (4.0 * largest + 4.0 / self.field.finest**2)
-
-
-def _times(matrices: Float[Array, "3 3 m"], vectors: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
-    return short_sum(matrices * vectors[None], axis=1)
 
 
 def _with_derivatives(

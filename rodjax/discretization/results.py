@@ -46,7 +46,7 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
     torque = torque_at(rod, point.total_twist)
-    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    section_forces = form.forces(point)[:, ::2]
     by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
     moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
     curvatures = curvature_under(rod, moments)
@@ -80,9 +80,9 @@ def positions_between(
     assert isinstance(field, HermiteElements)
     rod, tangents = scene.rod, point.tangents
     torque = torque_at(rod, point.total_twist)
-    section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+    section_forces = form.forces(point)[:, ::2]
     by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
-    forces = form.with_end_force(point, field.forces_in_elements(scene))
+    forces = form.forces(point)
     weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
     cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
 
@@ -119,7 +119,7 @@ def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
     moments = [jnp.zeros(3, tangents.dtype)] * len(scene.clips)
     directed = held_nodes(scene, field.clip_nodes)
     if isinstance(field, HermiteElements):
-        section_forces = form.with_end_force(point, field.forces_in_elements(scene)[:, ::2])
+        section_forces = form.forces(point)[:, ::2]
         by_ends = field.by_end_tangents(scene, tangents, section_forces, torque_at(scene.rod, point.total_twist))
         for k, node, _ in directed:
             moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])

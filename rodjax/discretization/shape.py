@@ -15,7 +15,7 @@ class Shape(eqx.Module):
     nodes: eqx.AbstractVar[Float[Array, "n+1 3"]]
 
     @abstractmethod
-    def point(self, end_force: Float[Array, "3"], total_twist: Float[Array, ""]) -> Any:
+    def point(self, end_force: Float[Array, "3 parts"], total_twist: Float[Array, ""]) -> Any:
         """The unknowns of its form, with these."""
 
     @abstractmethod

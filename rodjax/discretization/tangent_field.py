@@ -98,28 +98,10 @@ class TangentField(Protocol):
         """Sums over the cells at each point."""
         ...
 
-    def side_forces(self, scene: Scene) -> Float[Array, "3 p n"]:
-        """As `forces_beyond`, on the side of a cell."""
-        ...
-
-    def ways(self, slopes: Float[Array, "3 m"]) -> Float[Array, "n 3"]:
-        """From node to node, of a curve with these derivatives by arclength at the points."""
-        ...
-
-    def forces_beyond(self, scene: Scene) -> Float[Array, "3 m"]:
-        """What the loads beyond each point exert on it; where the start is free, less all of them."""
-        ...
-
-    def force_spread(self, scene: Scene) -> Float[Array, "3 3 m"] | None:
-        """Where a point force acts at a point: products of the differences from `forces_beyond` on both sides, by the
-        length of rod on each; `None` where there are none.
+    def loads_beyond(self, scene: Scene) -> Float[Array, "3 p n"]:
+        """What the loads beyond the points of each cell exert, on its side of a point force at a node; where the start
+        is free, less all of them.
         """
-        ...
-
-    def ways_of_spread(
-        self, scene: Scene, tangents: Float[Array, "3 m"], softness: Float[Array, "m"]
-    ) -> Float[Array, "n 3"]:
-        """By how much the ways between nodes differ where the tension on their side of a point does."""
         ...
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 m"], lengths: Float[Array, "m"]) -> Float[Array, ""]:

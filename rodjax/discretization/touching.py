@@ -22,8 +22,8 @@ from rodjax.along import Value, largest_beside, value_at
 from rodjax.chain import ChainSystem
 from rodjax.discretization.form import FLOOR_SAFETY, Linearization
 from rodjax.discretization.hermite import HermiteElements
-from rodjax.discretization.mixed import MixedPoint
-from rodjax.discretization.parted import PartedForm
+from rodjax.discretization.layout import CellForces
+from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import cubic
@@ -49,7 +49,7 @@ MOST_LOOKS = 24
 BETWEEN = 7
 
 
-class TouchingForm(PartedForm):
+class TouchingForm(MixedForm):
     """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element.
 
     `softening`: by how much the contacts are softer than those of a result, 1 or less; `is_cautious`: an obstacle that
@@ -62,14 +62,13 @@ class TouchingForm(PartedForm):
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "TouchingForm":
-        side_forces = field.side_forces(scene)
+        loads_beyond = field.loads_beyond(scene)
         return cls(
             scene=scene,
             field=field,
-            forces_beyond=field.of_points(field.side_weights[None] * side_forces) / field.weights[None],
-            force_spread=None,
-            side_forces=side_forces,
-            softening=jnp.ones((), side_forces.dtype),
+            layout=CellForces(len(field.s) - 1),
+            loads_beyond=loads_beyond,
+            softening=jnp.ones((), loads_beyond.dtype),
         )
 
     def softened(self, softening: Float[Array, ""]) -> "TouchingForm":
@@ -78,19 +77,6 @@ class TouchingForm(PartedForm):
 
     # --- what is unknown ---------------------------------------------------------------------------------------------
 
-    def of_cells(self, end_force: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        return end_force
-
-    @property
-    def _closures(self) -> int:
-        return 3 * (len(self.field.s) - 1)
-
-    def of_force(self, vector: Float[Array, "3 n"]) -> Float[Array, "3n"]:
-        return vector.T.reshape(-1)
-
-    def force_change(self, closure: Float[Array, "3n"]) -> Float[Array, "3 n"]:
-        return closure.reshape(-1, 3).T
-
     def multipliers_turned(
         self, point: MixedPoint, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
@@ -98,11 +84,8 @@ class TouchingForm(PartedForm):
         places, _ = self.held_places
         arms = jnp.where(self.is_held[:, None], 0.0, positions - places[:, 0][None])
         by_node = jnp.cross(axis[None], arms).reshape(-1)
-        of_force = self.of_force(jnp.cross(axis[:, None], point.end_force, axis=0))
+        of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
-
-    def along_spans(self, ways: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        return ways
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return super().is_closed(self.closure(closure), tolerance)
@@ -151,7 +134,7 @@ class TouchingForm(PartedForm):
         forces = [load.force for load in scene.point_forces]
         forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
         forces += [] if scene.gravity is None else [scene.gravity]
-        load = jnp.asarray(BENDING, self.side_forces.dtype)
+        load = jnp.asarray(BENDING, self.loads_beyond.dtype)
         for force in forces:
             load += jnp.sqrt(1.0 + jnp.sum(force**2))
         radius = self.radius
@@ -290,7 +273,7 @@ class TouchingForm(PartedForm):
             border,
             compliance,
             cells.by_force,
-            jnp.einsum("ipn,jpn->ijn", cells.softness[None] * cells.along, cells.along),
+            cells.compliance,
             second,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
@@ -316,12 +299,12 @@ class TouchingForm(PartedForm):
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
         """The energy of stretch, loads, contacts and of what closes the spans; and the gaps."""
         weights = self.field.side_weights
-        _, tension = self._by_sides(tangents, end_force)
+        _, tension = self.forces_and_tensions(MixedPoint(tangents, end_force, jnp.zeros((), end_force.dtype)))
         strain = axial_strain_under(self.scene.rod, tension)
         ways = (weights * (1 + strain))[None] * self.field.of_sides(tangents)
         edges = jnp.sum(ways, axis=1).T
         gaps = self._gaps(edges)
-        energy = jnp.sum(weights * density(self.scene.rod, axial_strain=strain)) - jnp.sum(self.side_forces * ways)
+        energy = jnp.sum(weights * density(self.scene.rod, axial_strain=strain)) - jnp.sum(self.loads_beyond * ways)
         return energy + self._contact_energy(self.positions(edges)) + jnp.sum(end_force * gaps.T), gaps
 
     def under_force(
@@ -337,7 +320,7 @@ class TouchingForm(PartedForm):
         )
         before, _ = self._stretching(point.tangents, point.end_force)
         # Of the gradient by rotations, which has the forces as they are.
-        forces, tension = self._by_sides(point.tangents, point.end_force)
+        forces, tension = self.forces_and_tensions(point)
         lengths = self.field.side_weights * (1 + axial_strain_under(self.scene.rod, tension))
         counted = -jnp.sum(lengths * short_sum(forces * self.field.of_sides(turning), axis=0))
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted

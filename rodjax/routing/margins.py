@@ -346,7 +346,9 @@ def _nearest_in_pieces(
         return low, high, f, rate, ahead, rate_ahead
 
     zero, one = jnp.zeros_like(h), jnp.ones_like(h)
-    f = jax.lax.fori_loop(0, NEARER, closer, (zero, one, zero, falls, one, rises))[4]
+    _, _, before, rate_before, f, rate = jax.lax.fori_loop(0, NEARER, closer, (zero, one, zero, falls, one, rises))
+    # Where the derivative is a rounding of 0 the last step may lead anywhere in the bracket.
+    f = jnp.where(jnp.abs(rate) <= jnp.abs(rate_before), f, before)
     lowest = body.distance(position_at(a + f * h)) - radii[0] - f * (radii[1] - radii[0])
     f = jnp.where(has_least, f, jnp.where(ends[1] < ends[0], 1.0, 0.0))
     return f, jnp.where(has_least, lowest, jnp.minimum(*ends))

@@ -83,7 +83,7 @@ class NewtonState(eqx.Module):
     residual: Float[Array, ""]
     shift: Float[Array, ""]
     rotation: Float[Array, "b n"]
-    force_change: Float[Array, "3 *spans"]
+    force_change: Float[Array, "3 parts"]
     # The augmented Lagrangian at the point with the new force, its slope along the step, and the fraction of it to try.
     weight: Float[Array, ""]
     merit: Float[Array, ""]
@@ -193,7 +193,7 @@ def _advanced(
     else:
         again = is_pushed = jnp.array(False)
         is_sought = may_go_on = jnp.array(True)
-    force_change = form.force_change(form.closure(multipliers))
+    force_change = form.layout.forces(form.closure(multipliers))
     largest = jnp.sqrt(jnp.max(dot(rotation, rotation)))
     step = jnp.minimum(1.0, solver.max_rotation / largest)
     if _descends(form, find):

@@ -350,8 +350,6 @@ def checked_options(
             raise ValueError("clips must not be sliding for a rod, loads or clips that need frames along the rod")
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
-        if planar:
-            raise ValueError("planar must be False for a scene with clips")
     if scene.obstacles:
         if discretization == "finite_difference":
             raise ValueError("discretization must be 'hermite' for a scene with obstacles")

@@ -254,7 +254,7 @@ def _eliminate(
     """
     b = len(diagonal)
     rows = jnp.concatenate([diagonal, right_sides], axis=1)
-    least = LEAST_PIVOT * sum(jnp.mean(jnp.abs(diagonal[k, k])) for k in range(b)) / b
+    least = LEAST_PIVOT / b * jnp.mean(jnp.abs(jnp.trace(diagonal)))
     levels, eliminated = [], []
     negative = jnp.zeros((), int)
     while rows.shape[-1] > 1:

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import is_known
 from rodjax.scene import Scene, dead_end_moment
-from rodjax.supports import Clamp, Directed, Free, Held
+from rodjax.supports import Clamp, Clip, Directed, Free, Held
 
 # Directions count as lying in the plane up to this part of their length: six digits, as typed.
 TOLERANCE = 1e-5
@@ -93,8 +93,9 @@ def _asymmetry(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
 def _directions(scene: Scene) -> Float[Array, "k 3"]:
     """Unit vectors that span the plane, zero where a scene happens to give none."""
     vectors = [end.tangent for end in (scene.start, scene.end) if isinstance(end, Directed)]
-    if isinstance(scene.start, Held) and isinstance(scene.end, Held):
-        vectors.append(scene.end.position - scene.start.position)
+    vectors += [clip.tangent for clip in scene.clips if clip.tangent is not None]
+    places = [held.position for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Held | Clip)]
+    vectors += [place - places[0] for place in places[1:]]
     if scene.gravity is not None:
         vectors.append(scene.gravity)
     vectors += [load.force for load in scene.point_forces]

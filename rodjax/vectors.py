@@ -22,3 +22,15 @@ def root(x: Float[Array, "*k"]) -> Float[Array, "*k"]:
     """Square root, with the derivative 0 at 0."""
     is_zero = x == 0
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, x)))
+
+
+def diagonal(x: Float[Array, "*k"]) -> Float[Array, "3 3 *k"]:
+    """The identity times each number."""
+    return jnp.eye(3, dtype=x.dtype).reshape(3, 3, *[1] * x.ndim) * x[None, None]
+
+
+def skew(x: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
+    """The matrices of the cross product with x from the left."""
+    nothing = jnp.zeros_like(x[0])
+    rows = [[nothing, -x[2], x[1]], [x[2], nothing, -x[0]], [-x[1], x[0], nothing]]
+    return jnp.stack([jnp.stack(row) for row in rows])

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
-from rodjax import Clamp, Free, Scene, frame, problems
+from rodjax import Clamp, Clip, Free, Rod, Scene, frame, problems
 
 CLAMP = Clamp((0, 0, 0), frame((1, 0, 0)))
 
@@ -122,3 +122,23 @@ def test_nonlinear_cg_is_refused():
 
 def test_documentation_says_that_stability_is_not_examined():
     assert "dead moment" in rj.Equilibrium.__doc__.split("`stable`")[1].split("`iterations`")[0]
+
+
+def test_clips_and_a_clamp_bear_a_moment_on_the_end():
+    """In balance as a whole, and the same by tangents and by frames."""
+    moment = np.array([0.4, 1.0, 0.5])
+    clips = [Clip(0.3, (0.28, 0.0, 0.02)), Clip(0.6, (0.55, 0.1, 0.05), tangent=(1.0, 0.2, 0.0))]
+    found = []
+    for EI in (1.0, (1.0, 1.0)):
+        scene = Scene(Rod(1.0, EI, 0.7, 1e4), CLAMP, Free(force=(0.0, 2.0, -3.0), moment=moment), clips=clips)
+        result = rj.solve(scene, segments=10)
+        assert result.converged
+        forces, moments = np.asarray(result.clip_forces), np.asarray(result.clip_moments)
+        # The residual of 1e-8, summed over the rod.
+        np.testing.assert_allclose(-result.start_force + np.sum(forces, axis=0) + scene.end.force, 0.0, atol=1e-7)
+        about_start = moment + np.cross(result.nodes[-1], scene.end.force) + np.sum(moments, axis=0)
+        about_start += np.sum(np.cross([clip.position for clip in clips], forces), axis=0)
+        np.testing.assert_allclose(about_start, result.start_moment, atol=1e-6)
+        found.append(result)
+    # Each as far from the continuum as its estimate says.
+    np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1.5 * sum(float(r.error_estimate) for r in found))

@@ -1,5 +1,7 @@
 """planar=True: the solution in space, stability against leaving the plane, what is refused."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
-from rodjax import Clamp, Free, Pin, PointForce, Scene, frame, problems
+from rodjax import Clamp, Clip, Free, Pin, PointForce, Rod, Scene, frame, problems
 from rodjax.path import stack_scenes
 from rodjax.plane import check_planar, plane
 
@@ -67,6 +69,22 @@ def test_the_plane_may_stand_anywhere(name, turn, in_space):
         jnp.column_stack([axes, normal]).T @ jnp.column_stack([axes, normal]), np.eye(3), atol=1e-15
     )
     np.testing.assert_allclose(planar.nodes @ normal, 0.0, atol=1e-14)
+
+
+def test_a_rod_in_clips_may_be_sought_in_its_plane():
+    clamp, clip = Clamp((0, 0, 0), frame((1, 0, 0))), Clip(0.4, (0.35, 0.0, 0.05), tangent=(1.0, 0.0, 0.2))
+    scene = Scene(
+        Rod(1.0, 1.0, 0.7, 1e4, mass_per_length=0.5), SCENES["omega"].start, Free(), (0, 0, -9.81), clips=[clip]
+    )
+    planar, space = (rj.solve(scene, segments=8, planar=planar) for planar in (True, False))
+    assert planar.stable
+    # The residual of 1e-8 of both.
+    np.testing.assert_allclose(planar.nodes, space.nodes, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(planar.clip_forces, space.clip_forces, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(planar.nodes[:, 1], 0.0, atol=1e-14)
+    aside = dataclasses.replace(clip, position=jnp.array([0.35, 0.1, 0.05]))
+    with pytest.raises(ValueError, match="one of them leaves it by"):
+        rj.solve(Scene(scene.rod, scene.start, Free(), clips=[aside]), segments=8, planar=True)
 
 
 @pytest.mark.parametrize("planar", [False, True])

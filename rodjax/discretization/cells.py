@@ -12,25 +12,24 @@ Arrays have the components first, then the frames of a cell or its strain points
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.along import Steps, stiffness_at
+from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
 from rodjax.energy import Sections
 from rodjax.linalg import short_sum
 from rodjax.rod import Rod
-from rodjax.rotations import Quaternion, Vector, inner, inverse, outer, product, unit
+from rodjax.rotations import inverse, product, unit
 from rodjax.scene import Scene
-from rodjax.staging import staged
 
-# The frames of a cell, each component an array along the cells.
-Frames = tuple[Quaternion, ...]
 # The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
 REFERENCE = 1
 
@@ -83,8 +82,15 @@ class Cells(Protocol):
         """Sums over the cells at each frame."""
         ...
 
-    def strains(self, frames: Frames) -> tuple[Vector, ...]:
-        """Curvature along d1 and d2, and twist, at the strain points."""
+    # The components of what is `seen` on which strains depend.
+    coordinates: ClassVar[slice]
+
+    def seen(self, quaternions: Float[Array, "4 p n"]) -> Float[Array, "4 p-1 n"]:
+        """The other frames of each cell seen from that of its reference."""
+        ...
+
+    def strains(self, seen: Float[Array, "c p-1 n"]) -> "Strains":
+        """By the coordinates of each other frame."""
         ...
 
     def ways(self, by_strain: Float[Array, "3 p n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
@@ -112,10 +118,62 @@ class Cells(Protocol):
         ...
 
 
+class Strains(Protocol):
+    """Curvature along d1 and d2, and twist, at the strain points."""
+
+    @property
+    def values(self) -> Float[Array, "3 p n"]: ...
+
+    @property
+    def jacobian(self) -> Float[Array, "3 p c q n"]:
+        """By the coordinates of the q other frames: [i, k, j, e] of component i at point k by j of frame e."""
+        ...
+
+    def curving(self, moments: Float[Array, "3 p n"]) -> Float[Array, "q c q c n"]:
+        """Second derivatives by the coordinates, times moments at the points: [e, i, f, j]."""
+        ...
+
+
+class JointStrains(NamedTuple):
+    """Of the rotation between two frames, a swing by the angle a and half of a spin before and after it, 2 tan(a/2) and
+    the spin: alone the curvature of `strain.squared_curvature_between`, and a twist that adds up.
+    """
+
+    seen: Float[Array, "4 1 n"]
+    spacing: Float[Array, "n"]
+
+    @property
+    def values(self) -> Float[Array, "3 2 n"]:
+        return self._at(self.seen[:, 0])
+
+    def _at(self, seen: Float[Array, "4 n"]) -> Float[Array, "3 2 n"]:
+        w, x, y, z = seen
+        swing = -2 / (jnp.sqrt(w * w + z * z) * self.spacing)
+        strain = jnp.stack([swing * x, swing * y, -2 * jnp.arctan2(z, w) / self.spacing])
+        return jnp.stack([strain, strain], axis=1)
+
+    @property
+    def jacobian(self) -> Float[Array, "3 2 4 1 n"]:
+        return jnp.moveaxis(self._by_each(self._at), 0, 2)[:, :, :, None]
+
+    def curving(self, moments: Float[Array, "3 2 n"]) -> Float[Array, "1 4 1 4 n"]:
+        def slopes(seen: Float[Array, "4 n"]) -> Float[Array, "4 n"]:
+            return jax.grad(lambda seen: jnp.sum(moments * self._at(seen)))(seen)
+
+        return self._by_each(slopes)[None, :, None]
+
+    def _by_each(self, function: Callable[[Float[Array, "4 n"]], Array]) -> Array:
+        """The derivatives by each coordinate, changed in all cells at once."""
+        here = self.seen[:, 0]
+        directions = jnp.eye(4, dtype=here.dtype)[..., None] * jnp.ones_like(here)[None]
+        return jax.vmap(lambda direction: jax.jvp(function, (here,), (direction,))[1])(directions)
+
+
 class JointCells(eqx.Module):
     """n equal edges, n + 2 frames: of the start, of the edges and of the end; cells are the joints between them."""
 
     s: Float[Array, "n+1"]
+    coordinates: ClassVar[slice] = slice(0, 4)
 
     @property
     def clip_nodes(self) -> None:
@@ -166,15 +224,11 @@ class JointCells(eqx.Module):
         before, after = by_cell[..., 0, :], by_cell[..., 1, :]
         return jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
 
-    def strains(self, frames: Frames) -> tuple[Vector, ...]:
-        """Of the rotation between two frames, a swing by the angle a and half of a spin before and after it, 2 tan(a/2)
-        and the spin: alone the curvature of `strain.squared_curvature_between`, and a twist that adds up.
-        """
-        first, last = frames
-        w, x, y, z = staged(product(inverse(first), last))
-        swing = 2 / (jnp.sqrt(w * w + z * z) * self.spacing)
-        strain = swing * x, swing * y, 2 * jnp.arctan2(z, w) / self.spacing
-        return strain, strain
+    def seen(self, quaternions: Float[Array, "4 2 n"]) -> Float[Array, "4 1 n"]:
+        return product(inverse(quaternions[:, 1]), quaternions[:, 0])[:, None]
+
+    def strains(self, seen: Float[Array, "4 1 n"]) -> "JointStrains":
+        return JointStrains(seen, self.spacing)
 
     def ways(self, by_strain: Float[Array, "3 2 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
         return by_strain[:, 1, :-1] + by_strain[:, 0, 1:] + rest[:, :-1]
@@ -221,6 +275,7 @@ class ElementCells(eqx.Module):
 
     s: Float[Array, "n+1"]
     clip_nodes: Int[Array, "clips"] | None = None
+    coordinates: ClassVar[slice] = slice(1, 4)  # of less than half a turn
 
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "ElementCells":
@@ -263,17 +318,13 @@ class ElementCells(eqx.Module):
     def assembled(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
         return assembled(*(by_cell[..., k, :] for k in range(3)))
 
-    def strains(self, frames: Frames) -> tuple[Vector, ...]:
-        middle = inverse(frames[1])
-        relative = staged((product(middle, frames[0]), product(middle, frames[2])))
-        first, rate_of_first = _rotation_vector(relative[0])
-        last, rate_of_last = _rotation_vector(relative[1])
-        change = _combined(1 / self.h, last, -1 / self.h, first)
-        return (
-            rate_of_first(_combined(-3 / self.h, first, -1 / self.h, last)),
-            change,
-            rate_of_last(_combined(3 / self.h, last, 1 / self.h, first)),
-        )
+    def seen(self, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "4 2 n"]:
+        middle = inverse(quaternions[:, 1])
+        seen = jnp.stack([product(middle, quaternions[:, 0]), product(middle, quaternions[:, 2])], axis=1)
+        return jnp.where(seen[:1] < 0, -seen, seen)
+
+    def strains(self, seen: Float[Array, "3 2 n"]) -> ElementStrains:
+        return ElementStrains.of(seen, self.h)
 
     def ways(self, by_strain: Float[Array, "3 3 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return short_sum(by_strain, axis=1) + rest
@@ -303,33 +354,6 @@ class ElementCells(eqx.Module):
         diagonal = self.assembled(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))
         between = jnp.stack([blocks[1, :, 0], blocks[2, :, 1]], axis=-1)
         return diagonal, between.reshape(*between.shape[:2], -1), blocks[2, :, 0]
-
-
-def _combined(a: Array, u: Vector, b: Array, v: Vector) -> Vector:
-    """a u + b v."""
-    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
-
-
-def _rotation_vector(q: Quaternion) -> tuple[Vector, Callable[[Vector], Vector]]:
-    """The rotation vector of a quaternion, and what makes of its rate of change that of turning, in the turned axes."""
-    sign = jnp.where(q[0] < 0, -1.0, 1.0).astype(q[0].dtype)
-    vector = sign * q[1], sign * q[2], sign * q[3]
-    x = inner(vector, vector)  # sin(t/2)^2
-    # t^2/(4 x) to fourth order in x, and growing to infinity at 1; and by how much it is above 1 - x, by x.
-    above = 1 / 3 + x * (8 / 45) + x**2 * (4 / 35) + x**3 * (128 / 1575) / (1 - x)
-    ratio, rest = 1 + x * above, 1 + above
-    size = 2 * jnp.sqrt(ratio)
-    v = size * vector[0], size * vector[1], size * vector[2]
-    by_sine = jnp.sqrt((1 - x) / ratio)  # sin(t)/t
-    second = rest / (4 * ratio**2 * (1 + by_sine))  # (t - sin t)/t^3
-    first = 1 / (2 * ratio)  # (1 - cos t)/t^2
-
-    def rate(change: Vector) -> Vector:
-        across = outer(v, change)
-        a, b, c = _combined(-first, across, second, outer(v, across))
-        return change[0] + a, change[1] + b, change[2] + c
-
-    return v, rate
 
 
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
@@ -363,14 +387,6 @@ def segments_for_jumps(scene: Scene) -> tuple[int, float] | None:
 SAME_PLACE = 1e-12
 
 
-def of_cells(cells: Cells, quaternions: Float[Array, "4 m"]) -> Frames:
-    return unstacked(cells.of_cells(quaternions))
-
-
-def unstacked(by_cell: Float[Array, "c p n"]) -> tuple[Any, ...]:
-    """By the frames of a cell, then by component."""
-    return tuple(tuple(jnp.unstack(by_cell[:, k])) for k in range(by_cell.shape[1]))
-
-
-def stacked(by_frame: tuple[Any, ...]) -> Float[Array, "c p n"]:
-    return jnp.stack([jnp.stack(components) for components in by_frame], axis=1)
+def strains_between(cells: Cells, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 p n"]:
+    """Curvature along d1 and d2, and twist, at the strain points of cells between these frames."""
+    return cells.strains(cells.seen(cells.of_cells(quaternions))[cells.coordinates]).values

@@ -6,9 +6,8 @@ The mixed form of `mixed`, with a frame R in the place of each tangent. An equil
 
 a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t.
 A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
-frames (`cells`): each cell is one function of its few rotations and F, which JAX differentiates twice, all at once. A
-clip holds a node, where it holds the direction of the rod two of the three rotations of the frame there, and where it
-holds the twist all three, as a clamp does at an end; clips need elements.
+frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
+rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
 
 Couples, follower loads and dead moments have no potential. Their virtual work enters the gradient; what follower forces
 change far away makes the matrix full, and the method Newton's own on all of it.
@@ -21,18 +20,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.discretization.cells import REFERENCE, Cells, Frames, of_cells, stacked, unstacked
+from rodjax.discretization.cell_derivatives import CellStates, derivatives, first_derivatives
+from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
 from rodjax.energy import Sections
-from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
+from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem, short_sum
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.rotations import Vector, columns, from_frame, inner, inverse, nearer, rotated, swung, tangent, turned, unit
+from rodjax.rotations import columns, from_frame, inverse, nearer, rotated, swung, tangent, turned, unit
 from rodjax.scene import Scene, has_potential, held_position
-from rodjax.staging import staged
 from rodjax.supports import Clamp, Directed, Free, Held
 from rodjax.vectors import components, dot
 
@@ -132,11 +131,7 @@ class FrameForm(Form):
         return FramePoint(point.quaternions, point.end_force, self.total_twist(point.quaternions))
 
     def total_twist(self, quaternions: Float[Array, "4 m"]) -> Float[Array, ""]:
-        return jnp.sum(self.field.lengths * self.strains(quaternions)[2])
-
-    def strains(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 p n"]:
-        """Curvature along d1 and d2, and twist, at the strain points."""
-        return stacked(self.field.strains(of_cells(self.field, quaternions)))
+        return jnp.sum(self.field.lengths * strains_between(self.field, quaternions)[2])
 
     def moved(
         self,
@@ -204,42 +199,36 @@ class FrameForm(Form):
         return sum(parts[1:], parts[0]) if parts else None
 
     def strained(self, point: FramePoint) -> Strained:
-        frames = of_cells(self.field, point.quaternions)
-        strains = stacked(self.field.strains(frames))
+        q, forces = point.quaternions, self.forces(point.quaternions, point.end_force)
+        return self._strained(self.field.of_cells(q), forces)
+
+    def _strained(self, quaternions: Float[Array, "4 p n"], forces: Float[Array, "3 p n"]) -> Strained:
+        """Of cells of these frames."""
+        field = self.field
+        strains = field.strains(field.seen(quaternions)[field.coordinates]).values
         if self.rest_strains is not None:
             strains -= self.rest_strains
-        tangents = stacked(tuple(tangent(frame) for frame in frames))
-        tension = dot(self.forces(point.quaternions, point.end_force), tangents)
+        tangents = tangent(quaternions)
+        tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
         return Strained(strains[:2], strains[2], axial, tension, tangents)
 
-    def _by_cells(self, frames: Frames, rotations: tuple[Vector, ...], forces: tuple[Vector, ...]) -> Float[Array, "n"]:
-        """L of each cell, as its frames turn under forces that stay."""
-        frames = staged(tuple(turned(frame, rotation) for frame, rotation in zip(frames, rotations, strict=True)))
-        lengths = self.field.lengths
-        terms = []
-        for k, strain in enumerate(staged(self.field.strains(frames))):
-            if self.rest_strains is not None:
-                strain = tuple(x - at_rest for x, at_rest in zip(strain, self.rest_strains[:, k], strict=True))
-            sections = self.sections.at(k)
-            tension = inner(forces[k], tangent(frames[k]))
-            axial = sections.axial_strain_under(tension, strain[:2], strain[2])
-            terms.append(lengths[k] * (sections.density(strain[:2], strain[2], axial) - tension * (1 + axial)))
-        if self.rest_ways is not None:
-            x, y, z = self.rest_ways
-            terms.append(-inner(forces[REFERENCE], rotated(frames[REFERENCE], (x, y, z))))
-        return sum(terms[1:], terms[0])
+    def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
+        forces = self.forces(quaternions, end_force)
+        of_cells = self.field.of_cells(quaternions)
+        return CellStates(self.field, self.sections, of_cells, forces, self.rest_strains, self.rest_ways)
 
     def edges(self, point: Any) -> Float[Array, "segments 3"]:
         """From node to node."""
-        here = self.strained(point)
-        ways = (self.field.lengths * (1 + here.axial))[None] * here.tangents
-        return self.field.ways(ways, self._rest_of_ways(point, jnp.zeros_like(ways[:, 0]))).T
+        of_cells = self.field.of_cells(point.quaternions)
+        ways = self._ways(self.strained(point))
+        return self.field.ways(ways, self._rest_of_ways(of_cells, jnp.zeros_like(ways[:, 0]))).T
 
-    def _rest_of_ways(self, point: FramePoint, nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        if self.rest_ways is None:
-            return nothing
-        return rotated(self.field.of_cells(point.quaternions)[:, REFERENCE], self.rest_ways)
+    def _ways(self, here: Strained) -> Float[Array, "3 p n"]:
+        return (self.field.lengths * (1 + here.axial))[None] * here.tangents
+
+    def _rest_of_ways(self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        return nothing if self.rest_ways is None else rotated(quaternions[:, REFERENCE], self.rest_ways)
 
     # --- energies ----------------------------------------------------------------------------------------------------
 
@@ -252,7 +241,7 @@ class FrameForm(Form):
         """The potential of dead forces, zero at the origin; other loads have none."""
         here = self.strained(point)
         work = jnp.sum((self.field.lengths * (1 + here.axial)) * dot(self.loads, here.tangents))
-        rest = self._rest_of_ways(point, jnp.zeros_like(self.loads[:, 0]))
+        rest = self._rest_of_ways(self.field.of_cells(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
 
@@ -278,10 +267,7 @@ class FrameForm(Form):
         self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]
     ) -> Float[Array, "3 p n"]:
         """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
-        frames = of_cells(self.field, quaternions)
-        forces = unstacked(self.forces(quaternions, end_force))
-        nothing = jax.tree.map(jnp.zeros_like, tuple(frame[1:] for frame in frames))
-        return stacked(jax.grad(lambda rotations: jnp.sum(self._by_cells(frames, rotations, forces)))(nothing))
+        return first_derivatives(self._cells(quaternions, end_force))
 
     def _unbalanced(
         self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]
@@ -305,47 +291,24 @@ class FrameForm(Form):
 
     def _with_cells(self, point: FramePoint) -> Linearization:
         """By two derivatives of each cell."""
-        field = self.field
-        frames = of_cells(field, point.quaternions)
-        loads = unstacked(self.loads)
-        p, n = field.lengths.shape
-        assert isinstance(self.layout, SpanForces)
-        closures = self.layout.size
-        of_cell = 3 if closures else 0
-
-        def energies(rotations: tuple[Vector, ...], force: Vector) -> Float[Array, ""]:
-            forces = tuple(tuple(f + load for f, load in zip(force, at, strict=True)) for at in loads)
-            return jnp.sum(self._by_cells(frames, rotations, forces))
-
-        nothing = jax.tree.map(jnp.zeros_like, tuple(frame[1:] for frame in frames))
-        x, y, z = (jnp.broadcast_to(component[0], (n,)) for component in self.through(point.end_force))
-        force = (x, y, z)
-        value = energies(nothing, force)
-        first, by_all = jax.linearize(jax.grad(energies, argnums=(0, 1) if closures else (0,)), nothing, force)
-        # Each rotation of each frame changed in all cells at once, then each component of the force.
-        unknowns = 3 * p + of_cell
-        directions = jnp.broadcast_to(jnp.eye(unknowns, dtype=value.dtype)[..., None], (unknowns, unknowns, n))
-        of_frames = tuple(tuple(directions[:, 3 * k + a] for a in range(3)) for k in range(p))
-        of_force = tuple(directions[:, 3 * p + a] if closures else jnp.zeros_like(directions[:, 0]) for a in range(3))
-        second = jax.vmap(by_all)(of_frames, of_force)
-        # [i, a, j, b]: by component a of the rotation of frame i, and b of frame j.
-        by_rotation = jnp.stack([jnp.stack(frame, axis=1) for frame in second[0]], axis=1)
-        blocks = by_rotation[: 3 * p].reshape(p, 3, p, 3, n)
-        diagonal, lower, across = field.couplings(blocks)
+        field, layout = self.field, self.layout
+        assert isinstance(layout, SpanForces)
+        cells = derivatives(self._cells(point.quaternions, point.end_force))
+        diagonal, lower, across = field.couplings(cells.second)
         free = self.is_free
-        gradient = field.assembled(stacked(first[0])) * free
+        gradient = field.assembled(cells.first) * free
         diagonal = diagonal * free[:, None] * free[None] + jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
         lower = lower * free[:, None, 1:] * free[None, :, :-1]
         if across is not None:
             across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
-        closure, border = jnp.zeros(0, value.dtype), jnp.zeros((3, 0, free.shape[1]), value.dtype)
-        compliance = jnp.zeros((0, 0), value.dtype)
-        if closures:
+        value, dtype = jnp.sum(cells.value), gradient.dtype
+        closure, border = jnp.zeros(0, dtype), jnp.zeros((3, 0, free.shape[1]), dtype)
+        compliance = jnp.zeros((0, 0), dtype)
+        if layout.size:
             value += jnp.sum(point.end_force * self.spans)
-            closure = self.layout.components(self.spans + self.layout.sums(jnp.stack(first[1])))
-            by_force = by_rotation[3 * p :].transpose(2, 0, 1, 3)  # [a, component of the force, i]
-            border = field.assembled(self.layout.columns(by_force)) * free[:, None]
-            compliance = -self.layout.compliance(jnp.stack([component[3 * p :] for component in second[1]]))
+            closure = layout.components(self.spans - layout.sums(cells.way))
+            border = field.assembled(layout.columns(cells.by_force)) * free[:, None]
+            compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
@@ -399,28 +362,25 @@ class FrameForm(Form):
         if not self.layout.size:
             nothing = jnp.zeros(0, change.dtype)
             return nothing, nothing, zero, zero
-        frames = of_cells(self.field, point.quaternions)
-        turning = unstacked(self.field.of_cells(rotation))
+        quaternions, turning = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
+        layout, spans = self.layout, self.spans
 
         def parts(amount: Float[Array, ""], force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
-            def value(force):
-                forces = unstacked(self.through(force) + self.loads)
-                cells = self._by_cells(frames, jax.tree.map(lambda x: amount * x, turning), forces)
-                return jnp.sum(cells) + jnp.sum(force * self.spans)
-
-            return jax.value_and_grad(value)(force)
+            frames, forces = turned(quaternions, amount * turning), self.through(force) + self.loads
+            here = self._strained(frames, forces)
+            densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
+            rest = self._rest_of_ways(frames, jnp.zeros_like(forces[:, 0]))
+            value = jnp.sum(self.field.lengths * (densities - here.tension * (1 + here.axial)))
+            value += jnp.sum(force * spans) - jnp.sum(forces[:, REFERENCE] * rest)
+            ways = short_sum(self._ways(here), axis=1) + rest
+            return value, layout.components(spans - layout.sums(ways))
 
         def rates(force: Float[Array, "3 parts"]):
             return jax.jvp(lambda amount: parts(amount, force), (zero,), (jnp.ones_like(zero),))
 
         (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
         (before, _), (rate_before, _) = rates(point.end_force)
-        return (
-            self.layout.components(closure),
-            self.layout.components(closure_rate),
-            energy - before,
-            rate - rate_before,
-        )
+        return closure, closure_rate, energy - before, rate - rate_before
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

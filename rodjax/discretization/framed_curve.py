@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
+from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.first_twist import FirstTwist, more_turns
 from rodjax.discretization.form import Form
@@ -119,7 +119,7 @@ def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], first: First
     if turns is None:
         if first.last is not None and scene.turns is None:
             return q
-        here = jnp.sum(cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2])
+        here = jnp.sum(cells.lengths * strains_between(cells, q)[2])
         principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
         turns = jnp.round((nearest_twist(principal, first.total_twist, scene.turns) - here) / (2 * jnp.pi))
     return jnp.where(turns != 0, spun(q, 2 * jnp.pi * turns * cells.places), q)
@@ -134,7 +134,7 @@ def _turned_to_supports(
     `reference`: those of the last equilibrium.
     """
     cells, places = form.field, form.field.places
-    had = cells.lengths * stacked(cells.strains(of_cells(cells, q)))[2]
+    had = cells.lengths * strains_between(cells, q)[2]
     is_carried = first.last is not None
     zero, last = jnp.zeros((), int), jnp.asarray(len(places) - 1)
     assert form.clip_nodes is not None
@@ -166,7 +166,7 @@ def _turned_to_supports(
     nodes = numbers[order] // 2
     cell = jnp.arange(had.shape[1])
     is_between = (cell[None] >= nodes[:-1, None]) & (cell[None] < nodes[1:, None])
-    here = stacked(cells.strains(of_cells(cells, q)))[2] * cells.lengths
+    here = strains_between(cells, q)[2] * cells.lengths
     more = (first.total_twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
     wanted = jnp.sum(jnp.where(is_between, (jnp.sum(had - here, axis=0) + more)[None], 0.0), axis=1)
     turns = jnp.concatenate([jnp.zeros_like(spins[:1]), jnp.cumsum(jnp.round(wanted / (2 * jnp.pi)))])

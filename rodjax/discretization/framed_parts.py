@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.along import Along
-from rodjax.discretization.cells import Cells, ElementCells, JointCells, of_cells, stacked
+from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.layout import SpanForces
 from rodjax.loads import DistributedForce
 from rodjax.rotations import inverse, rotated, tangent
@@ -39,7 +39,7 @@ def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, 
     is_joints = isinstance(cells, JointCells)
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
-    strains = stacked(cells.strains(of_cells(cells, frames)))
+    strains = strains_between(cells, frames)
     ways = cells.lengths[None] * tangent(cells.of_cells(frames))
     missing = jnp.diff(poses.positions[:, ::2], axis=1) - cells.ways(ways, jnp.zeros_like(ways[:, 0]))
     return strains, cells.rest_of(rotated(inverse(q[:, 1::2]), missing))

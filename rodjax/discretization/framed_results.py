@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.cells import ElementCells, JointCells
+from rodjax.discretization.cells import ElementCells, JointCells, strains_between
 from rodjax.discretization.error import (
     COUPLE_REACH,
     STEPS,
@@ -168,7 +168,7 @@ def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
         _strains_at_end(form, point, moments[:, k], force, k)
         for k, force in zip((0, -1), form.end_forces(point), strict=True)
     ]
-    here, strains = form.strained(point), form.strains(q)
+    here, strains = form.strained(point), strains_between(form.field, q)
 
     def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
         return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)

@@ -1,0 +1,215 @@
+"""Derivatives of cells of frames: by a few coordinates by autodiff, and of these by rotations by formulas.
+
+What a cell adds to the Lagrangian depends on its coordinates alone: how its frames are seen from the reference frame,
+and the tensions n . t of its strain points. By these JAX differentiates. How they change as frames turn by vectors d in
+their own axes are short formulas: of the quaternion p = (w, r) of a frame seen from the reference,
+
+    p' = p (0, d/2) - (0, d_ref/2) p,    and the second derivatives by one d: -p/4 times the identity;
+
+of a tension n . R e, with m = R^T n: m . (d x e), and (m e^T + e m^T)/2 - (m . e) I.
+
+Arrays have rows and columns first, then the cells.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.cells import REFERENCE, Cells, Strains
+from rodjax.energy import Sections
+from rodjax.linalg import short_sum
+from rodjax.rotations import columns, rotated
+from rodjax.staging import staged
+from rodjax.vectors import cross, diagonal, dot, skew
+
+
+class CellStates(NamedTuple):
+    """Of all cells: frames, the forces through them, and of the rod at rest strains and ways."""
+
+    field: Cells
+    sections: Sections
+    quaternions: Float[Array, "4 p n"]
+    forces: Float[Array, "3 p n"]
+    rest_strains: Float[Array, "3 p n"] | None
+    rest_ways: Float[Array, "3 n"] | None
+
+
+class CellDerivatives(NamedTuple):
+    """Of the Lagrangian of each cell, by the rotations of its frames in their own axes and by the force through it.
+
+    `second`: [i, a, j, b] by component a of frame i and b of frame j; `way`: the reverse of the derivative by the
+    force; `by_force`: [a, c, i] by component a of frame i and c of the force; `compliance`: of the way.
+    """
+
+    value: Float[Array, "n"]
+    first: Float[Array, "3 p n"]
+    second: Float[Array, "p 3 p 3 n"]
+    way: Float[Array, "3 n"]
+    by_force: Float[Array, "3 3 p n"]
+    compliance: Float[Array, "3 3 n"]
+
+
+class Coordinates(NamedTuple):
+    """`seen`: quaternions of the other frames from the reference; `directors`: [i, j] component i of director j;
+    `own_forces`: in the axes of the frames, the last of them the tensions.
+    """
+
+    seen: Float[Array, "4 p-1 n"]
+    directors: Float[Array, "3 3 p n"]
+    own_forces: Float[Array, "3 p n"]
+
+    @staticmethod
+    def of(cells: CellStates) -> "Coordinates":
+        directors = columns(cells.quaternions)
+        own_forces = short_sum(directors * cells.forces[:, None], axis=0)
+        return Coordinates(cells.field.seen(cells.quaternions), directors, own_forces)
+
+
+def density(cells: CellStates, strains: Float[Array, "4 p n"]) -> Float[Array, "p n"]:
+    """What a strain point adds to the Lagrangian, by the strains there and the tension."""
+    sections, (*curvature, twist, tension) = cells.sections, jnp.unstack(strains)
+    bent = (curvature[0], curvature[1])
+    axial = sections.axial_strain_under(tension, bent, twist)
+    return cells.field.lengths * (sections.density(bent, twist, axial) - tension * (1 + axial))
+
+
+def _at_points(cells: CellStates, here: Coordinates, strains: Strains) -> Float[Array, "4 p n"]:
+    values = strains.values
+    if cells.rest_strains is not None:
+        values -= cells.rest_strains
+    return jnp.concatenate([values, here.own_forces[2:]])
+
+
+def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
+    """By the rotations alone."""
+    here = Coordinates.of(cells)
+    strains = cells.field.strains(here.seen[cells.field.coordinates])
+    stresses = jax.grad(lambda values: jnp.sum(density(cells, values)))(_at_points(cells, here, strains))
+    return _by_rotations(cells, here, stresses, _strain_rows(cells.field, here, strains))
+
+
+def derivatives(cells: CellStates) -> CellDerivatives:
+    here = Coordinates.of(cells)
+    strains = cells.field.strains(here.seen[cells.field.coordinates])
+    values = _at_points(cells, here, strains)
+    stresses, by_all = jax.linearize(jax.grad(lambda values: jnp.sum(density(cells, values))), values)
+    # Each of the four changed at all points at once.
+    directions = jnp.eye(4, dtype=values.dtype)[:, :, None, None] * jnp.ones_like(values)[None]
+    stiffness = jax.vmap(by_all)(directions)
+
+    p, n = values.shape[1:]
+    turning = _coordinate_rows(cells.field, here)
+    of_strains = _strain_rows(cells.field, here, strains, turning)
+    # Rows: strains and tension at the points; columns: rotations of the frames, then the force.
+    forcing = jnp.zeros((4, p, 3, n), values.dtype).at[3].set(jnp.moveaxis(here.directors[:, 2], 1, 0))
+    rows = jnp.concatenate([of_strains, forcing], axis=2)
+    changed = short_sum(stiffness[:, :, :, None] * rows[:, None], axis=0)
+    quadratic = _products(rows.reshape(4 * p, -1, n), changed.reshape(4 * p, -1, n))
+    size = len(turning)
+    curving = strains.curving(stresses[:3]).reshape(size, size, n)
+    changed = short_sum(curving[:, :, None] * turning[None], axis=1)
+    second = quadratic[: 3 * p, : 3 * p] + _products(turning, changed)
+    slopes = short_sum((stresses[:3, :, None, None] * strains.jacobian).reshape(3 * p, -1, p - 1, n), axis=0)
+    second = second.reshape(p, 3, p, 3, n) + _curving(cells, here, slopes, stresses[3])
+    by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3])
+    way = -short_sum(stresses[3][:, None] * forcing[3], axis=0)
+    value = jnp.sum(density(cells, values), axis=0)
+    if cells.rest_ways is not None:
+        rest = rotated(cells.quaternions[:, REFERENCE], cells.rest_ways)
+        way += rest
+        value -= dot(cells.forces[:, REFERENCE], rest)
+    first = _by_rotations(cells, here, stresses, of_strains)
+    return CellDerivatives(value, first, second, way, by_force, -quadratic[3 * p :, 3 * p :])
+
+
+def _coordinate_rows(field: Cells, here: Coordinates) -> Float[Array, "v 3p n"]:
+    """The derivatives of the coordinates, of one other frame after the other, by the rotations, frame by frame."""
+    _, p, n = here.own_forces.shape
+    nothing = jnp.zeros((4, 3, n), here.seen.dtype)
+    rows = []
+    for k, other in enumerate(j for j in range(p) if j != REFERENCE):
+        w, r = here.seen[0, k], here.seen[1:, k]
+        straight, across = diagonal(w), skew(r)
+        blocks = [nothing] * p
+        blocks[other] = jnp.concatenate([-r[None], straight + across]) / 2
+        blocks[REFERENCE] = jnp.concatenate([r[None], across - straight]) / 2
+        rows.append(jnp.concatenate(blocks, axis=1)[field.coordinates])
+    return jnp.concatenate(rows)
+
+
+def _strain_rows(
+    field: Cells, here: Coordinates, strains: Strains, turning: Float[Array, "v 3p n"] | None = None
+) -> Float[Array, "4 p 3p n"]:
+    """The derivatives of strains and tensions at the points by the rotations."""
+    turning = _coordinate_rows(field, here) if turning is None else turning
+    _, p, n = here.own_forces.shape
+    by_coordinates = jnp.swapaxes(strains.jacobian, 2, 3).reshape(3, p, len(turning), n)
+    of_strains = short_sum(by_coordinates[:, :, :, None] * turning[None, None], axis=2)
+    forces = here.own_forces
+    by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)  # [k, a]
+    own = jnp.eye(p, dtype=forces.dtype)[:, :, None, None] * by_own[:, None]
+    return jnp.concatenate([of_strains, own.reshape(1, p, 3 * p, n)])
+
+
+def _by_rotations(
+    cells: CellStates, here: Coordinates, stresses: Float[Array, "4 p n"], rows: Float[Array, "4 p 3p n"]
+) -> Float[Array, "3 p n"]:
+    _, p, n = stresses.shape
+    first = short_sum((stresses[:, :, None] * rows).reshape(4 * p, 3 * p, n), axis=0)
+    first = jnp.moveaxis(first.reshape(p, 3, n), 0, 1)
+    if cells.rest_ways is None:
+        return first
+    return first.at[:, REFERENCE].add(-cross(cells.rest_ways, here.own_forces[:, REFERENCE]))
+
+
+def _curving(
+    cells: CellStates, here: Coordinates, slopes: Float[Array, "c q n"], by_tension: Float[Array, "p n"]
+) -> Float[Array, "p 3 p 3 n"]:
+    """The second derivatives of coordinates and tensions by the rotations, times those of the value by them."""
+    _, p, n = here.own_forces.shape
+    blocks = [[jnp.zeros((3, 3, n), slopes.dtype)] * p for _ in range(p)]
+    tangents = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], slopes.dtype)[:, None, None], here.own_forces.shape)
+    of_tensions = by_tension[None, None] * _of_turned(here.own_forces, tangents)
+    for k in range(p):
+        blocks[k][k] = of_tensions[:, :, k]
+    if cells.rest_ways is not None:
+        blocks[REFERENCE][REFERENCE] -= _of_turned(here.own_forces[:, REFERENCE], cells.rest_ways)
+    first, _, _ = cells.field.coordinates.indices(4)
+    (w, r), by_r = (here.seen[0], here.seen[1:]), slopes[1 - first :]
+    by_w = jnp.zeros_like(w) if first else slopes[0]
+    pure = diagonal(-(by_w * w + dot(by_r, r)) / 4)
+    both = r[:, None] * by_r[None]
+    mixed = both + jnp.swapaxes(both, 0, 1) + diagonal(by_w * w - dot(by_r, r)) + skew(w[None] * by_r + by_w[None] * r)
+    mixed /= 4
+    for k, other in enumerate(j for j in range(p) if j != REFERENCE):
+        blocks[other][other] += pure[:, :, k]
+        blocks[REFERENCE][REFERENCE] += pure[:, :, k]
+        blocks[REFERENCE][other] = mixed[:, :, k]
+        blocks[other][REFERENCE] = jnp.swapaxes(mixed[:, :, k], 0, 1)
+    return jnp.stack([jnp.stack(row, axis=1) for row in blocks])
+
+
+def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "p n"]) -> Float[Array, "3 3 p n"]:
+    """What the rotations change the direction of the ways by: derivatives by the tensions, times those of tangents."""
+    by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])
+    tilting = slopes[None, None] * by_turns
+    if cells.rest_ways is None:
+        return tilting
+    directors = here.directors[:, :, REFERENCE]
+    # [c, a]: the directors times e_a x way.
+    turned = short_sum(directors[:, :, None] * -skew(cells.rest_ways)[None], axis=1)
+    return tilting.at[:, :, REFERENCE].add(-jnp.swapaxes(turned, 0, 1))
+
+
+def _products(rows: Float[Array, "r c n"], changed: Float[Array, "r c n"]) -> Float[Array, "c c n"]:
+    """Sums over the rows of products of columns."""
+    rows, changed = staged((rows, changed))
+    return short_sum(rows[:, :, None] * changed[:, None], axis=0)
+
+
+def _of_turned(force: Float[Array, "3 *k"], vector: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
+    """Second derivatives of the scalar product of a force with a vector that turns, both in the axes of the frame."""
+    both = force[:, None] * vector[None]
+    return (both + jnp.swapaxes(both, 0, 1)) / 2 - diagonal(dot(force, vector))

@@ -144,7 +144,7 @@ def kernels(segments: int) -> Iterator[Kernel]:
     if segments <= DENSE_UP_TO:
         unknowns = jnp.concatenate([here.gradient.T.ravel(), here.closure])
         yield Kernel("jnp.linalg.solve, dense", lambda _, f: jnp.linalg.solve(*f), None, (full(here.system), unknowns))
-    step = here.bases, 1e-3 * here.gradient, jnp.zeros(3)
+    step = here.bases, 1e-3 * here.gradient, jnp.zeros((3, 1))
     yield Kernel(MOVED, lambda form, given: form.moved(*given), at.form, (at.point, *step))
     yield Kernel("resultants", at_nodes, at.form, at.point)
     count = jnp.zeros((), int)

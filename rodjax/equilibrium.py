@@ -346,8 +346,6 @@ def checked_options(
                 "discretization must be 'hermite' for clips on a rod, or with loads or clips, that need frames along "
                 "the rod"
             )
-        if of_frames and slides(scene):
-            raise ValueError("clips must not be sliding for a rod, loads or clips that need frames along the rod")
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
     if scene.obstacles:
@@ -550,22 +548,25 @@ def _first_frames(
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     parts = force_parts(scene, options.segments)
-    no_force = jnp.zeros((3, parts), s.dtype)
-    if isinstance(guess, Equilibrium):
-        shape, first = guess.state.shape, last_twist(guess)
-        if isinstance(shape, FramedCurve):
-            end_force = in_parts(guess.state.end_force, parts)
-            return SolverState(shape.on(s, of_joints), end_force, guess.state.units), first
-        points = _in_units(guess.state, units).shape.points(pieces)
-        start = guess.scene.start
-        if isinstance(start, Clamp):
-            frames = framed_through(scene, points, of_joints, (start.frame, guess.total_twist))
-            return SolverState(frames, no_force, units), first
-        return SolverState(framed_through(scene, points, of_joints), no_force, units), FirstTwist(guess.total_twist)
-    if guess is not None:
-        frames = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
-        return SolverState(frames, no_force, units), FirstTwist(guess.total_twist)
-    return SolverState(first_frames(scene, s, of_joints), no_force, units), FirstTwist(rest_twist(scene))
+    no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
+    if guess is None:
+        shape = first_frames(scene, s, of_joints)
+        return SolverState(shape, no_force, units, places), FirstTwist(rest_twist(scene))
+    if isinstance(guess, Guess):
+        shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
+        return SolverState(shape, no_force, units, places), FirstTwist(guess.total_twist)
+    shape, first = guess.state.shape, last_twist(guess)
+    if _sliding(guess.scene) == _sliding(scene):
+        places = guess.state.places
+    if isinstance(shape, FramedCurve):
+        end_force = in_parts(guess.state.end_force, parts)
+        return SolverState(shape.on(s, of_joints), end_force, guess.state.units, places), first
+    points = _in_units(guess.state, units).shape.points(pieces)
+    start = guess.scene.start
+    if isinstance(start, Clamp):
+        shape = framed_through(scene, points, of_joints, (start.frame, guess.total_twist))
+        return SolverState(shape, no_force, units, places), first
+    return SolverState(framed_through(scene, points, of_joints), no_force, units, places), FirstTwist(guess.total_twist)
 
 
 def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:

@@ -19,7 +19,6 @@ from rodjax.discretization.forms import form_of
 from rodjax.discretization.shape import Shape
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.scene import Scene, nondimensional, slid, sliding_places
-from rodjax.sliding import axial_forces
 from rodjax.stability import Motion, carried_to, examined
 from rodjax.status import Outcome
 
@@ -96,7 +95,7 @@ def _slid_change(
         changes = _change(scene, change, shape, point, result.converged, result.residual)
 
         def axial(scene: Scene, shape: Shape, point: Point) -> Float[Array, "slides"]:
-            return axial_forces(form_of(scene, shape), point)
+            return form_of(scene, shape).axial_forces(point)
 
         return jax.jvp(axial, (scene, shape, point), (change, *changes))[1]
 

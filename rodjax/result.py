@@ -27,18 +27,17 @@ from rodjax.discretization.error import (
     with_contacts,
 )
 from rodjax.discretization.form import NEUTRAL, Form
+from rodjax.discretization.form_results import clip_moments_of, resultants_of
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import (
-    clip_moments_of_frames,
     errors_of_frames,
     positions_between_frames,
-    resultants_of_frames,
     strains_beside_nodes,
 )
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
+from rodjax.discretization.results import positions_between
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import cubic
@@ -258,7 +257,7 @@ def equilibrium(
     point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
     form = form_of(scaled, found.state.shape)
-    results = _resultants(form, point)
+    results = resultants_of(form, point)
     elastic_energy = form.elastic_energy(point)
     potential = elastic_energy + form.load_energy(point)
     converged = is_converged(outcome.status)
@@ -291,13 +290,6 @@ def equilibrium(
         state=dataclasses.replace(found.state, units=units),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
     )
-
-
-def _resultants(form: Form, point: Any) -> Resultants:
-    if isinstance(form, FrameForm):
-        return resultants_of_frames(form, point)
-    assert isinstance(form, MixedForm)
-    return resultants(form, point)
 
 
 def over_leading_axes(function: Callable) -> Callable:
@@ -422,10 +414,7 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
-    if isinstance(form, FrameForm):
-        return clip_moments_of_frames(form, point) * equilibrium.state.units.energy
-    assert isinstance(form, MixedForm)
-    return clip_moments(form, point) * equilibrium.state.units.energy
+    return clip_moments_of(form, point) * equilibrium.state.units.energy
 
 
 class Sides(eqx.Module):

@@ -124,8 +124,6 @@ def _check_supports(scene: Scene) -> None:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
         if end.moment is not None and not isinstance(other, Clamp):
             raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
-        if end.moment is not None and slides(scene):
-            raise ValueError("clips must not be sliding where a moment acts on a free end, which has no energy")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
     if scene.turns is not None and any(clip.frame is not None for clip in scene.clips):

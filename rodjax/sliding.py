@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.form import Form, Point
-from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import clip_moments, resultants
+from rodjax.discretization.form import Point
+from rodjax.discretization.form_results import clip_moments_of, resultants_of
 from rodjax.discretization.shape import Shape
 from rodjax.linalg import factor
 from rodjax.scene import Scene, slid, sliding_places
@@ -37,7 +36,7 @@ class Slide(NamedTuple):
         return -(self.rates + self.rates.T) / 2
 
 
-def slide(scene: Scene, shape: Shape, point: MixedPoint) -> Slide:
+def slide(scene: Scene, shape: Shape, point: Point) -> Slide:
     """Of an equilibrium of a nondimensional scene."""
     places = sliding_places(scene)
     assert places is not None
@@ -52,22 +51,13 @@ def slide(scene: Scene, shape: Shape, point: MixedPoint) -> Slide:
 
     def seen(places: Float[Array, "slides"], motion: Motion) -> tuple[Array, ...]:
         form, there = carried_to(slid(scene, places), shape, point, motion)
-        assert isinstance(form, MixedForm)
-        assert isinstance(there, MixedPoint)
-        ends = resultants(form, there)
-        moments = jnp.stack([ends.start_moment, ends.end_moment, *clip_moments(form, there)], axis=1)
-        return axial_forces(form, there), form.nodes(form.edges(there)), there.end_force, moments, ends.curvature
+        ends = resultants_of(form, there)
+        moments = jnp.stack([ends.start_moment, ends.end_moment, *clip_moments_of(form, there)], axis=1)
+        return form.axial_forces(there), form.nodes(form.edges(there)), there.end_force, moments, ends.curvature
 
     def rate(direction: Float[Array, "slides"]) -> tuple[Array, ...]:
         _, (f, c) = jax.jvp(unbalanced, (places,), (direction,))
         return jax.jvp(seen, (places, nothing), (direction, Motion(*factors.solve(-f, -c))))[1]
 
     rates, *others = jax.vmap(rate)(jnp.eye(len(places), dtype=places.dtype))
-    return Slide(axial_forces(form, begin), rates.T, *others)
-
-
-def axial_forces(form: Form, point: Point) -> Float[Array, "slides"]:
-    """What the sliding clips apply along the rod."""
-    assert isinstance(form, MixedForm)
-    assert isinstance(point, MixedPoint)
-    return form.axial_forces(point)
+    return Slide(form.axial_forces(begin), rates.T, *others)

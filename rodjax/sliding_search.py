@@ -4,7 +4,8 @@ At given arclengths of the clips the rod has an equilibrium, in which each of th
 the energy falls as more of the rod passes; a step goes where the linearised axial forces vanish, or on the way to a
 minimum of the energy along its negative gradient, where that curves the other way. A clip that also holds the tangent
 has no such energy: the rod's moments jump there, and what slides would take their work (Bigoni et al. 2015,
-"Eshelby-like forces acting on elastic structures"). There steps are judged by the axial forces alone.
+"Eshelby-like forces acting on elastic structures"). There, and under loads without potential, steps are judged by the
+axial forces alone.
 """
 
 from collections.abc import Callable
@@ -68,7 +69,7 @@ def slid_free(
         bound = last.energy + SUFFICIENT_DECREASE * last.part * last.slope
         largest, before = jnp.max(jnp.abs(now.axial)), jnp.max(jnp.abs(last.axial))
         is_lower = energy <= bound + ENERGY_ROUNDING * (1 + jnp.abs(bound))
-        if any(clip.sliding and clip.tangent is not None for clip in scene.clips):
+        if not form.has_potential or any(clip.sliding and clip.tangent is not None for clip in scene.clips):
             is_lower = (largest < before) | ~last.is_steady
         is_good = is_converged(found.outcome.status) & (is_lower | (largest <= GOOD_FALL * before))
         is_accepted = is_first | is_good

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
@@ -12,6 +13,7 @@ from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
 from rodjax.linalg import AnySystem
 from rodjax.scene import Scene
 from rodjax.supports import Free
+from rodjax.vectors import dot
 
 # Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
 # a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
@@ -166,6 +168,15 @@ class Form(eqx.Module):
         if isinstance(self.scene.start, Free):
             return -given, last - total
         return first + total, given if isinstance(self.scene.end, Free) else last
+
+    @abstractmethod
+    def tangents_in_clips(self, point: Any) -> Float[Array, "3 clips"]: ...
+
+    def axial_forces(self, point: Any) -> Float[Array, "slides"]:
+        """What the sliding clips apply to the rod along its tangent."""
+        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
+        along = dot(forces, self.tangents_in_clips(point))
+        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     def closure(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
         """The part for the forces of the layout, of what is given for all multipliers."""

@@ -152,6 +152,10 @@ class FrameForm(Form):
         assert isinstance(self.layout, SpanForces)
         return self.layout.spans(self.held_places[0])
 
+    def tangents_in_clips(self, point: FramePoint) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return point.tangents[:, 2 * self.clip_nodes]
+
     def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
         """The force through the cells besides that of the loads."""
         return self.layout.of_cells(end_force)[:, None]

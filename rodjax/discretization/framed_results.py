@@ -21,6 +21,7 @@ from rodjax.discretization.results import Resultants
 from rodjax.energy import Sections
 from rodjax.guess import cubic
 from rodjax.rotations import columns, inverse, product, rotated, tangent, unit
+from rodjax.scene import slides
 from rodjax.supports import Directed, Free, Held
 from rodjax.vectors import cross, dot, root
 
@@ -284,7 +285,8 @@ def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool =
     changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
-    return Errors(displacements.T, *relative, scale, is_soft, defects)
+    axial = form.axial_forces(there) - form.axial_forces(point) if slides(form.scene) else None
+    return Errors(displacements.T, *relative, scale, is_soft, defects, axial)
 
 
 def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: Pose) -> Pose:

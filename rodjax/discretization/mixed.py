@@ -26,7 +26,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.chain import ChainSystem
@@ -191,11 +190,8 @@ class MixedForm(Form):
         assert isinstance(self.layout, SpanForces)
         return self.layout.spans(self.held_places[0])
 
-    def axial_forces(self, point: MixedPoint) -> Float[Array, "slides"]:
-        """What the sliding clips apply to the rod along its tangent."""
-        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
-        along = dot(forces, self.field.tangents_in_clips(self.scene, point.tangents))
-        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
+    def tangents_in_clips(self, point: MixedPoint) -> Float[Array, "3 clips"]:
+        return self.field.tangents_in_clips(self.scene, point.tangents)
 
     # --- energies ----------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,175 @@
+"""Every rod with every support, load, clip, obstacle and in its plane: which pairs solve, and which are refused why."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax import Clamp, Clip, DistributedCouple, DistributedForce, Free, Pin, PointForce, Rod, Scene, Steps, Swivel
+from rodjax.equilibrium import checked_options
+
+SEGMENTS = 8
+X = (1.0, 0.0, 0.0)
+START, END = (0.0, 0.0, 0.0), (0.8, 0.0, 0.0)
+CLAMP, FAR = Clamp(START, rj.frame(X)), Clamp(END, rj.frame(X))
+PLACE = (0.35, 0.0, 0.1)
+
+
+class Stiffening(rj.Law):
+    def __call__(self, curvature, twist, axial_strain, s):
+        bending = curvature[0] ** 2 / 2 + curvature[1] ** 2 / 2 + 0.01 * curvature[1] ** 4
+        return bending + 0.35 * twist**2 + 5e3 * axial_strain**2
+
+
+def rod(EI=1.0, **more) -> Rod:
+    return Rod(1.0, EI, 0.7, 1e4, mass_per_length=0.1, radius=0.01, **more)
+
+
+# What a feature makes of a scene whose other features are the first of their kind.
+FEATURES = {
+    "rod": {
+        "plain": rod(),
+        "flat": rod((1.0, 2.0)),
+        "curved": rod(rest_curvature=(0.0, 1.0)),
+        "twisted": rod((1.0, 2.0), rest_twist=1.0),
+        "varying": rod(rj.Smooth([0.0, 0.5, 1.0], [1.0, 1.5, 2.0])),
+        "stepped": rod(Steps([0.5], [1.0, 2.0])),
+        "law": rod(law=Stiffening()),
+    },
+    "ends": {
+        "clamps": (CLAMP, FAR),
+        "clamp and swivel": (CLAMP, Swivel(END, X)),
+        "pins": (Pin(START), Pin(END)),
+        "clamp and free": (CLAMP, Free()),
+        "free and clamp": (Free(), FAR),
+    },
+    "load": {
+        "gravity": {},
+        "point force": {"point_forces": [PointForce(0.6, (0.0, 0.0, 2.0))]},
+        "uniform force": {"distributed": [DistributedForce((0.0, 0.0, 2.0))]},
+        "follower force along": {"distributed": [DistributedForce((0.5, 0.0, 0.0), follower=True)]},
+        "couple along": {"distributed": [DistributedCouple((0.0, 0.5, 0.0))]},
+        "end force": {"end": {"force": (0.0, 0.0, 2.0)}},
+        "end moment": {"end": {"moment": (0.0, 1.0, 0.0)}},
+        "follower end force": {"end": {"force": (0.0, 0.0, 1.0), "follower": True}},
+    },
+    "clip": {
+        "none": (),
+        "position": (Clip(0.4, PLACE),),
+        "tangent": (Clip(0.4, PLACE, tangent=(1.0, 0.0, 0.2)),),
+        "frame": (Clip(0.4, PLACE, frame=rj.frame((1.0, 0.0, 0.2))),),
+        "sliding": (Clip(0.4, PLACE, sliding=True),),
+        "sliding tangent": (Clip(0.4, PLACE, tangent=(1.0, 0.0, 0.2), sliding=True),),
+    },
+    "obstacle": {"none": (), "floor": (rj.Plane((0.0, 0.0, -0.1), (0.0, 0.0, 1.0)),)},
+    "planar": {"no": False, "yes": True},
+}
+FIRST = {kind: next(iter(names)) for kind, names in FEATURES.items()}
+# What is refused for a reason of physics.
+PHYSICS = {
+    "planar must be False for a moment on a free end": "it twists the rod as it leaves the plane, and has no potential",
+}
+# What is refused as it is not built yet.
+NOT_YET = [
+    "planar must be False for a rod, loads or clips that need frames",
+    "planar must be False for a scene with obstacles",
+    "obstacles must be () for a rod, loads or clips that need frames",
+    "obstacles must be () where the rod slides through clips",
+    "obstacles must be () where a moment acts on a free end",
+]
+
+
+def scene_of(names: dict[str, str]) -> Scene | None:
+    """`None` where a load on the end goes with an end that is not free."""
+    of = {kind: FEATURES[kind][name] for kind, name in (FIRST | names).items()}
+    start, end = of["ends"]
+    load = dict(of["load"])
+    on_end = load.pop("end", None)
+    if on_end is not None:
+        if "ends" in names and not isinstance(end, Free):
+            return None
+        start, end = (CLAMP if "ends" not in names else start), Free(**on_end)
+    return Scene(of["rod"], start, end, (0.0, 0.0, -9.81), clips=of["clip"], obstacles=of["obstacle"], **load)
+
+
+def pairs() -> list[dict[str, str]]:
+    found = []
+    for kind, other in itertools.combinations(FEATURES, 2):
+        names = itertools.product(list(FEATURES[kind])[1:], list(FEATURES[other])[1:])
+        found += [{kind: name, other: other_name} for name, other_name in names]
+    return found
+
+
+def refused(names: dict[str, str]) -> str | None:
+    """What is said of a scene that is refused."""
+    try:
+        scene = scene_of(names)
+        if scene is not None:
+            checked_options(scene, SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def test_what_is_refused_is_listed():
+    """Of all pairs of features; the counts are to fall."""
+    messages = [message for message in map(refused, pairs()) if message is not None]
+    reasons = [*PHYSICS, *NOT_YET]
+    for message in messages:
+        assert any(message.startswith(reason) or reason in message for reason in reasons), message
+    of_physics = sum(any(reason in message for reason in PHYSICS) for message in messages)
+    assert (len(pairs()), len(messages), of_physics) == (224, 27, 1)
+
+
+def solved(names: dict[str, str]) -> rj.Equilibrium:
+    scene = scene_of(names)
+    assert scene is not None
+    result = rj.solve(scene, segments=SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
+    assert result.converged, rj.describe(result)
+    if "follower" in names.get("load", ""):
+        return result
+    loads = scene.rod.mass_per_length * scene.gravity
+    loads += sum((load.force for load in scene.point_forces), jnp.zeros(3))
+    loads += sum((load.force for load in scene.distributed if isinstance(load, DistributedForce)), jnp.zeros(3))
+    supports = jnp.sum(result.clip_forces, axis=0) + jnp.sum(result.contact_forces, axis=0)
+    supports += result.end_force - result.start_force
+    # The residual of 1e-8 EI/L^2, of forces of about 100.
+    np.testing.assert_allclose(supports, -loads, rtol=0, atol=1e-6)
+    return result
+
+
+# Each feature that solves at least once, several at a time.
+TOGETHER = [
+    {"rod": "varying", "ends": "clamp and swivel", "load": "point force", "clip": "tangent"},
+    {"rod": "law", "ends": "clamp and free", "load": "end moment", "clip": "frame"},
+    {"ends": "pins", "clip": "position", "obstacle": "floor"},
+    {"rod": "flat", "ends": "free and clamp", "clip": "sliding"},
+]
+
+
+@pytest.mark.parametrize("names", TOGETHER, ids=lambda names: ", ".join(names.values()))
+def test_features_compose(names):
+    solved(names)
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("names", pairs(), ids=lambda names: ", ".join(names.values()))
+def test_every_pair_solves_and_has_derivatives(names):
+    if refused(names) is not None or scene_of(names) is None:
+        pytest.skip("refused, or no scene")
+    solved(names)
+
+    def tip(scale):
+        scene = scene_of(names)
+        scaled = Scene(
+            scene.rod, scene.start, scene.end, scale * scene.gravity, scene.point_forces, None, scene.distributed,
+            scene.clips, scene.obstacles,
+        )  # fmt: skip
+        result = rj.solve(scaled, segments=SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
+        return jnp.sum(result.nodes**2)
+
+    assert np.isfinite(jax.jvp(tip, (jnp.array(1.0),), (jnp.array(1.0),))[1])

@@ -264,7 +264,7 @@ def _eliminate(
         # Blocks (goes, the one before) and (goes, the one after), none beyond the ends.
         before = _padded(_shifted(lower[..., 1 - first :: 2], 1 - first), m)
         after = _padded(jnp.swapaxes(lower[..., first::2], 0, 1), m)
-        inverse, below = _inverse(_with_least(goes[:, :b], least))
+        inverse, below = _inverse(goes[:, :b], least)
         scaled = _product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
         level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b], first)
         levels.append(level)
@@ -282,42 +282,44 @@ def _eliminate(
     return elimination, negative + below, x
 
 
-def _inverse(blocks: Float[Array, "b b m"]) -> tuple[Float[Array, "b b m"], Int[Array, ""]]:
-    """Inverses of symmetric blocks, and how many negative eigenvalues these have together."""
-    if blocks.shape[0] == 1:
-        return 1 / blocks, jnp.sum(blocks < 0)
-    if blocks.shape[0] == 3:
-        return _inverse_of_three(blocks)
+def _inverse(
+    blocks: Float[Array, "b b m"], least: Float[Array, ""] | None = None
+) -> tuple[Float[Array, "b b m"], Int[Array, ""]]:
+    """Inverses of symmetric blocks, and how many negative eigenvalues these have together.
+
+    Blocks with an eigenvalue within about `least` of zero are made stiffer by twice that before. So soft is a part of
+    the rod by itself, between neighbours that are held, only by chance or by symmetry, as half of a ring is.
+    Elimination would lose the square of its softness in digits; so it gives the solution and the inertia of a matrix
+    that differs by this much in a few places.
+    """
+    if len(blocks) == 1:
+        a = blocks[0, 0]
+        if least is not None:
+            a += jnp.where(jnp.abs(a) <= least, 2 * least, 0.0)
+        return (1 / a)[None, None], jnp.sum(a < 0)
+    if len(blocks) == 3:
+        return _inverse_of_three(blocks, least)
     a, b, d = blocks[0, 0], blocks[1, 0], blocks[1, 1]
+    if least is not None:
+        is_soft = jnp.abs(a * d - b * b) <= least * (jnp.abs(a) + jnp.abs(d))
+        added = jnp.where(is_soft, 2 * least, 0.0)
+        a, d = a + added, d + added
     determinant = a * d - b * b
     off = -b / determinant
     inverse = jnp.stack([jnp.stack([d / determinant, off]), jnp.stack([off, a / determinant])])
     return inverse, jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
 
 
-def _with_least(blocks: Float[Array, "b b m"], least: Float[Array, ""]) -> Float[Array, "b b m"]:
-    """Symmetric blocks made stiffer by 2 `least` where an eigenvalue lies within about that of zero.
-
-    So soft is a part of the rod by itself, between neighbours that are held, only by chance or by symmetry, as half of
-    a ring is. Elimination would lose the square of its softness in digits; so it gives the solution and the inertia of
-    a matrix that differs by this much in a few places.
-    """
-    if len(blocks) == 1:
-        is_soft = jnp.abs(blocks[0, 0]) <= least
-    elif len(blocks) == 2:
-        a, b, d = blocks[0, 0], blocks[1, 0], blocks[1, 1]
-        is_soft = jnp.abs(a * d - b * b) <= least * (jnp.abs(a) + jnp.abs(d))
-    else:
-        a, b, c, d, e, f = (blocks[k] for k in ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2)))
+def _inverse_of_three(
+    blocks: Float[Array, "3 3 m"], least: Float[Array, ""] | None
+) -> tuple[Float[Array, "3 3 m"], Int[Array, ""]]:
+    a, b, c, d, e, f = (blocks[k] for k in ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2)))
+    if least is not None:
         minors = d * f - e * e, a * f - c * c, a * d - b * b
         determinant = a * minors[0] + b * (c * e - b * f) + c * (b * e - c * d)
         is_soft = jnp.abs(determinant) <= least * sum(jnp.abs(minor) for minor in minors)
-    identity = jnp.eye(len(blocks), dtype=blocks.dtype)[..., None]
-    return blocks + identity * jnp.where(is_soft, 2 * least, 0.0)[None, None]
-
-
-def _inverse_of_three(blocks: Float[Array, "3 3 m"]) -> tuple[Float[Array, "3 3 m"], Int[Array, ""]]:
-    a, b, c, d, e, f = blocks[0, 0], blocks[1, 0], blocks[2, 0], blocks[1, 1], blocks[2, 1], blocks[2, 2]
+        added = jnp.where(is_soft, 2 * least, 0.0)
+        a, d, f = a + added, d + added, f + added
     first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
     minor = a * d - b * b
     determinant = a * first + b * second + c * third

@@ -143,7 +143,7 @@ def test_a_rod_that_can_turn_as_a_whole_is_solved_to_many_digits(span):
         factors = factor(system)
         return system, factors.negative, factors.border_solution
 
-    for shift in (1e-6, 1e-5, -1e-5):
+    for shift in (1e-6, 1e-5, -1e-3):  # the last one beyond what soft pivots are made stiffer by
         system, negative, solution = seen(result, jnp.asarray(shift))
         matrix = dense(system)
         k = system.border.shape[1]

@@ -150,8 +150,11 @@ def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
     return functools.reduce(jnp.add, jnp.unstack(x, axis=axis)) if x.shape[axis] else jnp.sum(x, axis=axis)
 
 
-def factor(system: AnySystem) -> "AnyFactors":
+def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
     """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
+
+    With `is_regularized` soft pivots are made stiffer (see `_inverse`), for an inertia that can be trusted where a rod
+    may turn as a whole; a critical motion would be lost with that.
 
     Where the last block is singular there are infinities or NaN.
     """
@@ -159,22 +162,26 @@ def factor(system: AnySystem) -> "AnyFactors":
         return DenseFactors(system, jax.scipy.linalg.lu_factor(system.matrix), jnp.zeros((), int))
     if isinstance(system, ChainSystem):
         return factor_chain(system)
-    return _factor(system, system.border)[0]
+    return _factor(system, system.border, is_regularized)[0]
 
 
 def factor_and_solve(
-    system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"]
+    system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"], *, is_regularized: bool = False
 ) -> tuple["AnyFactors", Float[Array, "b n"], Float[Array, "k"]]:
     """Factorisation and the solution for one right side, in one sweep."""
     if isinstance(system, DenseSystem | ChainSystem):
         factors = factor(system)
         return factors, *factors.solve(f, c)
-    factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1))
+    factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1), is_regularized)
     return factors, *factors._bordered(x[:, -1], c)
 
 
-def _factor(system: SaddlePointSystem, right_sides: Float[Array, "b j n"]) -> tuple[Factors, Float[Array, "b j n"]]:
-    elimination, negative, x = _eliminate(system.diagonal, system.lower, system.across, right_sides)
+def _factor(
+    system: SaddlePointSystem, right_sides: Float[Array, "b j n"], is_regularized: bool
+) -> tuple[Factors, Float[Array, "b j n"]]:
+    b = len(system.diagonal)
+    least = LEAST_PIVOT / b * jnp.mean(jnp.abs(jnp.trace(system.diagonal))) if is_regularized else None
+    elimination, negative, x = _eliminate(system.diagonal, system.lower, system.across, right_sides, least)
     k = system.border.shape[1]
     solution = x[:, :k]
     if system.rows is None:
@@ -245,6 +252,7 @@ def _eliminate(
     lower: Float[Array, "b b n-1"],
     across: Float[Array, "b b (n-1)/2"] | None,
     right_sides: Float[Array, "b j n"],
+    least: Float[Array, ""] | None,
 ) -> tuple[_Elimination, Int[Array, ""], Float[Array, "b j n"]]:
     """The factorisation of H, how many negative eigenvalues it has, and H^-1 right_sides, in one sweep.
 
@@ -254,7 +262,6 @@ def _eliminate(
     """
     b = len(diagonal)
     rows = jnp.concatenate([diagonal, right_sides], axis=1)
-    least = LEAST_PIVOT / b * jnp.mean(jnp.abs(jnp.trace(diagonal)))
     levels, eliminated = [], []
     negative = jnp.zeros((), int)
     while rows.shape[-1] > 1:

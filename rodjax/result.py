@@ -379,7 +379,7 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     _, critical, turn = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
-    negative = factor(form.regular(here.system)).negative
+    negative = factor(form.regular(here.system), is_regularized=True).negative
     if slides(equilibrium.scene):
         stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
         negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)

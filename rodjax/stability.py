@@ -20,6 +20,8 @@ MOST_SHIFT = 0.01
 # At a fold the residual is the square of the softest stiffness, over twice its change along that motion: up to this
 # multiple of the residual the square may be nothing but what was left unsolved.
 CRITICAL = 100.0
+# A solution that leaves more than this part of the right side is none.
+MOST_LEFT = 1e-3
 # The lowest eigenvalue is bracketed by powers of this factor, by so many at most, halved so often, and then found by
 # so many inverse iterations.
 BRACKET_GROWTH = 4.0
@@ -69,10 +71,15 @@ def examined(
     generic = components(here.bases, generic_field(point.tangents))
     nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
     # The first step of the inverse iteration in one sweep with the factorisation.
-    factors, softer, _ = factor_and_solve(here.system.shifted(shift / places), generic / places, nothing.multipliers)
+    system = here.system.shifted(shift / places)
+    factors, softer, multipliers = factor_and_solve(system, generic / places, nothing.multipliers)
     # Which motions are soft is a matter of the point alone; only the factors are differentiated.
     form, point, here, residual, generic = jax.lax.stop_gradient((form, point, here, residual, generic))
-    stiffness = _stiffness(generic, jax.lax.stop_gradient(softer))
+    system, softer, multipliers = jax.lax.stop_gradient((system, softer, multipliers))
+    stiffness = _stiffness(generic, softer)
+    # By symmetry a part of a rod that can turn may be as neutral as all of it, which leaves no digit of the solution.
+    left = jnp.max(jnp.abs(system.times(softer, multipliers)[0] - generic / places))
+    is_lost = jnp.isfinite(left) & (left > MOST_LEFT * jnp.max(jnp.abs(generic)) / places)
     least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
 
     def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
@@ -84,10 +91,10 @@ def examined(
         neutral = neutral_turn(form, point, here) if form.has_potential else nothing
         other = Motion(generic, nothing.multipliers).without(neutral).rotation
         softest = Motion(*factors.solve(other / places, nothing.multipliers)).without(neutral)
-        return is_soft(_stiffness(other, softest.rotation)), neutral
+        return is_soft(_stiffness(other, softest.rotation)) & ~is_lost, neutral
 
     fixed = (form, point, here, jax.lax.stop_gradient(factors))
-    critical, neutral = jax.lax.cond(is_soft(stiffness), closer, lambda _: (jnp.array(False), nothing), fixed)
+    critical, neutral = jax.lax.cond(is_soft(stiffness) | is_lost, closer, lambda _: (jnp.array(False), nothing), fixed)
     return factors, critical, neutral
 
 

@@ -49,7 +49,7 @@ def dense(system: SaddlePointSystem) -> np.ndarray:
 
 
 factored = jax.jit(factor)
-at_once = jax.jit(factor_and_solve)
+at_once = jax.jit(factor_and_solve, static_argnames="is_regularized")
 afterwards = jax.jit(lambda system, f, c: factor(system).solve(f, c))
 
 
@@ -117,7 +117,7 @@ def test_a_singular_block_does_no_harm(block):
     for where in (0, 2, 4, 6):
         coupled = dataclasses.replace(system, diagonal=system.diagonal.at[..., where].set(jnp.array(block)))
         matrix = dense(coupled)
-        factors, x, y = at_once(coupled, f, c)
+        factors, x, y = at_once(coupled, f, c, is_regularized=True)
         assert factors.negative == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1
         truth = np.linalg.solve(matrix, np.concatenate([f.T.ravel(), c]))
         np.testing.assert_allclose(np.concatenate([x.T.ravel(), y]), truth, rtol=0, atol=1e-3 * np.max(np.abs(truth)))
@@ -140,7 +140,7 @@ def test_a_rod_that_can_turn_as_a_whole_is_solved_to_many_digits(span):
     def seen(result, shift):
         form, point = form_and_point(result)
         system = form.linearized(point).system.shifted(shift / 33)
-        factors = factor(system)
+        factors = factor(system, is_regularized=True)
         return system, factors.negative, factors.border_solution
 
     for shift in (1e-6, 1e-5, -1e-3):  # the last one beyond what soft pivots are made stiffer by

@@ -102,7 +102,7 @@ class NewtonState(eqx.Module):
 
 def is_stable(form: Form, point: Point) -> Bool[Array, ""]:
     """Whether the energy has no negative curvature at an equilibrium, neutral modes apart."""
-    return factor(form.regular(form.linearized(point).system)).is_minimum
+    return factor(form.regular(form.linearized(point).system), is_regularized=True).is_minimum
 
 
 def find_equilibrium(form: Form, point: Point, solver: Newton, find: Find = "minimum") -> NewtonEnd:
@@ -181,7 +181,7 @@ def _advanced(
     pattern = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
     factors, rotation, multipliers = factor_and_solve(
-        here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure
+        here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure, is_regularized=True
     )
     is_definite = factors.is_minimum
     is_finite = jnp.isfinite(here.residual + here.energy)

@@ -153,8 +153,8 @@ def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
 def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
     """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
 
-    With `is_regularized` soft pivots are made stiffer (see `_inverse`), for an inertia that can be trusted where a rod
-    may turn as a whole; a critical motion would be lost with that.
+    `is_regularized`: soft pivots of a `SaddlePointSystem` are made stiffer (see `_inverse`), so that the inertia is
+    right where the rod may turn as a whole; a critical motion would be lost with that. Other systems stay as they are.
 
     Where the last block is singular there are infinities or NaN.
     """

@@ -28,16 +28,17 @@ def rod(EI=1.0, **more) -> Rod:
     return Rod(1.0, EI, 0.7, 1e4, mass_per_length=0.1, radius=0.01, **more)
 
 
-# What a feature makes of a scene whose other features are the first of their kind.
+# What a feature makes of a scene whose other features are the first of their kind. Rods are made when they are asked
+# for: to make some takes programs, and tests are collected by several processes at once.
 FEATURES = {
     "rod": {
-        "plain": rod(),
-        "flat": rod((1.0, 2.0)),
-        "curved": rod(rest_curvature=(0.0, 1.0)),
-        "twisted": rod((1.0, 2.0), rest_twist=1.0),
-        "varying": rod(rj.Smooth([0.0, 0.5, 1.0], [1.0, 1.5, 2.0])),
-        "stepped": rod(Steps([0.5], [1.0, 2.0])),
-        "law": rod(law=Stiffening()),
+        "plain": lambda: rod(),
+        "flat": lambda: rod((1.0, 2.0)),
+        "curved": lambda: rod(rest_curvature=(0.0, 1.0)),
+        "twisted": lambda: rod((1.0, 2.0), rest_twist=1.0),
+        "varying": lambda: rod(rj.Smooth([0.0, 0.5, 1.0], [1.0, 1.5, 2.0])),
+        "stepped": lambda: rod(Steps([0.5], [1.0, 2.0])),
+        "law": lambda: rod(law=Stiffening()),
     },
     "ends": {
         "clamps": (CLAMP, FAR),
@@ -92,7 +93,7 @@ def scene_of(names: dict[str, str]) -> Scene | None:
         if "ends" in names and not isinstance(end, Free):
             return None
         start, end = (CLAMP if "ends" not in names else start), Free(**on_end)
-    return Scene(of["rod"], start, end, (0.0, 0.0, -9.81), clips=of["clip"], obstacles=of["obstacle"], **load)
+    return Scene(of["rod"](), start, end, (0.0, 0.0, -9.81), clips=of["clip"], obstacles=of["obstacle"], **load)
 
 
 def pairs() -> list[dict[str, str]]:
@@ -119,7 +120,9 @@ def test_what_is_refused_is_listed():
     messages = [message for message in map(refused, pairs()) if message is not None]
     reasons = [*PHYSICS, *NOT_YET]
     for message in messages:
-        assert any(message.startswith(reason) or reason in message for reason in reasons), message
+        assert any(reason in message for reason in reasons), message
+    for reason in reasons:
+        assert any(reason in message for message in messages), reason
     of_physics = sum(any(reason in message for reason in PHYSICS) for message in messages)
     assert (len(pairs()), len(messages), of_physics) == (224, 27, 1)
 

@@ -87,7 +87,7 @@ def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     here = Coordinates.of(cells)
     strains = cells.field.strains(here.seen[cells.field.coordinates])
     stresses = jax.grad(lambda values: jnp.sum(density(cells, values)))(_at_points(cells, here, strains))
-    return _by_rotations(cells, here, stresses, _strain_rows(cells.field, here, strains))
+    return _by_rotations(cells, here, stresses, _strain_rows(here, strains, _coordinate_rows(cells.field, here)))
 
 
 def derivatives(cells: CellStates) -> CellDerivatives:
@@ -101,7 +101,7 @@ def derivatives(cells: CellStates) -> CellDerivatives:
 
     p, n = values.shape[1:]
     turning = _coordinate_rows(cells.field, here)
-    of_strains = _strain_rows(cells.field, here, strains, turning)
+    of_strains = _strain_rows(here, strains, turning)
     # Rows: strains and tension at the points; columns: rotations of the frames, then the force.
     forcing = jnp.zeros((4, p, 3, n), values.dtype).at[3].set(jnp.moveaxis(here.directors[:, 2], 1, 0))
     rows = jnp.concatenate([of_strains, forcing], axis=2)
@@ -139,16 +139,13 @@ def _coordinate_rows(field: Cells, here: Coordinates) -> Float[Array, "v 3p n"]:
     return jnp.concatenate(rows)
 
 
-def _strain_rows(
-    field: Cells, here: Coordinates, strains: Strains, turning: Float[Array, "v 3p n"] | None = None
-) -> Float[Array, "4 p 3p n"]:
-    """The derivatives of strains and tensions at the points by the rotations."""
-    turning = _coordinate_rows(field, here) if turning is None else turning
+def _strain_rows(here: Coordinates, strains: Strains, turning: Float[Array, "v 3p n"]) -> Float[Array, "4 p 3p n"]:
+    """The derivatives of strains and tensions at the points by the rotations, from those of the coordinates."""
     _, p, n = here.own_forces.shape
     by_coordinates = jnp.swapaxes(strains.jacobian, 2, 3).reshape(3, p, len(turning), n)
     of_strains = short_sum(by_coordinates[:, :, :, None] * turning[None, None], axis=2)
     forces = here.own_forces
-    by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)  # [k, a]
+    by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)  # [k, a]: t x m
     own = jnp.eye(p, dtype=forces.dtype)[:, :, None, None] * by_own[:, None]
     return jnp.concatenate([of_strains, own.reshape(1, p, 3 * p, n)])
 
@@ -192,7 +189,9 @@ def _curving(
 
 
 def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "p n"]) -> Float[Array, "3 3 p n"]:
-    """What the rotations change the direction of the ways by: derivatives by the tensions, times those of tangents."""
+    """Derivatives of the tangents, and of the ways at rest, by the rotations, times those of the value by the tensions:
+    [a, c, i] as in `CellDerivatives.by_force`.
+    """
     by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])
     tilting = slopes[None, None] * by_turns
     if cells.rest_ways is None:
@@ -205,7 +204,7 @@ def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "p n"]) 
 
 def _products(rows: Float[Array, "r c n"], changed: Float[Array, "r c n"]) -> Float[Array, "c c n"]:
     """Sums over the rows of products of columns."""
-    rows, changed = staged((rows, changed))
+    rows, changed = staged(rows, changed)
     return short_sum(rows[:, :, None] * changed[:, None], axis=0)
 
 

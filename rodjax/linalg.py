@@ -320,7 +320,7 @@ def _inverse(
 def _inverse_of_three(
     blocks: Float[Array, "3 3 m"], least: Float[Array, ""] | None
 ) -> tuple[Float[Array, "3 3 m"], Int[Array, ""]]:
-    a, b, c, d, e, f = (blocks[k] for k in ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2)))
+    (a, *_), (b, d, _), (c, e, f) = map(jnp.unstack, jnp.unstack(blocks))
     if least is not None:
         minors = d * f - e * e, a * f - c * c, a * d - b * b
         determinant = a * minors[0] + b * (c * e - b * f) + c * (b * e - c * d)
@@ -355,12 +355,12 @@ def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:
 
 
 def _product(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
-    return functools.reduce(jnp.add, (a[:, k, None] * b[None, k] for k in range(a.shape[1])))
+    return short_sum(a[:, :, None] * b[None], axis=1)
 
 
 def _transpose_product(a: Float[Array, "k i m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
     """a^T b block by block."""
-    return functools.reduce(jnp.add, (a[k, :, None] * b[k, None] for k in range(a.shape[0])))
+    return short_sum(a[:, :, None] * b[:, None], axis=0)
 
 
 def _shifted(x: Array, by: int) -> Array:

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.vectors import cross, dot
@@ -29,7 +30,7 @@ def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
     def either(*values: Any) -> Any:
         if isinstance(values[0], tuple):
             return function(*values)
-        return jnp.stack(function(*(tuple(value) for value in values)))
+        return jnp.stack(function(*map(jnp.unstack, values)))
 
     return either
 
@@ -85,7 +86,7 @@ def turned(q: Quaternion, rotation: Vector) -> Quaternion:
 
 def columns(q: Float[Array, "4 *k"]) -> Float[Array, "3 3 *k"]:
     """The rotation matrices: [i, j] is component i of director j."""
-    w, x, y, z = q
+    w, x, y, z = jnp.unstack(q)
     return jnp.stack(
         [
             jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
@@ -98,7 +99,7 @@ def columns(q: Float[Array, "4 *k"]) -> Float[Array, "3 3 *k"]:
 def spun(q: Float[Array, "4 *k"], angle: Float[Array, "*k"]) -> Float[Array, "4 *k"]:
     """Turned about its tangent."""
     cosine, sine = jnp.cos(angle / 2), jnp.sin(angle / 2)
-    w, x, y, z = q
+    w, x, y, z = jnp.unstack(q)
     return jnp.stack([w * cosine - z * sine, x * cosine + y * sine, y * cosine - x * sine, z * cosine + w * sine])
 
 
@@ -124,23 +125,30 @@ def unit(q: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
     return q / jnp.sqrt(dot(q, q))[None]
 
 
+def _products_by_frame() -> np.ndarray:
+    """[i, j, k, l]: 4 q_i q_j, less the identity, by the entry (k, l) of the rotation matrix of q."""
+    table = np.zeros((4, 4, 3, 3))
+    table[0, 0] = np.eye(3)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        table[k + 1, k + 1] = -np.eye(3)
+        table[k + 1, k + 1, k, k] = 1
+        for a, b in ((0, k + 1), (k + 1, 0)):
+            table[a, b, j, i], table[a, b, i, j] = 1, -1
+        for a, b in ((i + 1, j + 1), (j + 1, i + 1)):
+            table[a, b, i, j] = table[a, b, j, i] = 1
+    return table
+
+
+_PRODUCTS = _products_by_frame()
+
+
 def from_frame(frame: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Of the two quaternions of a rotation matrix either."""
-    trace = frame[0, 0] + frame[1, 1] + frame[2, 2]
-    squares = jnp.stack([1 + trace, *(1 - trace + 2 * frame[k, k] for k in range(3))])  # four times those of w, x, y, z
-    antisymmetric = [frame[2, 1] - frame[1, 2], frame[0, 2] - frame[2, 0], frame[1, 0] - frame[0, 1]]
-    symmetric = [frame[0, 1] + frame[1, 0], frame[0, 2] + frame[2, 0], frame[1, 2] + frame[2, 1]]
-    w, x, y, z = squares
-    products = jnp.stack(
-        [
-            jnp.stack([w, *antisymmetric]),
-            jnp.stack([antisymmetric[0], x, symmetric[0], symmetric[1]]),
-            jnp.stack([antisymmetric[1], symmetric[0], y, symmetric[2]]),
-            jnp.stack([antisymmetric[2], symmetric[1], symmetric[2], z]),
-        ]
+    products = jnp.eye(4, dtype=frame.dtype) + jnp.tensordot(
+        _PRODUCTS.astype(frame.dtype), frame, 2, precision="highest"
     )
     # The row of the largest component loses no digits.
-    row = products[jnp.argmax(squares)]
+    row = products[jnp.argmax(jnp.diagonal(products))]
     return row / jnp.sqrt(jnp.sum(row**2))
 
 

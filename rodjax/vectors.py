@@ -15,7 +15,8 @@ def dot(a: Float[Array, "c *k"], b: Float[Array, "c *k"]) -> Float[Array, "*k"]:
 
 
 def cross(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    (a1, a2, a3), (b1, b2, b3) = jnp.unstack(a), jnp.unstack(b)
+    return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1])
 
 
 def root(x: Float[Array, "*k"]) -> Float[Array, "*k"]:
@@ -31,6 +32,8 @@ def diagonal(x: Float[Array, "*k"]) -> Float[Array, "3 3 *k"]:
 
 def skew(x: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
     """The matrices of the cross product with x from the left."""
-    nothing = jnp.zeros_like(x[0])
-    rows = [[nothing, -x[2], x[1]], [x[2], nothing, -x[0]], [-x[1], x[0], nothing]]
+    x1, x2, x3 = jnp.unstack(x)
+    y1, y2, y3 = jnp.unstack(-x)
+    nothing = jnp.zeros_like(x1)
+    rows = [[nothing, y3, x2], [x3, nothing, y1], [y2, x1, nothing]]
     return jnp.stack([jnp.stack(row) for row in rows])

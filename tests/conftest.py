@@ -17,6 +17,8 @@ import rodjax
 IS_OPTIMIZED = bool(os.environ.get("RODJAX_TESTS_OPTIMIZED"))
 if not IS_OPTIMIZED:
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
+    # What these two look for in loops takes another seventh of the time.
+    os.environ["XLA_FLAGS"] += " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
     # As `rodjax.compilation.QUICK`, also for the programs in which tests use solves.
     if jax.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"

@@ -28,11 +28,11 @@ def test_strains_of_elements_have_their_derivatives():
     moments = jnp.asarray(generator.normal(size=(3, 3, CELLS)))
 
     def values(parts):
-        return ElementStrains.of(parts, h).values
+        return ElementStrains(parts, h).values
 
     @jax.jit
     def found_and_expected(parts):
-        here = ElementStrains.of(parts, h)
+        here = ElementStrains(parts, h)
         slopes = jax.grad(lambda parts: jnp.sum(moments * values(parts)))
         return (here.jacobian, here.curving(moments)), (by_each(values, parts), by_each(slopes, parts))
 
@@ -49,7 +49,7 @@ def test_a_helix_is_strained_everywhere_alike():
     parts = jnp.asarray(np.stack([-half, half], axis=1)[..., None])
     h = jnp.array([0.1])
     # The series is exact to the tenth power of the angle, 0.54 here.
-    for strain in np.moveaxis(np.asarray(ElementStrains.of(parts, h).values)[..., 0], 1, 0):
+    for strain in np.moveaxis(np.asarray(ElementStrains(parts, h).values)[..., 0], 1, 0):
         np.testing.assert_allclose(strain, vector / 0.05, rtol=1e-6)
 
 

@@ -87,7 +87,9 @@ def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     here = Coordinates.of(cells)
     strains = cells.field.strains(here.seen[cells.field.coordinates])
     stresses = jax.grad(lambda values: jnp.sum(density(cells, values)))(_at_points(cells, here, strains))
-    return _by_rotations(cells, here, stresses, _strain_rows(here, strains, _coordinate_rows(cells.field, here)))
+    return _by_rotations(
+        cells, here, stresses, _strain_rows(here, strains.jacobian, _coordinate_rows(cells.field, here))
+    )
 
 
 def derivatives(cells: CellStates) -> CellDerivatives:
@@ -101,7 +103,8 @@ def derivatives(cells: CellStates) -> CellDerivatives:
 
     p, n = values.shape[1:]
     turning = _coordinate_rows(cells.field, here)
-    of_strains = _strain_rows(here, strains, turning)
+    jacobian = strains.jacobian
+    of_strains = _strain_rows(here, jacobian, turning)
     # Rows: strains and tension at the points; columns: rotations of the frames, then the force.
     forcing = jnp.zeros((4, p, 3, n), values.dtype).at[3].set(jnp.moveaxis(here.directors[:, 2], 1, 0))
     rows = jnp.concatenate([of_strains, forcing], axis=2)
@@ -111,7 +114,7 @@ def derivatives(cells: CellStates) -> CellDerivatives:
     curving = strains.curving(stresses[:3]).reshape(size, size, n)
     changed = short_sum(curving[:, :, None] * turning[None], axis=1)
     second = quadratic[: 3 * p, : 3 * p] + _products(turning, changed)
-    slopes = short_sum((stresses[:3, :, None, None] * strains.jacobian).reshape(3 * p, -1, p - 1, n), axis=0)
+    slopes = short_sum((stresses[:3, :, None, None] * jacobian).reshape(3 * p, -1, p - 1, n), axis=0)
     second = second.reshape(p, 3, p, 3, n) + _curving(cells, here, slopes, stresses[3])
     by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3])
     way = -short_sum(stresses[3][:, None] * forcing[3], axis=0)
@@ -139,10 +142,12 @@ def _coordinate_rows(field: Cells, here: Coordinates) -> Float[Array, "v 3p n"]:
     return jnp.concatenate(rows)
 
 
-def _strain_rows(here: Coordinates, strains: Strains, turning: Float[Array, "v 3p n"]) -> Float[Array, "4 p 3p n"]:
+def _strain_rows(
+    here: Coordinates, jacobian: Float[Array, "3 p c q n"], turning: Float[Array, "v 3p n"]
+) -> Float[Array, "4 p 3p n"]:
     """The derivatives of strains and tensions at the points by the rotations, from those of the coordinates."""
     _, p, n = here.own_forces.shape
-    by_coordinates = jnp.swapaxes(strains.jacobian, 2, 3).reshape(3, p, len(turning), n)
+    by_coordinates = jnp.swapaxes(jacobian, 2, 3).reshape(3, p, len(turning), n)
     of_strains = short_sum(by_coordinates[:, :, :, None] * turning[None, None], axis=2)
     forces = here.own_forces
     by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)  # [k, a]: t x m

@@ -324,7 +324,7 @@ class ElementCells(eqx.Module):
         return jnp.where(seen[:1] < 0, -seen, seen)
 
     def strains(self, seen: Float[Array, "3 2 n"]) -> ElementStrains:
-        return ElementStrains.of(seen, self.h)
+        return ElementStrains(seen, self.h)
 
     def ways(self, by_strain: Float[Array, "3 3 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return short_sum(by_strain, axis=1) + rest

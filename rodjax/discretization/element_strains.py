@@ -5,14 +5,16 @@ quaternion and x = r . r. With u for the v of the other end, h times the strain 
 
     T = 3 v + u - a v x u + b v x (v x u) = 3 s r + u - A r x u + B [r (r . u) - x u],    A = a s,  B = b s^2,
 
-and that in the middle the difference of both v. The derivatives of s, A and B by x are from JAX, all others from vector
-algebra: so they take a third of the program that JAX makes of the strains. Arrays have the components first, then both
+and that in the middle the difference of both v. Derivatives from vector algebra take a third of the program that JAX
+makes of the strains. Arrays have the components first, then both
 ends, then the elements; matrices rows and columns first.
 """
 
+import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,38 +30,48 @@ class ByOneSize(NamedTuple):
     second: Float[Array, "2 n"]
 
 
-class ElementStrains(NamedTuple):
-    """At the ends of elements of length `h`, seen from their middles: vector parts, rotation vectors, those of the
-    other ends, their derivatives by the vector parts, and the functions s, A, B.
-    """
+@dataclasses.dataclass(frozen=True)
+class ElementStrains:
+    """At the ends of elements of length `h`, seen from their middles: the vector parts r."""
 
-    h: Float[Array, "n"]
     parts: Float[Array, "3 2 n"]
-    vectors: Float[Array, "3 2 n"]
-    others: Float[Array, "3 2 n"]
-    by_parts: Float[Array, "3 3 2 n"]
-    sizes: ByOneSize
-    first_order: ByOneSize
-    second_order: ByOneSize
+    h: Float[Array, "n"]
 
-    @staticmethod
-    def of(parts: Float[Array, "3 2 n"], h: Float[Array, "n"]) -> "ElementStrains":
-        x = dot(parts, parts)
-        one = jnp.ones_like(x)
-        value, (first, second) = (
-            coefficients(x),
-            jax.jvp(lambda x: jax.jvp(coefficients, (x,), (one,))[1], (x,), (one,)),
-        )
-        s, a, b = (ByOneSize(value[k], first[k], second[k]) for k in range(3))
-        vectors = _times(s.value, parts)
-        by_parts = diagonal(s.value) + _times(2 * s.first, _outer(parts, parts))
-        return ElementStrains(h, parts, vectors, vectors[:, ::-1], by_parts, s, a, b)
+    @functools.cached_property
+    def squares(self) -> Float[Array, "2 n"]:
+        """x."""
+        return dot(self.parts, self.parts)
+
+    @functools.cached_property
+    def coefficients(self) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "2 n"]]:
+        return coefficients(self.squares)
+
+    @functools.cached_property
+    def slopes(self) -> tuple[ByOneSize, ByOneSize, ByOneSize]:
+        """s, A and B with their derivatives."""
+        return slopes(self.squares)
+
+    @functools.cached_property
+    def vectors(self) -> Float[Array, "3 2 n"]:
+        """v."""
+        return _times(self.coefficients[0], self.parts)
+
+    @functools.cached_property
+    def others(self) -> Float[Array, "3 2 n"]:
+        """u."""
+        return self.vectors[:, ::-1]
+
+    @functools.cached_property
+    def by_parts(self) -> Float[Array, "3 3 2 n"]:
+        """The derivatives of v by r."""
+        s = self.slopes[0]
+        return diagonal(s.value) + _outer(_times(2 * s.first, self.parts), self.parts)
 
     @property
     def values(self) -> Float[Array, "3 3 n"]:
         """Curvature along d1 and d2, and twist, at start, middle and end."""
-        r, u, x = self.parts, self.others, dot(self.parts, self.parts)
-        a, b = self.first_order.value, self.second_order.value
+        r, u, x = self.parts, self.others, self.squares
+        _, a, b = self.coefficients
         ends = 3 * self.vectors + u - _times(a, cross(r, u)) + _times(b, _times(dot(r, u), r) - _times(x, u))
         middle = self.vectors[:, 1] - self.vectors[:, 0]
         return jnp.stack([-ends[:, 0], middle, ends[:, 1]], axis=1) / self.h[None, None]
@@ -67,8 +79,8 @@ class ElementStrains(NamedTuple):
     @property
     def jacobian(self) -> Float[Array, "3 3 3 2 n"]:
         """[i, k, j, e]: of component i of the strain at point k by component j of the part at end e."""
-        r, u, x = self.parts, self.others, dot(self.parts, self.parts)
-        a, b = self.first_order, self.second_order
+        r, u, x = self.parts, self.others, self.squares
+        _, a, b = self.slopes
         w = dot(r, u)
         own = 3 * self.by_parts + skew(_times(a.value, u)) - 2 * _outer(_times(a.first, cross(r, u)), r)
         own += _times(b.value, diagonal(w) + _outer(r, u) - 2 * _outer(u, r))
@@ -85,8 +97,8 @@ class ElementStrains(NamedTuple):
     def curving(self, moments: Float[Array, "3 3 n"]) -> Float[Array, "2 3 2 3 n"]:
         """Second derivatives of the strains by the parts, times moments at their points: [e, i, f, j]."""
         m = jnp.stack([-moments[:, 0], moments[:, 2]], axis=1) / self.h[None, None]
-        r, u, x = self.parts, self.others, dot(self.parts, self.parts)
-        s, a, b = self.sizes, self.first_order, self.second_order
+        r, u, x = self.parts, self.others, self.squares
+        s, a, b = self.slopes
         p, q, w = dot(m, r), dot(m, u), dot(r, u)
         across = cross(u, m)
         k = dot(r, across)
@@ -111,18 +123,66 @@ class ElementStrains(NamedTuple):
         return jnp.stack([jnp.stack(row, axis=1) for row in rows])
 
 
-def coefficients(x: Float[Array, "2 n"]) -> Float[Array, "3 2 n"]:
-    """s, A and B.
+# With sin(t/2)^2 = x, the series of t^2/(4 x) to the fourth order in x, continued so that it grows to infinity at 1:
+# P = 1 + x/3 + ... = GROWTH/(1 - x) + a polynomial, and Q = (P - (1 - x))/x likewise.
+GROWTH = 128 / 1575
+RATIO = (1 - GROWTH, 1 / 3 - GROWTH, 8 / 45 - GROWTH, 4 / 35 - GROWTH)
+REST = (4 / 3 - GROWTH, 8 / 45 - GROWTH, 4 / 35 - GROWTH)
+# (1 - x) P has no pole.
+SQUARE = (1.0, RATIO[1] - RATIO[0], RATIO[2] - RATIO[1], RATIO[3] - RATIO[2], -RATIO[3])
 
-    s^2/4 is t^2/(4 x), with sin(t/2)^2 = x, to fourth order in x, and growing to infinity at 1.
+
+def coefficients(x: Float[Array, "2 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "2 n"]]:
+    """s, A and B: of s^2/4 = P, a = (1 - cos t)/t^2 = 1/(2 P) and b = (t - sin t)/t^3, where sin(t)/t is
+    sqrt((1 - x)/P).
     """
-    above = 1 / 3 + x * (8 / 45) + x**2 * (4 / 35) + x**3 * (128 / 1575) / (1 - x)
-    ratio, rest = 1 + x * above, 1 + above  # the second: by how much the first is above 1 - x, by x
+    pole = GROWTH / (1 - x)
+    ratio = pole + _polynomial(RATIO, x)
     s = 2 * jnp.sqrt(ratio)
-    by_sine = jnp.sqrt((1 - x) / ratio)  # sin(t)/t
-    second = rest / (4 * ratio**2 * (1 + by_sine))  # (t - sin t)/t^3
-    first = 1 / (2 * ratio)  # (1 - cos t)/t^2
-    return jnp.stack([s, first * s, second * s**2])
+    return s, 2 / s, (pole + _polynomial(REST, x)) / (ratio + jnp.sqrt(_polynomial(SQUARE, x)))
+
+
+def slopes(x: Float[Array, "2 n"]) -> tuple[ByOneSize, ByOneSize, ByOneSize]:
+    """s, A and B with their derivatives."""
+    by_gap = 1 / (1 - x)
+    pole = GROWTH * by_gap
+    first_pole = pole * by_gap
+    poles = pole, first_pole, 2 * first_pole * by_gap
+    p, q = (
+        ByOneSize(*(k + of_pole for k, of_pole in zip(_derivatives(polynomial, x), poles, strict=True)))
+        for polynomial in (RATIO, REST)
+    )
+    s = _root(p)
+    w = _root(ByOneSize(*_derivatives(SQUARE, x)))
+    s = ByOneSize(2 * s.value, 2 * s.first, 2 * s.second)
+    first_order = 2 / s.value
+    slope = -first_order * s.first / s.value
+    a = ByOneSize(first_order, slope, -(first_order * s.second + 2 * slope * s.first) / s.value)
+    d = ByOneSize(p.value + w.value, p.first + w.first, p.second + w.second)
+    value = q.value / d.value
+    first = (q.first - value * d.first) / d.value
+    return s, a, ByOneSize(value, first, (q.second - 2 * first * d.first - value * d.second) / d.value)
+
+
+def _polynomial(coefficients: Sequence[float], x: Array) -> Array:
+    *others, last = coefficients
+    value = jnp.full_like(x, last)
+    for c in reversed(others):
+        value = c + x * value
+    return value
+
+
+def _derivatives(polynomial: Sequence[float], x: Array) -> tuple[Array, Array, Array]:
+    """Of a polynomial: value, first and second."""
+    first = [k * c for k, c in enumerate(polynomial)][1:]
+    second = [k * c for k, c in enumerate(first)][1:]
+    return _polynomial(polynomial, x), _polynomial(first, x), _polynomial(second, x)
+
+
+def _root(of: ByOneSize) -> ByOneSize:
+    value = jnp.sqrt(of.value)
+    first = of.first / (2 * value)
+    return ByOneSize(value, first, (of.second / 2 - first**2) / value)
 
 
 def _times(x: Float[Array, "*k"], array: Float[Array, "..."]) -> Float[Array, "..."]:

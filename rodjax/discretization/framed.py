@@ -60,6 +60,16 @@ class Strained(eqx.Module):
     tangents: Float[Array, "3 p n"]
 
 
+class Kinematics(NamedTuple):
+    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and what turns with
+    the reference frames of the ways at rest.
+    """
+
+    strains: Float[Array, "3 p n"]
+    tangents: Float[Array, "3 p n"]
+    rests: Float[Array, "3 n"]
+
+
 class HeldFrame(NamedTuple):
     """What a support holds of the frame of this number: its tangent, or where `frame` is given all of it."""
 
@@ -203,16 +213,19 @@ class FrameForm(Form):
         return sum(parts[1:], parts[0]) if parts else None
 
     def strained(self, point: FramePoint) -> Strained:
-        q, forces = point.quaternions, self.forces(point.quaternions, point.end_force)
-        return self._strained(self.field.of_cells(q), forces)
+        forces = self.forces(point.quaternions, point.end_force)
+        return self._strained(self._kinematics(self.field.of_cells(point.quaternions)), forces)
 
-    def _strained(self, quaternions: Float[Array, "4 p n"], forces: Float[Array, "3 p n"]) -> Strained:
-        """Of cells of these frames."""
+    def _kinematics(self, quaternions: Float[Array, "4 p n"]) -> "Kinematics":
         field = self.field
         strains = field.strains(field.seen(quaternions)[field.coordinates]).values
         if self.rest_strains is not None:
             strains -= self.rest_strains
-        tangents = tangent(quaternions)
+        rests = self._rest_of_ways(quaternions, jnp.zeros_like(strains[:, 0]))
+        return Kinematics(strains, tangent(quaternions), rests)
+
+    def _strained(self, here: "Kinematics", forces: Float[Array, "3 p n"]) -> Strained:
+        strains, tangents = here.strains, here.tangents
         tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
         return Strained(strains[:2], strains[2], axial, tension, tangents)
@@ -366,25 +379,28 @@ class FrameForm(Form):
         if not self.layout.size:
             nothing = jnp.zeros(0, change.dtype)
             return nothing, nothing, zero, zero
-        quaternions, turning = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
         layout, spans = self.layout, self.spans
+        frames, turning = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
+        # Strains and directions are those of both forces.
+        kinematics, turning_rates = jax.jvp(
+            lambda amount: self._kinematics(turned(frames, amount * turning)), (zero,), (jnp.ones_like(zero),)
+        )
 
-        def parts(amount: Float[Array, ""], force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
-            frames, forces = turned(quaternions, amount * turning), self.through(force) + self.loads
-            here = self._strained(frames, forces)
+        def parts(of_frames: Kinematics, force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
+            forces = self.through(force) + self.loads
+            here = self._strained(of_frames, forces)
             densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
-            rest = self._rest_of_ways(frames, jnp.zeros_like(forces[:, 0]))
             value = jnp.sum(self.field.lengths * (densities - here.tension * (1 + here.axial)))
-            value += jnp.sum(force * spans) - jnp.sum(forces[:, REFERENCE] * rest)
-            ways = short_sum(self._ways(here), axis=1) + rest
+            value += jnp.sum(force * spans) - jnp.sum(forces[:, REFERENCE] * of_frames.rests)
+            ways = short_sum(self._ways(here), axis=1) + of_frames.rests
             return value, layout.components(spans - layout.sums(ways))
 
         def rates(force: Float[Array, "3 parts"]):
-            return jax.jvp(lambda amount: parts(amount, force), (zero,), (jnp.ones_like(zero),))
+            return jax.jvp(lambda of_frames: parts(of_frames, force), (kinematics,), (turning_rates,))
 
-        (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
-        (before, _), (rate_before, _) = rates(point.end_force)
-        return closure, closure_rate, energy - before, rate - rate_before
+        both = jnp.stack([point.end_force + change, point.end_force])
+        (energy, closure), (rate, closure_rate) = jax.vmap(rates)(both)
+        return closure[0], closure_rate[0], energy[0] - energy[1], rate[0] - rate[1]
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.blocks import short_sum
 from rodjax.compilation import compiled
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
-from rodjax.linalg import AnyFactors, SaddlePointSystem, factor, short_sum
+from rodjax.linalg import AnyFactors, SaddlePointSystem, factor
 from rodjax.modes import Mode, mode_of
 from rodjax.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.scene import Scene, between, nondimensional

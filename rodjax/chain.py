@@ -1,9 +1,10 @@
 """Saddle-point systems of a rod whose nodes have positions of their own, by block elimination from node to node.
 
-The tangents of Hermite elements and the force in each element are the unknowns, as in `linalg`, and the positions of
-the nodes, at which something may push: its stiffness stands on their diagonal. The force of an element is the
-multiplier of its way from node to node. Tangents in the middle of elements go first; then a node has eight unknowns,
-rotation, force of the element before it and displacement, coupled with those of its neighbours only: O(n).
+The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in `linalg`,
+and the positions of the nodes, at which something may push: its stiffness stands on their diagonal. The force of an
+element is the multiplier of its way from node to node. The points in the middle of elements go first; then a node has
+b + 6 unknowns, rotation, force of the element before it and displacement, coupled with those of its neighbours only:
+O(n).
 
     rotation     H theta + B F + border y = f
     gap          B^T theta - C F + u_after - u_before = gap,    for each element
@@ -18,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.blocks import inverse_of_blocks
+
 
 class ChainSystem(eqx.Module):
     """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
@@ -28,12 +31,12 @@ class ChainSystem(eqx.Module):
     the end, for a free start: a first node that nothing holds or touches has no pivot.
     """
 
-    diagonal: Float[Array, "2 2 m"]
-    lower: Float[Array, "2 2 m-1"]
-    across: Float[Array, "2 2 n"]
-    border: Float[Array, "2 k m"]
+    diagonal: Float[Array, "b b m"]
+    lower: Float[Array, "b b m-1"]
+    across: Float[Array, "b b n"]
+    border: Float[Array, "b k m"]
     compliance: Float[Array, "k k"]
-    by_force: Float[Array, "2 3 3 n"]
+    by_force: Float[Array, "b 3 3 n"]
     cell_compliance: Float[Array, "3 3 n"]
     stiffness: Float[Array, "n+1 3 3"]
     held: Bool[Array, "n+1"]
@@ -55,11 +58,11 @@ class ChainSystem(eqx.Module):
 
     def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
         """H + shift I in the place of H, with one shift or one for each point."""
-        identity = jnp.eye(2, dtype=shift.dtype)[..., None]
+        identity = jnp.eye(len(self.diagonal), dtype=shift.dtype)[..., None]
         shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
 
-    def times(self, x: Float[Array, "2 m"], y: Float[Array, "j"]) -> tuple[Float[Array, "2 m"], Float[Array, "j"]]:
+    def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
         first, u, force = self.parted(y)
         u = jnp.where(self.held[:, None], 0.0, u)
@@ -87,10 +90,10 @@ class ChainSystem(eqx.Module):
 
 
 class _Middles(eqx.Module):
-    """The elimination of the tangents in the middle: what couples them to start, end and force, before and after."""
+    """The elimination of the points in the middle: what couples them to start, end and force, before and after."""
 
-    solved: Float[Array, "n 2 7"]
-    inverse: Float[Array, "n 2 2"]
+    solved: Float[Array, "n b 2b+3"]
+    inverse: Float[Array, "n b b"]
 
 
 class ChainFactors(eqx.Module):
@@ -101,9 +104,9 @@ class ChainFactors(eqx.Module):
 
     system: ChainSystem
     middles: _Middles
-    inverses: Float[Array, "n+1 8 8"]
-    below: Float[Array, "n 8 8"]
-    border_solution: tuple[Float[Array, "2 k m"], Float[Array, "k j"]]
+    inverses: Float[Array, "n+1 c c"]
+    below: Float[Array, "n c c"]
+    border_solution: tuple[Float[Array, "b k m"], Float[Array, "k j"]]
     complement: Float[Array, "k k"]
     negative: Int[Array, ""]
 
@@ -112,7 +115,7 @@ class ChainFactors(eqx.Module):
         """Whether H is positive definite under the constraints."""
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
-    def solve(self, f: Float[Array, "2 m"], c: Float[Array, "j"]) -> tuple[Float[Array, "2 m"], Float[Array, "j"]]:
+    def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         first, nodes, gaps = self.system.parted(c)
         if self.system.is_backward:
             f, nodes, gaps = f[:, ::-1], nodes[::-1], -gaps[::-1]
@@ -129,14 +132,14 @@ class ChainFactors(eqx.Module):
         return x, y
 
     def _without_border(
-        self, f: Float[Array, "2 r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
-    ) -> tuple[Float[Array, "2 r m"], Float[Array, "r j"]]:
-        middles = self.middles
+        self, f: Float[Array, "b r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
+    ) -> tuple[Float[Array, "b r m"], Float[Array, "r j"]]:
+        middles, b = self.middles, len(f)
         of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
         moved = jnp.einsum("npq,npr->nqr", middles.solved, of_middles)
         none = jnp.zeros_like(of_nodes[:1])
-        rotations = of_nodes - jnp.concatenate([moved[:, :2], none]) - jnp.concatenate([none, moved[:, 2:4]])
-        forces = gaps.transpose(1, 2, 0) - moved[:, 4:]
+        rotations = of_nodes - jnp.concatenate([moved[:, :b], none]) - jnp.concatenate([none, moved[:, b : 2 * b]])
+        forces = gaps.transpose(1, 2, 0) - moved[:, 2 * b :]
         right = jnp.concatenate(
             [rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), nodes.transpose(1, 2, 0)], axis=1
         )
@@ -157,46 +160,48 @@ class ChainFactors(eqx.Module):
         reached = jnp.concatenate([first[None], reached[:-1]])
         _, solved = jax.lax.scan(backward, last, (self.inverses[:-1], self.below, reached), reverse=True)
         z = jnp.concatenate([solved, last[None]])
-        around = jnp.concatenate([z[:-1, :2], z[1:, :2], z[1:, 2:5]], axis=1)
+        around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
         of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)
-        x = jnp.zeros_like(f).at[..., ::2].set(z[:, :2].transpose(1, 2, 0))
+        x = jnp.zeros_like(f).at[..., ::2].set(z[:, :b].transpose(1, 2, 0))
         x = x.at[..., 1::2].set(of_middles.transpose(1, 2, 0))
         r = f.shape[1]
-        displacements, forces = z[:, 5:].transpose(2, 0, 1), z[1:, 2:5].transpose(2, 0, 1)
+        displacements, forces = z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
         return x, jnp.concatenate([displacements.reshape(r, -1), forces.reshape(r, -1)], axis=1)
 
 
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
     system = system.mirrored() if system.is_backward else system
-    n = system.across.shape[-1]
+    b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
     middles, coupled, negative = _eliminated(system)
+    start, end, force = slice(0, b), slice(b, 2 * b), slice(2 * b, None)
     of_nodes = system.diagonal[..., ::2].transpose(2, 0, 1)
-    of_nodes = of_nodes.at[:-1].add(-coupled[:, :2, :2]).at[1:].add(-coupled[:, 2:4, 2:4])
+    of_nodes = of_nodes.at[:-1].add(-coupled[:, start, start]).at[1:].add(-coupled[:, end, end])
     free = jnp.where(system.held, 0.0, 1.0).astype(dtype)
     identity = jnp.eye(3, dtype=dtype)
-    by_end = system.by_force[:, :, 2].transpose(2, 1, 0) - coupled[:, 4:, 2:4]
-    of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, 4:, 4:]
-    blocks = jnp.zeros((n + 1, 8, 8), dtype)
-    blocks = blocks.at[:, :2, :2].set(of_nodes)
-    blocks = blocks.at[1:, 2:5, :2].set(by_end).at[1:, :2, 2:5].set(by_end.transpose(0, 2, 1))
+    by_end = system.by_force[:, :, 2].transpose(2, 1, 0) - coupled[:, force, end]
+    of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, force, force]
+    turn, pull, place = slice(0, b), slice(b, b + 3), slice(b + 3, None)  # of the unknowns of a node
+    blocks = jnp.zeros((n + 1, b + 6, b + 6), dtype)
+    blocks = blocks.at[:, turn, turn].set(of_nodes)
+    blocks = blocks.at[1:, pull, turn].set(by_end).at[1:, turn, pull].set(by_end.transpose(0, 2, 1))
     # The first node has no element before it.
-    blocks = blocks.at[1:, 2:5, 2:5].set(of_force).at[0, 2:5, 2:5].set(-identity)
+    blocks = blocks.at[1:, pull, pull].set(of_force).at[0, pull, pull].set(-identity)
     pushed = free[1:, None, None] * identity[None]
-    blocks = blocks.at[1:, 2:5, 5:].set(pushed).at[1:, 5:, 2:5].set(pushed)
-    blocks = blocks.at[:, 5:, 5:].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
-    below = jnp.zeros((n, 8, 8), dtype)
-    below = below.at[:, :2, :2].set(system.across.transpose(2, 0, 1) - coupled[:, 2:4, :2])
-    below = below.at[:, 2:5, :2].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, 4:, :2])
-    below = below.at[:, 2:5, 5:].set(-free[:-1, None, None] * identity[None])
+    blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
+    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
+    below = jnp.zeros((n, b + 6, b + 6), dtype)
+    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start])
+    below = below.at[:, pull, turn].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, force, start])
+    below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])
 
     # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
     stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
     unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
     scale = jnp.concatenate(
-        [jnp.ones((n + 1, 2), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1
+        [jnp.ones((n + 1, b), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1
     )
 
     def inverted(block: Array, scale: Array) -> tuple[Array, Array]:
@@ -216,7 +221,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     negative += jnp.sum(signs < 0) - 3 * (n + 1)
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
-    blank = jnp.zeros((2, k, 2 * n + 1), dtype), jnp.zeros((k, 6 * n + 3), dtype)
+    blank = jnp.zeros((b, k, 2 * n + 1), dtype), jnp.zeros((k, 6 * n + 3), dtype)
     factors = ChainFactors(system, middles, inverses, below, blank, jnp.zeros((k, k), dtype), negative)
     if not k:
         return factors
@@ -226,16 +231,12 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     return ChainFactors(system, middles, inverses, below, (by_border, of_border), jnp.linalg.inv(matrix), negative)
 
 
-def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n 7 7"], Int[Array, ""]]:
+def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n d d"], Int[Array, ""]]:
     """The middles eliminated, what that takes from start, end and force, and how many negative eigenvalues they had."""
-    diagonal = system.diagonal[..., 1::2].transpose(2, 0, 1)
     before = system.lower[..., 0::2].transpose(2, 0, 1)
     after = system.lower[..., 1::2].transpose(2, 1, 0)
     coupling = jnp.concatenate([before, after, system.by_force[:, :, 1].transpose(2, 0, 1)], axis=2)
-    a, b, d = diagonal[:, 0, 0], diagonal[:, 1, 0], diagonal[:, 1, 1]
-    determinant = a * d - b * b
-    inverse = jnp.stack([jnp.stack([d, -b], axis=-1), jnp.stack([-b, a], axis=-1)], axis=-2)
-    inverse /= determinant[:, None, None]
+    inverse, negative = inverse_of_blocks(system.diagonal[..., 1::2])
+    inverse = inverse.transpose(2, 0, 1)
     solved = inverse @ coupling
-    negative = jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
     return _Middles(solved, inverse), coupling.transpose(0, 2, 1) @ solved, negative

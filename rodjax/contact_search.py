@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.form import Point
 from rodjax.discretization.touching import PENETRATION, TouchingForm
 from rodjax.solvers.newton import Find, Newton, NewtonEnd, find_equilibrium
 from rodjax.status import Outcome, Status
@@ -21,8 +21,10 @@ from rodjax.status import Outcome, Status
 FIRST_DEPTH = 0.3
 TOUCHING_DEPTH = 4e-3
 STIFFENING = 30.0
-# The residual [EI/L^2] of a start that is all but in equilibrium.
+# The residual [EI/L^2] of a start that is all but in equilibrium, and as a part of the largest force through it: light
+# rods begin with no more.
 NEAR = 1.0
+NEAR_PART = 0.1
 
 
 class _Stage(eqx.Module):
@@ -33,7 +35,7 @@ class _Stage(eqx.Module):
     is_done: Bool[Array, ""]
 
 
-def find_touching(form: TouchingForm, point: MixedPoint, solver: Newton, find: Find = "minimum") -> NewtonEnd:
+def find_touching(form: TouchingForm, point: Point, solver: Newton, find: Find = "minimum") -> NewtonEnd:
     """The equilibrium reached from `point`."""
     depths = form.depths(form.positions(form.edges(point)))
     deepest = depths.reshape(-1)[jnp.argmax(depths)]
@@ -43,7 +45,7 @@ def find_touching(form: TouchingForm, point: MixedPoint, solver: Newton, find: F
     thinnest = radius[jnp.argmin(radius)]
     depth = jnp.where(deepest > least * thinnest, deepest, least * thinnest)
     soft = PENETRATION * thinnest / depth
-    is_near = form.linearized(point).residual <= NEAR
+    is_near = form.linearized(point).residual <= jnp.minimum(NEAR, NEAR_PART * form.largest_force(point))
     count = jnp.zeros((), int)
     outcome = Outcome(jnp.zeros_like(soft), count, count, jnp.full((), Status.RUNNING, int))
     begin = NewtonEnd(point, outcome, jnp.array(False))

@@ -271,22 +271,26 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         shape = Polyline.through(shape.points(options.segments))
     end_force = state.end_force
     if coarse.scene.obstacles:
-        assert isinstance(state.shape, Curve)
-        assert isinstance(shape, Curve)
+        assert isinstance(state.shape, Curve | FramedCurve)
+        assert isinstance(shape, Curve | FramedCurve)
         end_force = _of_elements(end_force, state.shape.s, shape.s)
-    shape, end_force = _on_its_side(coarse, shape, end_force)
+    shape, end_force = _on_its_side(coarse.scene, coarse, shape, end_force)
     return SolverState(shape, end_force, state.units, state.places, before=state.before)
 
 
 def _on_its_side(
-    last: Equilibrium, shape: Shape, end_force: Float[Array, "3 parts"]
+    scene: Scene, last: Equilibrium, shape: Shape, end_force: Float[Array, "3 parts"]
 ) -> tuple[Shape, Float[Array, "3 parts"]]:
     """What a solve on another mesh begins from: where the last one came through an obstacle, what that began from."""
     state = last.state
-    if state.before is None or not isinstance(shape, Curve):
+    if state.before is None or not isinstance(shape, Curve | FramedCurve):
         return shape, end_force
     points = (state.before.points - state.units.origin[None]) / state.units.length
-    begin = Curve.through(resampled(points, 2 * (len(shape.s) - 1))).on(shape.s)
+    points = resampled(points, 2 * (len(shape.s) - 1))
+    if isinstance(shape, Curve):
+        begin = Curve.through(points).on(shape.s)
+    else:
+        begin = framed_through(nondimensional(scene)[0], points, of_joints=False).on(shape.s, of_joints=False)
     is_lost = last.status == Status.PASSED_THROUGH
     return (
         jax.tree.map(lambda old, new: jnp.where(is_lost, old, new), begin, shape),
@@ -508,13 +512,13 @@ def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Optio
 def _unsettled_state(
     scene: Scene, guess: Guess | Equilibrium | None, options: Options
 ) -> tuple[SolverState, FirstTwist]:
+    if needs_frames(scene):
+        return _first_frames(scene, guess, options)
     scaled, units = nondimensional(scene)
     kind = _kind(options)
     pieces = options.segments if kind is Polyline else 2 * options.segments
     parts = force_parts(scene, options.segments)
     no_force = jnp.zeros((3, parts), scene.rod.length.dtype)
-    if needs_frames(scene):
-        return _first_frames(scaled, units, guess, options)
     before = _before(scene, guess)
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype)
@@ -536,37 +540,42 @@ def _unsettled_state(
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
     if scene.obstacles:
-        shape, end_force = _on_its_side(guess, shape, end_force)
+        shape, end_force = _on_its_side(scene, guess, shape, end_force)
     return SolverState(shape, end_force, state.units, places, before=before), last_twist(guess)
 
 
-def _first_frames(
-    scene: Scene, units: Units, guess: Guess | Equilibrium | None, options: Options
-) -> tuple[SolverState, FirstTwist]:
-    """The same for a nondimensional scene that needs frames."""
+def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """The same for a scene that needs frames."""
+    scene, units = nondimensional(given)
     of_joints = options.discretization == "finite_difference"
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     parts = force_parts(scene, options.segments)
     no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
+    before = _before(given, guess)
+
+    def state(shape: FramedCurve) -> SolverState:
+        return SolverState(shape, no_force, units, places, before=before)
+
     if guess is None:
-        shape = first_frames(scene, s, of_joints)
-        return SolverState(shape, no_force, units, places), FirstTwist(rest_twist(scene))
+        return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
     if isinstance(guess, Guess):
         shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
-        return SolverState(shape, no_force, units, places), FirstTwist(guess.total_twist)
+        return state(shape), FirstTwist(guess.total_twist)
     shape, first = guess.state.shape, last_twist(guess)
     if _sliding(guess.scene) == _sliding(scene):
         places = guess.state.places
     if isinstance(shape, FramedCurve):
         end_force = in_parts(guess.state.end_force, parts)
-        return SolverState(shape.on(s, of_joints), end_force, guess.state.units, places), first
+        shape = shape.on(s, of_joints)
+        if scene.obstacles:
+            shape, end_force = _on_its_side(given, guess, shape, end_force)
+        return SolverState(shape, end_force, guess.state.units, places, before=before), first
     points = _in_units(guess.state, units).shape.points(pieces)
     start = guess.scene.start
     if isinstance(start, Clamp):
-        shape = framed_through(scene, points, of_joints, (start.frame, guess.total_twist))
-        return SolverState(shape, no_force, units, places), first
-    return SolverState(framed_through(scene, points, of_joints), no_force, units, places), FirstTwist(guess.total_twist)
+        return state(framed_through(scene, points, of_joints, (start.frame, guess.total_twist))), first
+    return state(framed_through(scene, points, of_joints)), FirstTwist(guess.total_twist)
 
 
 def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:
@@ -629,7 +638,6 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, first, options)
         if isinstance(search.form, TouchingForm):
-            assert isinstance(search.point, MixedPoint)
             end = find_touching(search.form, search.point, solver, options.find)
             return _on_one_side(search, search.found(end), guess)
         return search.found(find_equilibrium(search.form, search.point, solver, options.find))
@@ -645,7 +653,6 @@ def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
     """Not converged where the rod came through an obstacle on the way, or lies within one."""
     form, before = search.form, guess.before
     assert isinstance(form, TouchingForm)
-    assert isinstance(search.point, MixedPoint)
     assert before is not None
     nodes = form.nodes(form.edges(search.point))
     begin, _, _ = form.places(nodes, search.point)

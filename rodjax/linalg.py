@@ -13,7 +13,6 @@ the rod as their last axis, (b, b, n): all loops are then vector loops along the
 Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tridiagonal linear systems" (1976).
 """
 
-import functools
 import math
 
 import equinox as eqx
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.blocks import inverse_of_blocks, short_sum
 from rodjax.chain import ChainFactors, ChainSystem, factor_chain
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
@@ -145,16 +145,12 @@ AnyFactors = Factors | DenseFactors | ChainFactors
 AnySystem = SaddlePointSystem | DenseSystem | ChainSystem
 
 
-def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
-    """Sum over an axis of few entries, written out: XLA makes a sum over an axis a loop at each place along the rod."""
-    return functools.reduce(jnp.add, jnp.unstack(x, axis=axis)) if x.shape[axis] else jnp.sum(x, axis=axis)
-
-
 def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
     """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
 
-    `is_regularized`: soft pivots of a `SaddlePointSystem` are made stiffer (see `_inverse`), so that the inertia is
-    right where the rod may turn as a whole; a critical motion would be lost with that. Other systems stay as they are.
+    `is_regularized`: soft pivots of a `SaddlePointSystem` are made stiffer (see `blocks.inverse_of_blocks`), so that
+    the inertia is right where the rod may turn as a whole; a critical motion would be lost with that. Other systems
+    stay as they are.
 
     Where the last block is singular there are infinities or NaN.
     """
@@ -271,7 +267,7 @@ def _eliminate(
         # Blocks (goes, the one before) and (goes, the one after), none beyond the ends.
         before = _padded(_shifted(lower[..., 1 - first :: 2], 1 - first), m)
         after = _padded(jnp.swapaxes(lower[..., first::2], 0, 1), m)
-        inverse, below = _inverse(goes[:, :b], least)
+        inverse, below = inverse_of_blocks(goes[:, :b], least)
         scaled = _product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
         level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b], first)
         levels.append(level)
@@ -283,59 +279,10 @@ def _eliminate(
         lower = -_shifted(_transpose_product(after, level.before), first - 1)[..., : k - 1]
         if across is not None:
             lower, across = lower + across, None
-    last_inverse, below = _inverse(rows[:, :b])
+    last_inverse, below = inverse_of_blocks(rows[:, :b])
     elimination = _Elimination(tuple(levels), last_inverse)
     x = elimination.back_substituted(_product(last_inverse, rows[:, b:]), eliminated)
     return elimination, negative + below, x
-
-
-def _inverse(
-    blocks: Float[Array, "b b m"], least: Float[Array, ""] | None = None
-) -> tuple[Float[Array, "b b m"], Int[Array, ""]]:
-    """Inverses of symmetric blocks, and how many negative eigenvalues these have together.
-
-    Blocks with an eigenvalue within about `least` of zero are made stiffer by twice that before. So soft is a part of
-    the rod by itself, between neighbours that are held, only by chance or by symmetry, as half of a ring is.
-    Elimination would lose the square of its softness in digits; so it gives the solution and the inertia of a matrix
-    that differs by this much in a few places.
-    """
-    if len(blocks) == 1:
-        a = blocks[0, 0]
-        if least is not None:
-            a += jnp.where(jnp.abs(a) <= least, 2 * least, 0.0)
-        return (1 / a)[None, None], jnp.sum(a < 0)
-    if len(blocks) == 3:
-        return _inverse_of_three(blocks, least)
-    a, b, d = blocks[0, 0], blocks[1, 0], blocks[1, 1]
-    if least is not None:
-        is_soft = jnp.abs(a * d - b * b) <= least * (jnp.abs(a) + jnp.abs(d))
-        added = jnp.where(is_soft, 2 * least, 0.0)
-        a, d = a + added, d + added
-    determinant = a * d - b * b
-    off = -b / determinant
-    inverse = jnp.stack([jnp.stack([d / determinant, off]), jnp.stack([off, a / determinant])])
-    return inverse, jnp.sum(jnp.where(determinant < 0, 1, jnp.where(a < 0, 2, 0)))
-
-
-def _inverse_of_three(
-    blocks: Float[Array, "3 3 m"], least: Float[Array, ""] | None
-) -> tuple[Float[Array, "3 3 m"], Int[Array, ""]]:
-    (a, *_), (b, d, _), (c, e, f) = map(jnp.unstack, jnp.unstack(blocks))
-    if least is not None:
-        minors = d * f - e * e, a * f - c * c, a * d - b * b
-        determinant = a * minors[0] + b * (c * e - b * f) + c * (b * e - c * d)
-        is_soft = jnp.abs(determinant) <= least * sum(jnp.abs(minor) for minor in minors)
-        added = jnp.where(is_soft, 2 * least, 0.0)
-        a, d, f = a + added, d + added, f + added
-    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
-    minor = a * d - b * b
-    determinant = a * first + b * second + c * third
-    inverse = [[first, second, third], [second, a * f - c * c, b * c - a * e], [third, b * c - a * e, minor]]
-    # By Sylvester's criterion all eigenvalues are positive, or all of them negative; else the determinant tells.
-    is_positive = (a > 0) & (minor > 0) & (determinant > 0)
-    is_negative = (a < 0) & (minor > 0) & (determinant < 0)
-    count = jnp.where(is_positive, 0, jnp.where(is_negative, 3, jnp.where(determinant < 0, 1, 2)))
-    return jnp.stack([jnp.stack(row) for row in inverse]) / determinant[None, None], jnp.sum(count)
 
 
 def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:

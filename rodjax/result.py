@@ -16,28 +16,26 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.compilation import compiled
 from rodjax.discretization.cells import ElementCells
+from rodjax.discretization.contact_error import depths_of_elements, with_contacts
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.error import (
     Errors,
     Sizes,
-    depths_of_elements,
     errors_of_differences,
     errors_of_elements,
     longest,
-    with_contacts,
 )
-from rodjax.discretization.form import NEUTRAL, Form
-from rodjax.discretization.form_results import clip_moments_of, resultants_of
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.form import NEUTRAL, Form, Point
+from rodjax.discretization.form_results import clip_moments_of, positions_between_nodes, resultants_of
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import (
     errors_of_frames,
-    positions_between_frames,
     strains_beside_nodes,
 )
 from rodjax.discretization.hermite import Curve, HermiteElements
-from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import positions_between
+from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
 from rodjax.guess import cubic
@@ -336,16 +334,17 @@ def _errors_of(equilibrium: Equilibrium, *, is_turn_held: bool) -> Errors:
         return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), *unknown, unknown, jnp.array(False), None)
     form, point = form_and_point(equilibrium)
     if isinstance(form, FrameForm):
-        return errors_of_frames(form, point, is_turn_held=is_turn_held)
-    assert isinstance(form, MixedForm)
-    if isinstance(state.shape, Curve):
+        errors = errors_of_frames(form, point, is_turn_held=is_turn_held)
+    elif isinstance(state.shape, Curve):
+        assert isinstance(form, MixedForm)
         errors = errors_of_elements(form, point, is_turn_held=is_turn_held)
     else:
+        assert isinstance(form, MixedForm)
         errors = errors_of_differences(
             form, point, state.shape.nodes, equilibrium.tangents.T, is_turn_held=is_turn_held
         )
     if isinstance(form, TouchingForm):
-        return with_contacts(errors, form, point)
+        errors = with_contacts(errors, form, point)
     if errors.axial is None:
         return errors
     # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
@@ -439,16 +438,12 @@ def beside_nodes(equilibrium: Equilibrium) -> Sides:
 
 @over_leading_axes
 def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
-    units = equilibrium.state.units
+    shape, units = equilibrium.state.shape, equilibrium.state.units
     form, point = form_and_point(equilibrium)
-    if isinstance(form, FrameForm):
-        nodes = equilibrium.state.shape.nodes
-        return units.origin[None] + units.length * positions_between_frames(form, point, nodes, s / units.length)
-    assert isinstance(form, MixedForm)
-    if not isinstance(equilibrium.state.shape, Curve):
+    if isinstance(shape, Polyline):
         slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
         return cubic(equilibrium.s, equilibrium.nodes, slopes, s)
-    positions = positions_between(form, point, equilibrium.state.shape.nodes, s / units.length)
+    positions = positions_between_nodes(form, point, shape.nodes, s / units.length)
     return units.origin[None] + units.length * positions
 
 
@@ -560,7 +555,7 @@ def _passage_of(equilibrium: Equilibrium) -> Passage:
 
 
 def passage_to(
-    form: TouchingForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], units: Units, before: Before
+    form: TouchingForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
 ) -> tuple[Passage, Before]:
     """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
     points, radius, held = form.places(nodes, point)

@@ -138,17 +138,16 @@ def _check_obstacles(scene: Scene) -> None:
         return
     if scene.rod.radius is None:
         raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
-    if needs_frames(scene):
-        raise ValueError("obstacles must be () for a rod, loads or clips that need frames along the rod")
+    if not has_potential(scene):
+        raise ValueError(
+            "obstacles must be () under loads without a potential: a moment on a free end, couples along the rod, and "
+            "forces that follow it"
+        )
     if scene.rod.length.dtype != jnp.float64:
         raise ValueError(
             "obstacles must be () in single precision, in which contacts have no digits: "
             "jax.config.update('jax_enable_x64', True) before making the scene"
         )
-    if slides(scene):
-        raise ValueError("obstacles must be () where the rod slides through clips")
-    if dead_end_moment(scene) is not None:
-        raise ValueError("obstacles must be () where a moment acts on a free end")
 
 
 def _check_numbers(scene: Scene) -> None:

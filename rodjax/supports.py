@@ -109,7 +109,7 @@ class Clip(eqx.Module):
     that begins.
 
     A rod in a clip that holds its twist is solved by frames along it, as one whose section is not round is: by elements
-    of a `Newton`, and without obstacles.
+    of a `Newton`.
 
     Raises `ValueError` where both `tangent` and `frame` are given, and for a `frame` in a sliding clip.
     """

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.linalg import short_sum
+from rodjax.blocks import short_sum
 
 
 def components(basis: Float[Array, "3 b *k"], vectors: Float[Array, "3 *k"]) -> Float[Array, "b *k"]:

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.blocks import short_sum
 from rodjax.discretization.cells import REFERENCE, Cells, Strains
 from rodjax.energy import Sections
-from rodjax.linalg import short_sum
 from rodjax.rotations import columns, rotated
 from rodjax.staging import staged
 from rodjax.vectors import cross, diagonal, dot, skew

@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.along import Steps, stiffness_at
+from rodjax.blocks import short_sum
 from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
 from rodjax.energy import Sections
-from rodjax.linalg import short_sum
 from rodjax.rod import Rod
 from rodjax.rotations import inverse, product, unit
 from rodjax.scene import Scene

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.linalg import short_sum
+from rodjax.blocks import short_sum
 from rodjax.vectors import cross, diagonal, dot, skew
 
 

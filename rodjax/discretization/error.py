@@ -19,14 +19,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.blocks import short_sum
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.results import clip_moments, positions_between, resultants
-from rodjax.discretization.touching import TouchingForm
+from rodjax.discretization.results import clip_moments, resultants
 from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
-from rodjax.linalg import factor_and_solve, short_sum
+from rodjax.linalg import factor_and_solve
 from rodjax.scene import slides
 from rodjax.stability import Motion, neutral_turn
 from rodjax.strain import swept_angle
@@ -39,10 +39,6 @@ STEPS = 4
 # that.
 TURN_REACH = 4.0
 COUPLE_REACH = 12.0
-# A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
-# displaces it by about half of that.
-CONTACT_REACH = 16.0
-CONTACT_MOMENT = 8.0
 # Errors of forces and moments are relative to the largest one in the rod, at least to these [EI/L^2], [EI/L]: of what
 # vanishes no part can be told. Of curvatures [1/L] as of moments.
 LEAST_FORCE = 1.0
@@ -50,8 +46,6 @@ LEAST_MOMENT = 0.1
 # A correction of less stiffness [EI/L^2 per rad and length] than this may be mostly a turn that nothing resists; the
 # softest motion of a clamped rod has pi^2.
 SOFT = 1.0
-# Where it is looked at how deep a rod lies within obstacles, as parts of elements.
-DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 class Section(NamedTuple):
@@ -264,44 +258,6 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     )
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
     return Errors(displacements.T, *relative, scale, is_soft, defects, axial)
-
-
-def with_contacts(errors: Errors, form: TouchingForm, point: MixedPoint) -> Errors:
-    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node.
-
-    And how deep the rod lies between the nodes.
-    """
-    h = jnp.diff(form.field.s)
-    forces = jnp.where(form.is_held[None], 0.0, form.at_nodes(point.end_force))
-    beside = jnp.pad(forces, ((0, 0), (1, 1)))
-    alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
-    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2
-    misplaced = alone * (spacing**2 / CONTACT_REACH)[None]
-    sizes = root(dot(misplaced, misplaced))
-    defects = errors.defects
-    if defects is not None:
-        defects = defects + (sizes[:-1] + sizes[1:]) / 2
-    nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
-    moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT / errors.scale.moment
-    return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
-
-
-def depths_of_elements(form: TouchingForm, point: MixedPoint) -> Float[Array, "n"]:
-    """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
-    beside a held place so much more than it is held there.
-    """
-    s, nodes = form.field.s, form.positions(form.edges(point))
-    at_nodes = form.depths_at(nodes, form.radius)
-    held = jnp.where(form.is_held, at_nodes, 0.0)
-    parts = jnp.array(DEPTH_PLACES, s.dtype)
-    places = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
-    positions = positions_between(form, point, nodes, places.reshape(-1))
-    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(places.shape)
-    at_ends = jnp.where(form.is_held, 0.0, at_nodes)
-    depths = jnp.concatenate(
-        [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1
-    )
-    return jnp.maximum(jnp.max(depths, axis=1), 0.0)
 
 
 def _with_jumps(spans: Float[Array, "3 parts"]) -> Float[Array, "3 k"]:

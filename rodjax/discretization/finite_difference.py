@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.blocks import short_sum
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes, load_energy
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.first_twist import FirstTwist, twist_on
@@ -36,7 +37,7 @@ from rodjax.discretization.twist import (
 )
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import resampled
-from rodjax.linalg import AnyFactors, Factors, SaddlePointSystem, factor, short_sum
+from rodjax.linalg import AnyFactors, Factors, SaddlePointSystem, factor
 from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
 from rodjax.strain import axial_strain
 from rodjax.supports import Clamp, Directed, Held

@@ -114,10 +114,10 @@ class Form(eqx.Module):
 
     @abstractmethod
     def under_force(
-        self, point: Any, bases: Float[Array, "3 b m"], rotation: Float[Array, "b m"], change: Float[Array, "3 parts"]
+        self, point: Any, here: Linearization, rotation: Float[Array, "b m"], change: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        """Under other forces: what the rod lacks of its spans and the rate of that as it begins to turn; by how much L
-        differs, and by how much the rate of L does.
+        """At a point and its linearisation, under other forces: what the rod lacks of its spans and the rate of that as
+        it begins to turn; by how much L differs, and by how much the rate of L does.
         """
 
     @abstractmethod

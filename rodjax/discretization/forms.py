@@ -2,21 +2,23 @@
 
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.form import Form
-from rodjax.discretization.framed_curve import FramedCurve, form_of_frames
+from rodjax.discretization.framed import FrameForm
+from rodjax.discretization.framed_curve import FramedCurve, cells_of
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.touching import TouchingForm
+from rodjax.discretization.touching import TouchingFrames, TouchingTangents
 from rodjax.scene import Scene
 
 
 def form_of(scene: Scene, shape: Shape) -> Form:
     """Of a nondimensional scene."""
     if isinstance(shape, FramedCurve):
-        return form_of_frames(scene, shape)
+        cells = cells_of(scene, shape)
+        return TouchingFrames.of(scene, cells) if scene.obstacles else FrameForm.of(scene, cells)
     if scene.obstacles:
-        return TouchingForm.of(scene, field_of(scene, shape))
+        return TouchingTangents.of(scene, field_of(scene, shape))
     return MixedForm.of(scene, field_of(scene, shape))
 
 

@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.discretization.cell_derivatives import CellStates, derivatives, first_derivatives
+from rodjax.blocks import short_sum
+from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
 from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
@@ -28,7 +29,7 @@ from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
 from rodjax.energy import Sections
-from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem, short_sum
+from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
 from rodjax.rotations import columns, from_frame, inverse, nearer, rotated, swung, tangent, turned, unit
 from rodjax.scene import Scene, has_potential, held_position
@@ -216,7 +217,7 @@ class FrameForm(Form):
         forces = self.forces(point.quaternions, point.end_force)
         return self._strained(self._kinematics(self.field.of_cells(point.quaternions)), forces)
 
-    def _kinematics(self, quaternions: Float[Array, "4 p n"]) -> "Kinematics":
+    def _kinematics(self, quaternions: Float[Array, "4 p n"]) -> Kinematics:
         field = self.field
         strains = field.strains(field.seen(quaternions)[field.coordinates]).values
         if self.rest_strains is not None:
@@ -224,7 +225,7 @@ class FrameForm(Form):
         rests = self._rest_of_ways(quaternions, jnp.zeros_like(strains[:, 0]))
         return Kinematics(strains, tangent(quaternions), rests)
 
-    def _strained(self, here: "Kinematics", forces: Float[Array, "3 p n"]) -> Strained:
+    def _strained(self, here: Kinematics, forces: Float[Array, "3 p n"]) -> Strained:
         strains, tangents = here.strains, here.tangents
         tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
@@ -306,25 +307,34 @@ class FrameForm(Form):
     def linearized(self, point: FramePoint) -> Linearization:
         return self._with_cells(point) if self.has_potential else self.with_all(point)
 
-    def _with_cells(self, point: FramePoint) -> Linearization:
-        """By two derivatives of each cell."""
-        field, layout = self.field, self.layout
-        assert isinstance(layout, SpanForces)
+    def by_cells(
+        self, point: FramePoint
+    ) -> tuple[CellDerivatives, Float[Array, "3 m"], tuple[Array, Array, Array | None]]:
+        """The derivatives of each cell, and by the rotations that are free: first ones, and blocks of second ones on
+        the diagonal, between neighbours and between ends of elements.
+        """
+        field = self.field
         cells = derivatives(self._cells(point.quaternions, point.end_force))
         diagonal, lower, across = field.couplings(cells.second)
         free = self.is_free
-        gradient = field.assembled(cells.first) * free
         diagonal = diagonal * free[:, None] * free[None] + jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
         lower = lower * free[:, None, 1:] * free[None, :, :-1]
         if across is not None:
             across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
+        return cells, field.assembled(cells.first) * free, (diagonal, lower, across)
+
+    def _with_cells(self, point: FramePoint) -> Linearization:
+        """By two derivatives of each cell."""
+        layout = self.layout
+        assert isinstance(layout, SpanForces)
+        cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         value, dtype = jnp.sum(cells.value), gradient.dtype
-        closure, border = jnp.zeros(0, dtype), jnp.zeros((3, 0, free.shape[1]), dtype)
+        closure, border = jnp.zeros(0, dtype), jnp.zeros((3, 0, gradient.shape[1]), dtype)
         compliance = jnp.zeros((0, 0), dtype)
         if layout.size:
             value += jnp.sum(point.end_force * self.spans)
             closure = layout.components(self.spans - layout.sums(cells.way))
-            border = field.assembled(layout.columns(cells.by_force)) * free[:, None]
+            border = self.field.assembled(layout.columns(cells.by_force)) * self.is_free[:, None]
             compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),
@@ -369,38 +379,42 @@ class FrameForm(Form):
         return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))
 
     def under_force(
-        self,
-        point: FramePoint,
-        bases: Float[Array, "3 3 m"],
-        rotation: Float[Array, "3 m"],
-        change: Float[Array, "3 parts"],
+        self, point: FramePoint, here: Linearization, rotation: Float[Array, "3 m"], change: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         zero = jnp.zeros((), change.dtype)
         if not self.layout.size:
             nothing = jnp.zeros(0, change.dtype)
             return nothing, nothing, zero, zero
         layout, spans = self.layout, self.spans
-        frames, turning = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
-        # Strains and directions are those of both forces.
-        kinematics, turning_rates = jax.jvp(
-            lambda amount: self._kinematics(turned(frames, amount * turning)), (zero,), (jnp.ones_like(zero),)
-        )
+        kinematics, turning = self.turning(point, rotation)
 
         def parts(of_frames: Kinematics, force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
-            forces = self.through(force) + self.loads
-            here = self._strained(of_frames, forces)
-            densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
-            value = jnp.sum(self.field.lengths * (densities - here.tension * (1 + here.axial)))
-            value += jnp.sum(force * spans) - jnp.sum(forces[:, REFERENCE] * of_frames.rests)
-            ways = short_sum(self._ways(here), axis=1) + of_frames.rests
-            return value, layout.components(spans - layout.sums(ways))
+            value, ways = self.in_cells(of_frames, force)
+            return value + jnp.sum(force * spans), layout.components(spans - layout.sums(ways))
 
         def rates(force: Float[Array, "3 parts"]):
-            return jax.jvp(lambda of_frames: parts(of_frames, force), (kinematics,), (turning_rates,))
+            return jax.jvp(lambda of_frames: parts(of_frames, force), (kinematics,), (turning,))
 
         both = jnp.stack([point.end_force + change, point.end_force])
         (energy, closure), (rate, closure_rate) = jax.vmap(rates)(both)
         return closure[0], closure_rate[0], energy[0] - energy[1], rate[0] - rate[1]
+
+    def turning(self, point: FramePoint, rotation: Float[Array, "3 m"]) -> tuple[Kinematics, Kinematics]:
+        """What follows from the frames of the cells alone, and its rates as they begin to turn."""
+        frames, turns = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
+        zero = jnp.zeros((), rotation.dtype)
+        return jax.jvp(lambda part: self._kinematics(turned(frames, part * turns)), (zero,), (jnp.ones_like(zero),))
+
+    def in_cells(
+        self, of_frames: Kinematics, end_force: Float[Array, "3 parts"]
+    ) -> tuple[Float[Array, ""], Float[Array, "3 n"]]:
+        """What the cells add to L under forces, and their ways."""
+        forces = self.through(end_force) + self.loads
+        here = self._strained(of_frames, forces)
+        densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
+        value = jnp.sum(self.field.lengths * (densities - here.tension * (1 + here.axial)))
+        value -= jnp.sum(forces[:, REFERENCE] * of_frames.rests)
+        return value, short_sum(self._ways(here), axis=1) + of_frames.rests
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

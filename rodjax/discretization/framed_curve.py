@@ -200,9 +200,8 @@ def _spin_between(q: Float[Array, "4"], other: Float[Array, "4"]) -> Float[Array
     return jnp.where(jnp.abs(angle) > 16 * jnp.finfo(angle.dtype).eps, angle, 0.0)
 
 
-def form_of_frames(scene: Scene, shape: FramedCurve) -> FrameForm:
-    cells = shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s)
-    return FrameForm.of(scene, cells)
+def cells_of(scene: Scene, shape: FramedCurve) -> Cells:
+    return shape.cells if shape.is_of_joints else ElementCells.of(scene, shape.s)
 
 
 def framed_through(

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from rodjax.blocks import short_sum
 from rodjax.discretization.form import Form
 from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed import MixedPoint
@@ -28,7 +29,6 @@ from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import cubic
-from rodjax.linalg import short_sum
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import swept_angle

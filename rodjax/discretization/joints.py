@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.blocks import short_sum
 from rodjax.energy import density
-from rodjax.linalg import short_sum
 from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import squared_curvature_between

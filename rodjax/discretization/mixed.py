@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.blocks import short_sum
 from rodjax.chain import ChainSystem
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.first_twist import FirstTwist, twist_on
@@ -38,7 +39,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.energy import axial_strain_under, density
-from rodjax.linalg import AnySystem, SaddlePointSystem, short_sum
+from rodjax.linalg import AnySystem, SaddlePointSystem
 from rodjax.scene import Scene, dead_end_moment, held_position
 from rodjax.supports import Clamp, Free
 from rodjax.vectors import components, dot
@@ -341,7 +342,7 @@ class MixedForm(Form):
     def under_force(
         self,
         point: MixedPoint,
-        bases: Float[Array, "3 b m"],
+        here: Linearization,
         rotation: Float[Array, "b m"],
         change: Float[Array, "3 parts"],
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
@@ -359,7 +360,7 @@ class MixedForm(Form):
             ways = short_sum((weights * (1 + strain))[None] * self.field.of_sides(tangents), axis=1)
             return jnp.sum(stretching) + jnp.sum(force * spans), layout.components(spans - layout.sums(ways))
 
-        turning = short_sum(bases * rotation[None], axis=1)
+        turning = short_sum(here.bases * rotation[None], axis=1)
 
         def rates(force: Float[Array, "3 parts"]):
             return jax.jvp(lambda tangents: parts(tangents, force), (point.tangents,), (turning,))

@@ -1,4 +1,4 @@
-"""A rod that touches obstacles: the mixed form with a force of its own in each element, and pressure on its nodes.
+"""A rod that touches obstacles: the forms with a force of its own in each element, and pressure on its nodes.
 
 Where a node is nearer to an obstacle than the rod is thick, it is pushed back by a force in proportion to how deep it
 is, straight out of the obstacle, so that the energy stays a smooth function: without friction. The stiffness is so
@@ -6,32 +6,40 @@ high that loads of the size of those on the rod press it in by a small part of i
 
 The force through an element is that of all loads and contacts beyond it: unknown, one for each element, as the position
 of each node is. At a node the forces on its two sides differ by the contact; from node to node the way is that of the
-element (`chain.ChainSystem`). Positions follow from the elements, so that tangents and forces alone make a point.
-Hermite elements only. Contact acts at the nodes; between them the rod is not looked at.
+element (`chain.ChainSystem`). Positions follow from the elements, so that tangents or frames and forces alone make a
+point. Elements only. Contact acts at the nodes; between them the rod is not looked at.
 """
 
 import dataclasses
 import functools
+from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.along import Value, largest_beside, value_at
+from rodjax.blocks import short_sum
 from rodjax.chain import ChainSystem
-from rodjax.discretization.form import FLOOR_SAFETY, Linearization
+from rodjax.discretization.cells import Cells
+from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
+from rodjax.discretization.framed import FrameForm, FramePoint, Kinematics
+from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import cubic
-from rodjax.linalg import short_sum
+from rodjax.loads import DistributedForce
 from rodjax.obstacles import Obstacle, least
 from rodjax.passage import PLACES
 from rodjax.scene import Scene
 from rodjax.supports import Free, Held
+from rodjax.vectors import dot
 
 # A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
 PENETRATION = 3e-5
@@ -49,7 +57,7 @@ MOST_LOOKS = 24
 BETWEEN = 7
 
 
-class TouchingForm(MixedForm):
+class TouchingForm(Form):
     """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element.
 
     `softening`: by how much the contacts are softer than those of a result, 1 or less; `is_cautious`: an obstacle that
@@ -60,16 +68,13 @@ class TouchingForm(MixedForm):
     softening: Float[Array, ""] = eqx.field(kw_only=True)
     is_cautious: bool = eqx.field(kw_only=True, static=True, default=False)
 
-    @classmethod
-    def of(cls, scene: Scene, field: TangentField) -> "TouchingForm":
-        loads_beyond = field.loads_beyond(scene)
-        return cls(
-            scene=scene,
-            field=field,
-            layout=CellForces(len(field.s) - 1),
-            loads_beyond=loads_beyond,
-            softening=jnp.ones((), loads_beyond.dtype),
-        )
+    @abstractmethod
+    def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
+        """The derivative of the centerline by arclength at the nodes."""
+
+    @abstractmethod
+    def largest_force(self, point: Any) -> Float[Array, ""]:
+        """The largest component of a force through the rod."""
 
     def softened(self, softening: Float[Array, ""]) -> "TouchingForm":
         """On the way to an equilibrium."""
@@ -78,7 +83,7 @@ class TouchingForm(MixedForm):
     # --- what is unknown ---------------------------------------------------------------------------------------------
 
     def multipliers_turned(
-        self, point: MixedPoint, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
+        self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
         positions = self.positions(self.edges(point))
         places, _ = self.held_places
@@ -86,6 +91,12 @@ class TouchingForm(MixedForm):
         by_node = jnp.cross(axis[None], arms).reshape(-1)
         of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
+
+    def axial_forces(self, point: Any) -> Float[Array, "slides"]:
+        nodes = self.clip_nodes
+        assert nodes is not None
+        along = dot(self.at_nodes(point.end_force)[:, nodes], self.tangents_in_clips(point))
+        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return super().is_closed(self.closure(closure), tolerance)
@@ -134,7 +145,8 @@ class TouchingForm(MixedForm):
         forces = [load.force for load in scene.point_forces]
         forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
         forces += [] if scene.gravity is None else [scene.gravity]
-        load = jnp.asarray(BENDING, self.loads_beyond.dtype)
+        forces += [load.force for load in scene.distributed if isinstance(load, DistributedForce)]
+        load = jnp.asarray(BENDING, self.field.s.dtype)
         for force in forces:
             load += jnp.sqrt(1.0 + jnp.sum(force**2))
         radius = self.radius
@@ -153,7 +165,7 @@ class TouchingForm(MixedForm):
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
 
-    def accepts(self, point: MixedPoint, trial: MixedPoint, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+    def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
         """Only where all places go straight from one to the other without getting too deep into an obstacle."""
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before
@@ -185,7 +197,7 @@ class TouchingForm(MixedForm):
         gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
         return is_better & ~is_blocked & jnp.all(gone >= lengths)
 
-    def _looked_at(self, point: MixedPoint) -> Float[Array, "k 3"]:
+    def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
         """The nodes, and places on what the rod lacks of the way to each held one: else it would pass there."""
         nodes = self.positions(self.edges(point))
         _, held = self.held_places
@@ -194,13 +206,13 @@ class TouchingForm(MixedForm):
         across = nodes[held[1:] - 1][:, None] + parts[None, :, None] * lacking[:, None]
         return jnp.concatenate([nodes, across.reshape(-1, 3)])
 
-    def places(self, nodes: Float[Array, "n+1 3"], point: MixedPoint) -> tuple[Array, Array, Array]:
+    def places(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
         """At equal steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
         beside a held node this, elsewhere not a number.
         """
         s = self.field.s
         x = jnp.linspace(0.0, 1.0, PLACES, dtype=s.dtype)
-        points = cubic(s, nodes, self.slopes(point)[:, ::2].T, x)
+        points = cubic(s, nodes, self.node_slopes(point), x)
         cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
         radius = value_at(self._radius, x, s[cell], s[cell + 1])
         beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
@@ -239,10 +251,48 @@ class TouchingForm(MixedForm):
         second = stiffnesses[:, None, None] * normals[:, :, None] * normals[:, None]
         return -pressures[:, None] * normals, second - curving[:, None, None] * curvatures
 
-    # --- derivatives -------------------------------------------------------------------------------------------------
+    def _balance(
+        self, edges: Float[Array, "n 3"], end_force: Float[Array, "3 n"]
+    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
+        """What is out of balance at the nodes, and the stiffness of the contacts there."""
+        pushing = self.at_nodes(end_force).T
+        first, second = self._contacts(self.positions(edges), pushing)
+        return jnp.where(self.is_held[:, None], 0.0, first + pushing), second
 
-    def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
-        return super().load_energy(point) + self._contact_energy(self.positions(self.edges(point)))
+    def _gaps(self, edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """What the elements lack of the ways between their nodes: those before held nodes."""
+        places, held = self.held_places
+        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        missing = jnp.diff(places, axis=1).T - jnp.diff(sums[held], axis=0)
+        return jnp.zeros_like(edges).at[held[1:] - 1].set(missing)
+
+    def load_energy(self, point: Any) -> Float[Array, ""]:
+        return super().load_energy(point) + self._contact_energy(self.positions(self.edges(point)))  # pyright: ignore
+
+    def rounding_floor(self, point: Any) -> Float[Array, ""]:
+        floor = super().rounding_floor(point)  # pyright: ignore
+        return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * self.stiffness
+
+
+class TouchingTangents(TouchingForm, MixedForm):
+    """By tangents."""
+
+    @classmethod
+    def of(cls, scene: Scene, field: TangentField) -> "TouchingTangents":
+        loads_beyond = field.loads_beyond(scene)
+        return cls(
+            scene=scene,
+            field=field,
+            layout=CellForces(len(field.s) - 1),
+            loads_beyond=loads_beyond,
+            softening=jnp.ones((), loads_beyond.dtype),
+        )
+
+    def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
+        return self.slopes(point)[:, ::2].T
+
+    def largest_force(self, point: MixedPoint) -> Float[Array, ""]:
+        return jnp.max(jnp.abs(self.forces(point)))
 
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
@@ -251,11 +301,7 @@ class TouchingForm(MixedForm):
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
-        positions = self.positions(edges)
-        pushing = self.at_nodes(point.end_force).T
-        first, second = self._contacts(positions, pushing)
-        balance = jnp.where(self.is_held[:, None], 0.0, first + pushing)
-        unbalanced = jnp.max(jnp.abs(balance))
+        balance, second = self._balance(edges, point.end_force)
         closure = [balance.reshape(-1), self._gaps(edges).reshape(-1)]
         dtype = energy.dtype
         if softness is None:
@@ -284,15 +330,8 @@ class TouchingForm(MixedForm):
             closure=jnp.concatenate(closure),
             system=system,
             energy=energy + self._stretching(tangents, point.end_force)[0],
-            residual=jnp.where(unbalanced > residual, unbalanced, residual),
+            residual=_larger(jnp.max(jnp.abs(balance)), residual),
         )
-
-    def _gaps(self, edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """What the elements lack of the ways between their nodes: those before held nodes."""
-        places, held = self.held_places
-        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        missing = jnp.diff(places, axis=1).T - jnp.diff(sums[held], axis=0)
-        return jnp.zeros_like(edges).at[held[1:] - 1].set(missing)
 
     def _stretching(
         self, tangents: Float[Array, "3 m"], end_force: Float[Array, "3 n"]
@@ -310,11 +349,11 @@ class TouchingForm(MixedForm):
     def under_force(
         self,
         point: MixedPoint,
-        bases: Float[Array, "3 b m"],
+        here: Linearization,
         rotation: Float[Array, "b m"],
         change: Float[Array, "3 n"],
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        turning = jnp.sum(bases * rotation[None], axis=1)
+        turning = jnp.sum(here.bases * rotation[None], axis=1)
         (energy, gaps), (rate, gap_rates) = jax.jvp(
             lambda tangents: self._stretching(tangents, point.end_force + change), (point.tangents,), (turning,)
         )
@@ -325,6 +364,80 @@ class TouchingForm(MixedForm):
         counted = -jnp.sum(lengths * short_sum(forces * self.field.of_sides(turning), axis=0))
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
-    def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
-        floor = super().rounding_floor(point)
-        return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * self.stiffness
+
+class TouchingFrames(TouchingForm, FrameForm):
+    """By frames."""
+
+    @classmethod
+    def of(cls, scene: Scene, field: Cells) -> "TouchingFrames":
+        parts = parts_of(scene, field)
+        layout = CellForces(len(field.s) - 1)
+        return cls(**{**parts, "layout": layout}, softening=jnp.ones((), field.s.dtype))
+
+    def node_slopes(self, point: FramePoint) -> Float[Array, "n+1 3"]:
+        strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
+        return ((1 + strain)[None] * point.tangents)[:, ::2].T
+
+    def largest_force(self, point: FramePoint) -> Float[Array, ""]:
+        return jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
+
+    def linearized(self, point: FramePoint) -> Linearization:
+        cells, gradient, (diagonal, lower, across) = self.by_cells(point)
+        assert across is not None, "elements, not joints"
+        edges = cells.way.T
+        balance, second = self._balance(edges, point.end_force)
+        dtype = gradient.dtype
+        system = ChainSystem(
+            diagonal,
+            lower,
+            across,
+            jnp.zeros((3, 0, gradient.shape[1]), dtype),
+            jnp.zeros((0, 0), dtype),
+            cells.by_force * self.field.of_cells(self.is_free)[:, None],
+            cells.compliance,
+            second,
+            self.is_held,
+            is_backward=not isinstance(self.scene.start, Held),
+        )
+        return Linearization(
+            bases=self.bases_at(point),
+            gradient=gradient,
+            closure=jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)]),
+            system=system,
+            energy=self._with_contacts(jnp.sum(cells.value), edges, point.end_force),
+            residual=_larger(jnp.max(jnp.abs(balance)), self._residual(gradient)),
+        )
+
+    def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
+        gradient = self.field.assembled(self.by_rotations(point.quaternions, point.end_force))
+        edges = self.edges(point)
+        balance, _ = self._balance(edges, point.end_force)
+        return gradient * self.is_free, jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)])
+
+    def _with_contacts(
+        self, value: Float[Array, ""], edges: Float[Array, "n 3"], end_force: Float[Array, "3 n"]
+    ) -> Float[Array, ""]:
+        """L, of what the cells add to it under the forces through them."""
+        across = jnp.sum(end_force.T * (edges + self._gaps(edges)))
+        return value + across + self._contact_energy(self.positions(edges))
+
+    def under_force(
+        self, point: FramePoint, here: Linearization, rotation: Float[Array, "3 m"], change: Float[Array, "3 n"]
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        kinematics, rates = self.turning(point, rotation)
+
+        def parts(of_frames: Kinematics, force: Float[Array, "3 n"]) -> tuple[Array, Array]:
+            value, ways = self.in_cells(of_frames, force)
+            return self._with_contacts(value, ways.T, force), self._gaps(ways.T)
+
+        (energy, gaps), (rate, gap_rates) = jax.jvp(
+            lambda of_frames: parts(of_frames, point.end_force + change), (kinematics,), (rates,)
+        )
+        before, _ = parts(kinematics, point.end_force)
+        counted = jnp.sum(rotation * here.gradient)
+        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
+
+
+def _larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+    """With the derivative of one of them."""
+    return jnp.where(a > b, a, b)

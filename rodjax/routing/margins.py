@@ -335,7 +335,7 @@ def _nearest_in_pieces(
     has_least = (falls < 0) & (rises > 0)
 
     def closer(_: Any, state: tuple[Float[Array, "k"], ...]) -> tuple[Float[Array, "k"], ...]:
-        low, high, before, rate_before, f, rate = state
+        low, high, before, rate_before, f, rate, best, least_rate = state
         low, high = jnp.where(rate < 0, f, low), jnp.where(rate < 0, high, f)
         change = rate - rate_before
         ahead = f - rate * (f - before) / jnp.where(change == 0, 1.0, change)
@@ -343,12 +343,13 @@ def _nearest_in_pieces(
         # Where the derivative is 0 already, it stays.
         ahead = jnp.where(rate == 0, f, ahead)
         rate_ahead = gap(*jax.jvp(position_at, (a + ahead * h,), (jnp.ones_like(f),)))[1] - taper
-        return low, high, f, rate, ahead, rate_ahead
+        # From where the derivative is a rounding of 0 the next step may lead anywhere in the bracket.
+        is_better = jnp.abs(rate_ahead) < least_rate
+        best, least_rate = jnp.where(is_better, ahead, best), jnp.where(is_better, jnp.abs(rate_ahead), least_rate)
+        return low, high, f, rate, ahead, rate_ahead, best, least_rate
 
     zero, one = jnp.zeros_like(h), jnp.ones_like(h)
-    _, _, before, rate_before, f, rate = jax.lax.fori_loop(0, NEARER, closer, (zero, one, zero, falls, one, rises))
-    # Where the derivative is a rounding of 0 the last step may lead anywhere in the bracket.
-    f = jnp.where(jnp.abs(rate) <= jnp.abs(rate_before), f, before)
+    *_, f, _ = jax.lax.fori_loop(0, NEARER, closer, (zero, one, zero, falls, one, rises, one, jnp.abs(rises)))
     lowest = body.distance(position_at(a + f * h)) - radii[0] - f * (radii[1] - radii[0])
     f = jnp.where(has_least, f, jnp.where(ends[1] < ends[0], 1.0, 0.0))
     return f, jnp.where(has_least, lowest, jnp.minimum(*ends))

@@ -201,7 +201,7 @@ def _advanced(
 
     if _descends(form, find):
         # With the new force in place of the old one.
-        closure, closure_rate, change, along = form.under_force(point, here.bases, rotation, force_change)
+        closure, closure_rate, change, along = form.under_force(point, here, rotation, force_change)
         objective = here.energy + change
         along += jnp.sum(rotation * here.gradient)
     else:

@@ -1,0 +1,56 @@
+"""What contacts at nodes alone add to the error of a mesh, and how deep the rod lies within obstacles between them."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.error import Errors
+from rodjax.discretization.form_results import positions_between_nodes
+from rodjax.discretization.touching import TouchingForm
+from rodjax.vectors import dot, root
+
+# A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
+# displaces it by about half of that.
+CONTACT_REACH = 16.0
+CONTACT_MOMENT = 8.0
+# Where it is looked at how deep a rod lies within obstacles, as parts of elements.
+DEPTH_PLACES = (0.25, 0.5, 0.75)
+
+
+def with_contacts(errors: Errors, form: TouchingForm, point: Any) -> Errors:
+    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node.
+
+    And how deep the rod lies between the nodes.
+    """
+    h = jnp.diff(form.field.s)
+    forces = jnp.where(form.is_held[None], 0.0, form.at_nodes(point.end_force))
+    beside = jnp.pad(forces, ((0, 0), (1, 1)))
+    alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
+    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2
+    misplaced = alone * (spacing**2 / CONTACT_REACH)[None]
+    sizes = root(dot(misplaced, misplaced))
+    defects = errors.defects
+    if defects is not None:
+        defects = defects + (sizes[:-1] + sizes[1:]) / 2
+    nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
+    moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT / errors.scale.moment
+    return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
+
+
+def depths_of_elements(form: TouchingForm, point: Any) -> Float[Array, "n"]:
+    """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
+    beside a held place so much more than it is held there.
+    """
+    s, nodes = form.field.s, form.positions(form.edges(point))
+    at_nodes = form.depths_at(nodes, form.radius)
+    held = jnp.where(form.is_held, at_nodes, 0.0)
+    parts = jnp.array(DEPTH_PLACES, s.dtype)
+    places = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
+    positions = positions_between_nodes(form, point, nodes, places.reshape(-1))
+    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(places.shape)
+    at_ends = jnp.where(form.is_held, 0.0, at_nodes)
+    depths = jnp.concatenate(
+        [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1
+    )
+    return jnp.maximum(jnp.max(depths, axis=1), 0.0)

@@ -339,11 +339,8 @@ def checked_options(
     if discretization == "hermite" and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton where discretization is 'hermite'")
     of_frames = needs_frames(scene)
-    if of_frames:
-        if isinstance(solver, NonlinearCG):
-            raise ValueError("solver must be a Newton for a rod, loads or clips that need frames along the rod")
-        if planar:
-            raise ValueError("planar must be False for a rod, loads or clips that need frames along the rod")
+    if of_frames and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton for a rod, loads or clips that need frames along the rod")
     if scene.clips:
         if of_frames and discretization == "finite_difference":
             raise ValueError(
@@ -352,11 +349,8 @@ def checked_options(
             )
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
-    if scene.obstacles:
-        if discretization == "finite_difference":
-            raise ValueError("discretization must be 'hermite' for a scene with obstacles")
-        if planar:
-            raise ValueError("planar must be False for a scene with obstacles")
+    if scene.obstacles and discretization == "finite_difference":
+        raise ValueError("discretization must be 'hermite' for a scene with obstacles")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     if rtol is not None:
@@ -610,11 +604,9 @@ class Search(eqx.Module):
         shape, point = _first_point(form, guess, first)
         if not options.planar:
             return Search(form, point, shape, guess.units, None, None)
-        assert isinstance(form, MixedForm)
-        assert isinstance(point, MixedPoint)
         normal, axes = plane(scene, point.tangents)
         within = is_planar(scene, first.total_twist)
-        return Search(form.in_axes(axes), point.flattened(axes), shape, guess.units, within, normal)
+        return Search(*form.in_plane(point, normal, axes), shape, guess.units, within, normal)
 
     def found(self, end: NewtonEnd) -> Found:
         point, outcome, stable = self.form.settled(end.point), end.outcome, end.is_stable
@@ -624,10 +616,10 @@ class Search(eqx.Module):
         is_start = (outcome.iterations == 0) & is_same
         shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
         if self.normal is not None and self.is_within_plane is not None:
-            assert isinstance(self.form, MixedForm)
-            stable &= is_stable(self.form.in_axes(self.normal[:, None]), point)
+            stable &= is_stable(self.form.out_of_plane(self.normal), point)
             # Inside a user's own jit the scene could not be checked before.
-            status = jnp.where(self.is_within_plane, outcome.status, Status.NOT_PLANAR)
+            within = self.is_within_plane & (self.form.stays_in_plane(point) | ~is_converged(outcome.status))
+            status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
         return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)

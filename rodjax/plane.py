@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import is_known
+from rodjax.loads import DistributedForce
 from rodjax.scene import Scene, dead_end_moment
 from rodjax.supports import Clamp, Clip, Directed, Free, Held
 
@@ -42,7 +43,8 @@ def _normal_to(lead: Float[Array, "3"], directions: Float[Array, "k 3"]) -> Floa
 def is_planar(scene: Scene, twist: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a scene is symmetric to a plane, and the total twist to stay near to [rad] nearer to none than to 2 pi.
 
-    What `check_planar` tells of its structure is left out.
+    What `check_planar` tells of its structure is left out, and of rods by frames what shows in the plane alone:
+    sections, shapes at rest and loads that follow the rod may push it out (`Form.stays_in_plane`).
     """
     leaving, twisting = _asymmetry(scene)
     is_untwisted = jnp.abs(twist) < jnp.pi
@@ -58,6 +60,8 @@ def check_planar(scene: Scene, twist: Float[Array, "..."] | float) -> None:
     """
     if dead_end_moment(scene) is not None:
         raise ValueError("planar must be False for a moment on a free end")
+    if scene.rod.rest_twist is not None:
+        raise ValueError("planar must be False for a rod that is twisted at rest: it leaves the plane as it bends")
     if scene.turns is not None:
         raise ValueError("planar must be False for a scene with turns: a twisted rod leaves the plane")
     has_torsion = isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)
@@ -93,12 +97,14 @@ def _asymmetry(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
 def _directions(scene: Scene) -> Float[Array, "k 3"]:
     """Unit vectors that span the plane, zero where a scene happens to give none."""
     vectors = [end.tangent for end in (scene.start, scene.end) if isinstance(end, Directed)]
-    vectors += [clip.tangent for clip in scene.clips if clip.tangent is not None]
+    vectors += [clip.direction for clip in scene.clips if clip.direction is not None]
     places = [held.position for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Held | Clip)]
     vectors += [place - places[0] for place in places[1:]]
     if scene.gravity is not None:
         vectors.append(scene.gravity)
     vectors += [load.force for load in scene.point_forces]
-    vectors += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
+    vectors += [load.force for load in scene.distributed if isinstance(load, DistributedForce) and not load.follower]
+    ends = [end for end in (scene.start, scene.end) if isinstance(end, Free) and not end.follower]
+    vectors += [end.force for end in ends if end.force is not None]
     sizes = [jnp.sqrt(jnp.sum(vector**2)) for vector in vectors]
     return jnp.stack([vector / jnp.where(size > 0, size, 1.0) for vector, size in zip(vectors, sizes, strict=True)])

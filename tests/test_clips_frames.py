@@ -610,13 +610,9 @@ def test_what_frames_in_clips_do_not_go_with_is_said():
     parts = (scene.rod, scene.start, scene.end)
     with pytest.raises(ValueError, match="turns must be None where a clip has a frame"):
         Scene(*parts, turns=1, clips=scene.clips)
-    thick = Rod(1.0, 1.0, GJ, 1e4, radius=0.01)
-    with pytest.raises(ValueError, match=r"obstacles must be \(\) for a rod, loads or clips that need frames"):
-        Scene(thick, *parts[1:], clips=scene.clips, obstacles=[rj.Sphere((0, 0, 1), 0.1)])
     for held in (scene, general):
         for options, message in (
             ({"solver": rj.NonlinearCG()}, "solver must be a Newton for a rod, loads or clips that need frames"),
-            ({"planar": True}, "planar must be False for a rod, loads or clips that need frames"),
             ({"discretization": "finite_difference"}, "discretization must be 'hermite' for clips on a rod"),
             ({"segments": 1}, "segments must be a whole number from"),
         ):

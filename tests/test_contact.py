@@ -381,7 +381,6 @@ def single(parts):
         ),
         (lambda: Scene(cable(), Clamp((0, 0, 1), LEVEL), Free(), obstacles=[1]), r"obstacles[0] must be an Obstacle"),
         (lambda: rj.solve(with_floor(), discretization="finite_difference"), "discretization must be 'hermite'"),
-        (lambda: rj.solve(with_floor(), planar=True), "planar must be False for a scene with obstacles"),
         (lambda: rj.solve(with_floor(), solver=rj.NonlinearCG()), "discretization must be 'hermite' for a scene"),
         (lambda: rj.solve_continuum(with_floor()), "obstacles must be () in the continuum"),
         (

@@ -157,8 +157,6 @@ def test_bad_input_for_frames_is_refused():
     scene = SCENES["clamps"](isotropic(True))
     with pytest.raises(ValueError, match="solver must be a Newton for a rod"):
         rj.solve(scene, segments=8, solver=rj.NonlinearCG())
-    with pytest.raises(ValueError, match="planar must be False for a rod"):
-        rj.solve(scene, segments=8, planar=True)
 
 
 # --- closed forms and references -------------------------------------------------------------------------------------

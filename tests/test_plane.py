@@ -39,6 +39,10 @@ def in_space() -> dict[str, rj.Equilibrium]:
     }
 
 
+def flat(**more) -> Rod:
+    return Rod(1.0, (1.0, 2.0), 0.7, 1e4, mass_per_length=0.1, radius=0.01, **more)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_a_planar_solve_is_the_one_in_space(name, in_space):
     planar = rj.solve(SCENES[name], segments=SEGMENTS, discretization="finite_difference", planar=True)
@@ -204,6 +208,7 @@ DOWN = (0.0, 0.0, -9.81)
         (Scene(ROD, Pin((0, 0, 0)), Clamp((0.5, 0.1, 0), frame((1, 0, 0))), DOWN), "must lie in one plane"),
         (Scene(ROD, START, Free(moment=(0, 1e-3, 0))), "planar must be False for a moment on a free end"),
         (Scene(ROD, START, END, turns=0), "planar must be False for a scene with turns"),
+        (Scene(flat(rest_twist=1.0), START, END), "planar must be False for a rod that is twisted at rest"),
     ],
 )
 def test_scenes_that_leave_a_plane_are_refused(scene, message):
@@ -232,6 +237,44 @@ def test_a_guess_with_turns_is_refused():
 def test_planar_must_be_true_or_false():
     with pytest.raises(TypeError, match="planar must be a bool, got 'yes'"):
         rj.solve(SCENES["omega"], planar="yes")  # type: ignore[arg-type]
+
+
+def along_x(spin: float) -> np.ndarray:
+    """The frame of a clamp along x, its sections turned about it."""
+    return frame((1, 0, 0)) @ Rotation.from_rotvec([0, 0, spin]).as_matrix()
+
+
+def test_rods_by_frames_in_a_plane():
+    """A flat rod, curved in the plane, between clamps: in equilibrium in space too, where it would fall over."""
+
+    def scene(spin):
+        rod, held = flat(rest_curvature=(0.0, 0.5)), along_x(spin)
+        return Scene(rod, Clamp((0, 0, 0), held), Clamp((0.8, 0, 0), held), (0, 0, -9.81))
+
+    planar = rj.solve(scene(0.0), segments=SEGMENTS, planar=True)
+    assert planar.converged
+    assert not planar.stable
+    np.testing.assert_allclose(planar.nodes[:, 1], 0.0, rtol=0, atol=1e-14)
+    # The sections keep d2 across the plane, by which the stiffness in it is the second one.
+    np.testing.assert_allclose(planar.frames[:, :, 1], np.broadcast_to([0, 1, 0], (SEGMENTS + 1, 3)), atol=1e-12)
+    in_space = rj.solve(scene(0.0), segments=SEGMENTS, guess=planar, find="equilibrium")
+    assert in_space.iterations == 0
+    assert in_space.index >= 1
+    # Of sections that stand askew the moment has a part out of the plane.
+    with pytest.warns(rj.NotConvergedWarning, match="planar is True, but supports, loads or twist leave the plane"):
+        rj.solve(scene(0.5), segments=SEGMENTS, planar=True)
+
+
+def test_a_rod_on_an_obstacle_in_a_plane():
+    """By tangents; what it does is known from the solve in space, where here it does not fall over."""
+    rod = Rod(1.0, 0.02, 0.015, 1e6, 0.15, radius=0.005)
+    floor = rj.Plane((0, 0, 0), (0, 0, 1))
+    scene = Scene(rod, Clamp((0, 0, 0.005), frame((1, 0, 0))), Free(force=(0, 0, 0.3)), (0, 0, -10), obstacles=[floor])
+    planar, in_space = (rj.solve(scene, segments=16, planar=is_planar) for is_planar in (True, False))
+    assert planar.stable
+    # Contacts are stiffer than the rod by 1e9.
+    np.testing.assert_allclose(planar.nodes, in_space.nodes, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(planar.contact_forces, in_space.contact_forces, rtol=0, atol=1e-5)
 
 
 def test_inside_jit_a_scene_that_leaves_the_plane_is_flagged():

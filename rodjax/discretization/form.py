@@ -100,6 +100,18 @@ class Form(eqx.Module):
     ) -> Any:
         """The point turned by rotations in its bases, and under another force."""
 
+    @abstractmethod
+    def in_plane(self, point: Any, normal: Float[Array, "3"], axes: Float[Array, "3 2"]) -> tuple["Form", Any]:
+        """Of a rod that stays in the plane of two axes, and a point moved into it."""
+
+    @abstractmethod
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "Form":
+        """Of a form in a plane, that of the motions out of it, or of all where these couple."""
+
+    def stays_in_plane(self, point: Any) -> Bool[Array, ""]:
+        """Whether nothing pushes an equilibrium out of its plane, beside what supports and loads show."""
+        return jnp.array(True)
+
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
         """Whether a step goes from a point to another, which is better or not judged."""
         return is_better

@@ -13,12 +13,13 @@ Couples, follower loads and dead moments have no potential. Their virtual work e
 change far away makes the matrix full, and the method Newton's own on all of it.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.blocks import short_sum
 from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
@@ -31,10 +32,14 @@ from rodjax.discretization.nodes import held_nodes
 from rodjax.energy import Sections
 from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.rotations import columns, from_frame, inverse, nearer, rotated, swung, tangent, turned, unit
+from rodjax.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
 from rodjax.scene import Scene, has_potential, held_position
 from rodjax.supports import Clamp, Directed, Free, Held
 from rodjax.vectors import components, dot
+
+# The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
+# and of EI/L^2: directions count as lying in the plane up to as much.
+OUT_OF_PLANE = 1e-5
 
 
 class FramePoint(eqx.Module):
@@ -47,6 +52,17 @@ class FramePoint(eqx.Module):
     @property
     def tangents(self) -> Float[Array, "3 m"]:
         return tangent(self.quaternions)
+
+    def flattened(self, normal: Float[Array, "3"], across: Float[Array, "3"]) -> "FramePoint":
+        """The point turned into a plane: with the normal along `across` in the axes of each frame."""
+        tangents = self.tangents
+        in_plane = tangents - normal[:, None] * (normal @ tangents)[None]
+        sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
+        swung_into = swung(self.quaternions, in_plane / jnp.where(sizes > 0, sizes, 1.0))
+        seen = rotated(inverse(swung_into), jnp.broadcast_to(normal[:, None], tangents.shape))
+        turn = jnp.arctan2(seen[1], seen[0]) - jnp.arctan2(across[1], across[0])
+        force = self.end_force - normal[:, None] * (normal @ self.end_force)[None]
+        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist))
 
 
 class Strained(eqx.Module):
@@ -83,7 +99,8 @@ class FrameForm(Form):
     """A nondimensional scene on cells, as a function of a `FramePoint`.
 
     `rest_strains` and `rest_ways`: of the rod at rest, by the formula of the cells, and what its ways from node to node
-    have beyond that; `loads`: what the dead loads beyond each strain point exert on it.
+    have beyond that; `loads`: what the dead loads beyond each strain point exert on it; `across`: the normal of the
+    plane in which the rod stays, in the axes of every frame, `None` where it may leave its place in all of space.
     """
 
     scene: Scene
@@ -93,6 +110,7 @@ class FrameForm(Form):
     rest_ways: Float[Array, "3 n"] | None
     loads: Float[Array, "3 k n"]
     layout: ForceLayout
+    across: Float[Array, "3"] | None = eqx.field(kw_only=True, default=None)
 
     @classmethod
     def of(cls, scene: Scene, field: Cells) -> "FrameForm":
@@ -110,6 +128,43 @@ class FrameForm(Form):
             free = free.at[: 2 if held.frame is None else 3, held.number].set(0.0)
         return free
 
+    def in_plane(
+        self, point: FramePoint, normal: Float[Array, "3"], axes: Float[Array, "3 2"]
+    ) -> tuple["FrameForm", FramePoint]:
+        """The same for a rod that stays in a plane: with the normal of this where a held frame has it, else along the
+        axis d1 or d2 that is nearest to it at the first frame of a point.
+        """
+        held = [held.frame for held in self.held_frames if held.frame is not None]
+        if held:
+            across = normal @ held[0]
+        else:
+            first = rotated(inverse(point.quaternions[:, 0]), normal)
+            nearest = jnp.argmax(jnp.abs(first[:2]))
+            across = jnp.where(jnp.arange(3) == nearest, jnp.where(first < 0, -1.0, 1.0), 0.0).astype(first.dtype)
+        form = dataclasses.replace(self, across=across, layout=self.layout.in_axes(axes))
+        return form, point.flattened(normal, across)
+
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "FrameForm":
+        return dataclasses.replace(self, across=None, layout=self.layout.in_axes(None))
+
+    def stays_in_plane(self, point: FramePoint) -> Bool[Array, ""]:
+        gradient, _ = dataclasses.replace(self, across=None).unbalanced(point)
+        largest = jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
+        return self._residual(gradient - self.projected(gradient)) <= OUT_OF_PLANE * (1 + largest)
+
+    def projected(self, by_frame: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+        """What turns frames, or is turned, without what supports hold or leads out of the plane."""
+        by_frame = by_frame * self.is_free
+        return by_frame if self.across is None else self.across[:, None] * (self.across @ by_frame)[None]
+
+    @property
+    def projection(self) -> Float[Array, "3 3 m"]:
+        """The same as matrices."""
+        free = self.is_free
+        if self.across is None:
+            return jnp.eye(3, dtype=free.dtype)[..., None] * free[:, None]
+        return self.across[:, None, None] * (self.across[:, None] * free)[None]
+
     @property
     def held_frames(self) -> list[HeldFrame]:
         ends = ((self.scene.start, 0), (self.scene.end, -1))
@@ -125,7 +180,8 @@ class FrameForm(Form):
         ]
 
     def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
-        return columns(point.quaternions) * self.is_free[None]
+        bases = columns(point.quaternions)
+        return bases * self.is_free[None] if self.across is None else _times(bases, self.projection)
 
     def turn(self, point: FramePoint, bases: Float[Array, "3 3 m"], axis: Float[Array, "3"]) -> Float[Array, "3 m"]:
         return components(bases, jnp.broadcast_to(axis[:, None], point.tangents.shape))
@@ -299,7 +355,7 @@ class FrameForm(Form):
         if self.layout.size:
             edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros((), end_force.dtype)))
             closure = self.layout.components(self.spans - self.layout.sums(edges.T))
-        return gradient * self.is_free, closure
+        return self.projected(gradient), closure
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         return self._unbalanced(point.quaternions, point.end_force)
@@ -317,11 +373,20 @@ class FrameForm(Form):
         cells = derivatives(self._cells(point.quaternions, point.end_force))
         diagonal, lower, across = field.couplings(cells.second)
         free = self.is_free
-        diagonal = diagonal * free[:, None] * free[None] + jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
-        lower = lower * free[:, None, 1:] * free[None, :, :-1]
-        if across is not None:
-            across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
-        return cells, field.assembled(cells.first) * free, (diagonal, lower, across)
+        held = jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
+        if self.across is None:
+            diagonal = diagonal * free[:, None] * free[None] + held
+            lower = lower * free[:, None, 1:] * free[None, :, :-1]
+            if across is not None:
+                across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
+        else:
+            projection = self.projection
+            held = jnp.eye(3, dtype=free.dtype)[..., None] - projection
+            diagonal = _times(_times(projection, diagonal), projection) + held
+            lower = _times(_times(projection[..., 1:], lower), projection[..., :-1])
+            if across is not None:
+                across = _times(_times(projection[..., 2::2], across), projection[..., 0:-1:2])
+        return cells, self.projected(field.assembled(cells.first)), (diagonal, lower, across)
 
     def _with_cells(self, point: FramePoint) -> Linearization:
         """By two derivatives of each cell."""
@@ -334,7 +399,7 @@ class FrameForm(Form):
         if layout.size:
             value += jnp.sum(point.end_force * self.spans)
             closure = layout.components(self.spans - layout.sums(cells.way))
-            border = self.field.assembled(layout.columns(cells.by_force)) * self.is_free[:, None]
+            border = _times(self.projection, self.field.assembled(layout.columns(cells.by_force)))
             compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),
@@ -349,22 +414,22 @@ class FrameForm(Form):
         """By one derivative of all that is out of balance, by all rotations."""
         q = point.quaternions
         gradient, closure = self._unbalanced(q, point.end_force)
-        free = self.is_free
 
         def residual(unknowns: Float[Array, "3m+c"]) -> Float[Array, "3m+c"]:
-            rotation = unknowns[: free.size].reshape(free.shape)
-            force = point.end_force + self.layout.forces(unknowns[free.size :])
-            gradient, closure = self._unbalanced(turned(q, rotation * free), force)
-            return jnp.concatenate([gradient.reshape(-1), closure])
+            rotation = unknowns[: gradient.size].reshape(gradient.shape)
+            force = point.end_force + self.layout.forces(unknowns[gradient.size :])
+            turning, closure = self._unbalanced(turned(q, self.projected(rotation)), force)
+            # Unit rows for what is not turned.
+            turning += rotation - self.projected(rotation)
+            return jnp.concatenate([turning.reshape(-1), closure])
 
-        unknowns = jnp.zeros(free.size + len(closure), gradient.dtype)
+        unknowns = jnp.zeros(gradient.size + len(closure), gradient.dtype)
         matrix = jax.jacfwd(residual)(unknowns)
-        held = jnp.concatenate([1 - free.reshape(-1), jnp.zeros_like(closure)])
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
             closure=closure,
-            system=DenseSystem(matrix + jnp.diag(held), (3, free.shape[1])),
+            system=DenseSystem(matrix, (3, gradient.shape[1])),
             energy=self.elastic_energy(point),
             residual=self._residual(gradient),
         )
@@ -422,3 +487,7 @@ class FrameForm(Form):
         eps = jnp.finfo(largest.dtype).eps
         stiffest = jnp.maximum(self.sections.stiffest, 1.0)
         return FLOOR_SAFETY * eps * 4.0 * (largest + stiffest / self.field.finest**2)
+
+
+def _times(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
+    return short_sum(a[:, :, None] * b[None], axis=1)

@@ -8,6 +8,8 @@ the rod, each cell has a force of its own.
 A cell lies between two neighbouring nodes; forces are (3, parts), one column for each span or cell.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -41,6 +43,9 @@ class SpanForces(eqx.Module):
         first = 0 if isinstance(scene.start, Held) else 1
         stop = parts if isinstance(scene.end, Held) else parts - 1
         return SpanForces(members, None, parts, first, max(first, stop))
+
+    def in_axes(self, axes: Float[Array, "3 a"] | None) -> "SpanForces":
+        return dataclasses.replace(self, axes=axes)
 
     @property
     def closed(self) -> slice:
@@ -100,9 +105,20 @@ class SpanForces(eqx.Module):
 
 
 class CellForces(eqx.Module):
-    """One force in each cell, all of them unknown; methods as of `SpanForces`."""
+    """One force in each cell, all of them unknown; methods as of `SpanForces`.
+
+    `normal`: of the plane of a rod that stays in one: no force has a component along it.
+    """
 
     parts: int = eqx.field(static=True)
+    normal: Float[Array, "3"] | None = None
+
+    def in_axes(self, axes: Float[Array, "3 2"] | None) -> "CellForces":
+        return CellForces(self.parts, None if axes is None else jnp.cross(axes[:, 0], axes[:, 1]))
+
+    def compliance(self, by_cell: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
+        """Of each cell; along the normal one that leaves the force there zero."""
+        return by_cell if self.normal is None else by_cell + (self.normal[:, None] * self.normal[None])[..., None]
 
     @property
     def size(self) -> int:

@@ -96,15 +96,16 @@ class ByCells(NamedTuple):
 class MixedForm(Form):
     """A nondimensional scene on a field of tangents, as a function of a `MixedPoint`.
 
-    `loads_beyond`: what the loads exert on what lies beyond each point, on the side of a cell. The `axes` of the layout
-    are those along which the rod may leave its place: two for a rod in a plane, its normal for motions out of it. In a
-    symmetric scene the two kinds do not couple.
+    `loads_beyond`: what the loads exert on what lies beyond each point, on the side of a cell; `axes`: those along
+    which the rod may leave its place, as the layout has them: two for a rod in a plane, its normal for motions out of
+    it, `None` for all of space. In a symmetric scene the two kinds do not couple.
     """
 
     scene: Scene
     field: TangentField
     layout: ForceLayout
     loads_beyond: Float[Array, "3 p n"]
+    axes: Float[Array, "3 a"] | None = eqx.field(kw_only=True, default=None)
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "MixedForm":
@@ -112,12 +113,15 @@ class MixedForm(Form):
         return cls(scene=scene, field=field, layout=layout, loads_beyond=field.loads_beyond(scene))
 
     def in_axes(self, axes: Float[Array, "3 a"]) -> "MixedForm":
-        assert isinstance(self.layout, SpanForces)
-        return dataclasses.replace(self, layout=dataclasses.replace(self.layout, axes=axes))
+        return dataclasses.replace(self, axes=axes, layout=self.layout.in_axes(axes))
 
-    @property
-    def axes(self) -> Float[Array, "3 a"] | None:
-        return self.layout.axes if isinstance(self.layout, SpanForces) else None
+    def in_plane(
+        self, point: MixedPoint, normal: Float[Array, "3"], axes: Float[Array, "3 2"]
+    ) -> tuple["MixedForm", MixedPoint]:
+        return self.in_axes(axes), point.flattened(axes)
+
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "MixedForm":
+        return self.in_axes(normal[:, None])
 
     def bases(self, tangents: Float[Array, "3 n"]) -> Float[Array, "3 b n"]:
         """Directions at right angles to each tangent, along the axes."""

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.along import Value, largest_beside, value_at
 from rodjax.blocks import short_sum
 from rodjax.chain import ChainSystem
+from rodjax.discretization.cell_derivatives import CellDerivatives
 from rodjax.discretization.cells import Cells
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.framed import FrameForm, FramePoint, Kinematics
@@ -288,6 +289,9 @@ class TouchingTangents(TouchingForm, MixedForm):
             softening=jnp.ones((), loads_beyond.dtype),
         )
 
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "TouchingTangents":
+        return dataclasses.replace(self, axes=None, layout=self.layout.in_axes(None))
+
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
         return self.slopes(point)[:, ::2].T
 
@@ -305,7 +309,7 @@ class TouchingTangents(TouchingForm, MixedForm):
         closure = [balance.reshape(-1), self._gaps(edges).reshape(-1)]
         dtype = energy.dtype
         if softness is None:
-            border, compliance = jnp.zeros((2, 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
+            border, compliance = jnp.zeros((len(bases[0]), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
             assert torque_column is not None
             border, compliance = torque_column, softness[None, None]
@@ -319,7 +323,7 @@ class TouchingTangents(TouchingForm, MixedForm):
             border,
             compliance,
             cells.by_force,
-            cells.compliance,
+            self.layout.compliance(cells.compliance),
             second,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
@@ -393,8 +397,8 @@ class TouchingFrames(TouchingForm, FrameForm):
             across,
             jnp.zeros((3, 0, gradient.shape[1]), dtype),
             jnp.zeros((0, 0), dtype),
-            cells.by_force * self.field.of_cells(self.is_free)[:, None],
-            cells.compliance,
+            self._by_force(cells),
+            self.layout.compliance(cells.compliance),
             second,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
@@ -408,11 +412,17 @@ class TouchingFrames(TouchingForm, FrameForm):
             residual=_larger(jnp.max(jnp.abs(balance)), self._residual(gradient)),
         )
 
+    def _by_force(self, cells: CellDerivatives) -> Float[Array, "3 3 3 n"]:
+        by_force = cells.by_force * self.field.of_cells(self.is_free)[:, None]
+        if self.across is None:
+            return by_force
+        return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
+
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
         gradient = self.field.assembled(self.by_rotations(point.quaternions, point.end_force))
         edges = self.edges(point)
         balance, _ = self._balance(edges, point.end_force)
-        return gradient * self.is_free, jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)])
+        return self.projected(gradient), jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)])
 
     def _with_contacts(
         self, value: Float[Array, ""], edges: Float[Array, "n 3"], end_force: Float[Array, "3 n"]

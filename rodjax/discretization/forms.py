@@ -8,7 +8,7 @@ from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.touching import TouchingFrames, TouchingTangents
+from rodjax.discretization.touching_forms import TouchingFrames, TouchingTangents
 from rodjax.scene import Scene
 
 

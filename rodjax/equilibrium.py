@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import math
 import typing
-import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -64,6 +63,7 @@ from rodjax.solvers.nonlinear_cg import NonlinearCG, minimize
 from rodjax.status import Outcome, Status, is_converged
 from rodjax.supports import Clamp
 from rodjax.units import Units
+from rodjax.warn import warn
 
 Solver = Newton | NonlinearCG
 Discretization = Literal["finite_difference", "hermite"]
@@ -245,11 +245,10 @@ def _is_finest(options: Options) -> bool:
 
 def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
     if not error <= rtol:
-        warnings.warn(
+        warn(
             f"the estimated error {error:.1e} (of the shape, or a tenth of that of forces, moments or curvature) is "
             f"above rtol = {rtol:g}{where} on the finest mesh, of {options.segments} segments",
             NotConvergedWarning,
-            stacklevel=4,
         )
 
 

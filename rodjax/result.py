@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -48,6 +47,7 @@ from rodjax.stability import examined
 from rodjax.status import Outcome, Status, is_converged, with_strain
 from rodjax.units import Units
 from rodjax.vectors import dot, root
+from rodjax.warn import warn
 
 # A rod deeper within an obstacle than this part of its radius is so by forces beyond all loads on it, as in a jam.
 MOST_PENETRATION = 1e-4
@@ -578,23 +578,21 @@ def warn_if_coarse(equilibrium: Equilibrium) -> None:
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
         most = f"{np.max(turn[is_coarse]):.1f} rad"
-        warnings.warn(
+        warn(
             f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {most} along one of them; "
             "more segments, or rtol in the place of segments, may help; rodjax.describe tells the errors",
             MeshWarning,
-            stacklevel=4,
         )
 
 
 @functools.cache
 def warn_of_unknown_mesh(segments: int) -> None:
     """Once in a process: where numbers are not known, no error can be looked at and no mesh chosen."""
-    warnings.warn(
+    warn(
         f"the mesh is one of {segments} segments, whatever its errors, as numbers are not known inside jax.jit, vmap "
         "or grad: values and derivatives differ by those errors from what the same solve gives outside, on a mesh "
         "chosen for rtol; segments= states a mesh (this is said once)",
         MeshWarning,
-        stacklevel=4,
     )
 
 
@@ -606,15 +604,14 @@ def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | f
     if not status.any():  # all CONVERGED
         return
     if not np.all(equilibrium.converged):
-        warnings.warn(_outcome(equilibrium), NotConvergedWarning, stacklevel=3)
+        warn(_outcome(equilibrium), NotConvergedWarning)
     is_overstretched = status == Status.OVERSTRETCHED
     # In the continuum strains may be traced where the status is not.
     if not is_overstretched.any() or not is_known(equilibrium.axial_strain, strain_limit):
         return
     count = int(np.sum(is_overstretched))
     rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
-    warnings.warn(
+    warn(
         f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}",
         OverstretchedWarning,
-        stacklevel=3,
     )

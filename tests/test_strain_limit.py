@@ -32,6 +32,24 @@ def test_a_taut_rod_is_told_by_status_warning_and_words():
     assert "largest axial strain +25 % at s = " in rj.describe(taut)
 
 
+def test_warnings_point_at_the_line_that_called():
+    scenes = jax.vmap(between_clamps)(jnp.array([0.5, 0.75]))
+    calls = [
+        lambda: rj.solve(between_clamps(0.75), **MESH),
+        lambda: rj.solve_batch(scenes, **MESH),
+        lambda: rj.solve_path(scenes, **MESH),
+    ]
+    for call in calls:
+        with pytest.warns(rj.OverstretchedWarning) as caught:
+            call()
+        assert {warning.filename for warning in caught} == {__file__}
+
+
+def test_in_the_continuum_too():
+    with pytest.warns(rj.OverstretchedWarning, match=r"largest axial strain \+25 % at s = "):
+        rj.solve_continuum(between_clamps(0.75))
+
+
 def test_the_limit_is_an_argument_that_compiles_nothing():
     scene = between_clamps(0.75)
     for limit, status in ((0.26, rj.Status.CONVERGED), (0.24, rj.Status.OVERSTRETCHED), (None, rj.Status.CONVERGED)):

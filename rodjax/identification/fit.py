@@ -2,7 +2,6 @@
 
 import functools
 import math
-import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -35,6 +34,7 @@ from rodjax.identification.setup import (
 )
 from rodjax.identification.unknowns import Unknown, with_values
 from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.warn import warn
 
 # The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.
 MAX_ROUNDS = 20
@@ -91,11 +91,10 @@ def fit(
         structure, results = better, beginnings(better, problem, at, results)
     warn_of_lost(setup, np.asarray(found.evaluation.is_used))
     if not found.converged:
-        warnings.warn(
+        warn(
             f"the fit has not converged in {int(found.steps)} steps: better values to start from, bounds or priors may "
             "help",
             NotConvergedWarning,
-            stacklevel=2,
         )
     result = Fit.of(setup, structure, problem, found, held, error)
     if result.undetermined:

@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
@@ -27,6 +26,7 @@ from rodjax.path import stack_scenes
 from rodjax.refinement import SAFETY, SIZES, next_size
 from rodjax.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.scene import held_position
+from rodjax.warn import warn
 
 DEFAULT_RTOL = 1e-4
 MAX_STEPS = 100
@@ -366,10 +366,9 @@ def warn_of_lost(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> None:
             "start from (Unknown's start, the scene's numbers) or a guess of the shape may help"
         )
     shown = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    warnings.warn(
+    warn(
         f"{len(names)} experiments are left out of the fit, as no equilibrium was found where it begins: {shown}",
         NotConvergedWarning,
-        stacklevel=3,
     )
 
 

@@ -6,12 +6,13 @@ border, says which rotations and forces take it away: O(n). All of it is made of
 derivative has derivatives itself, and a transpose.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rodjax.checks import is_known
 from rodjax.discretization.form import Point
@@ -75,51 +76,49 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
     _, point = form_and_point(result)
     places, of_places = result.state.places, None
-    if places is not None:
-        scaled = slid(scaled, places)
-        scaled_change, of_places = _slid_change(scaled, scaled_change, shape, point, result)
-    changes = _change(scaled, scaled_change, shape, point, result.converged, result.residual)
+    if places is None:
+        changes = _response(scaled, shape, point, result)(scaled_change)
+    else:
+        changes, of_places = _slid_change(slid(scaled, places), scaled_change, shape, point, result)
     _, change = jax.jvp(same, (scene, shape, point, places), (scene_change, *changes, of_places))
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
 def _slid_change(
     scene: Scene, scene_change: Scene, shape: Shape, point: Point, result: Equilibrium
-) -> tuple[Scene, Float[Array, "slides"]]:
-    """The change of a nondimensional scene with that of the arclengths of its sliding clips, and this: by as much as
-    leaves them without axial force.
+) -> tuple[tuple[Shape, Point], Float[Array, "slides"]]:
+    """The change of shape and point of an equilibrium with that of its nondimensional scene and of the arclengths of
+    its sliding clips, and the latter: by as much as leaves them without axial force.
     """
+    respond = _response(scene, shape, point, result)
 
-    def gained(change: Scene) -> Float[Array, "slides"]:
-        """What the axial forces gain."""
-        changes = _change(scene, change, shape, point, result.converged, result.residual)
+    def with_axial(change: Scene) -> tuple[tuple[Shape, Point], Float[Array, "slides"]]:
+        """And what the axial forces gain."""
+        changes = respond(change)
 
         def axial(scene: Scene, shape: Shape, point: Point) -> Float[Array, "slides"]:
             return form_of(scene, shape).axial_forces(point)
 
-        return jax.jvp(axial, (scene, shape, point), (change, *changes))[1]
+        return changes, jax.jvp(axial, (scene, shape, point), (change, *changes))[1]
 
     places = sliding_places(scene)
     assert places is not None
-    fixed = slid(scene_change, jnp.zeros_like(places))
     alone = jax.tree.map(jnp.zeros_like, scene)
-    rates = jax.vmap(lambda change: gained(slid(alone, change)))(jnp.eye(len(places), dtype=places.dtype)).T
-    of_places = -jnp.linalg.solve(rates, gained(fixed))
-    return slid(fixed, of_places), of_places
+    each = jnp.eye(len(places), dtype=places.dtype)
+    by_places, rates = jax.vmap(lambda change: with_axial(slid(alone, change)))(each)
+    fixed, gained = with_axial(slid(scene_change, jnp.zeros_like(places)))
+    of_places = -jnp.linalg.solve(rates.T, gained)
+    return jax.tree.map(lambda one, rate: one + jnp.tensordot(of_places, rate, 1), fixed, by_places), of_places
 
 
-def _change(
-    scene: Scene,
-    scene_change: Scene,
-    shape: Shape,
-    point: Point,
-    is_equilibrium: Bool[Array, ""],
-    residual: Float[Array, ""],
-) -> tuple[Shape, Point]:
-    """The change of shape and point of an equilibrium with that of its scene, nondimensional.
+def _response(scene: Scene, shape: Shape, point: Point, result: Equilibrium) -> Callable[[Scene], tuple[Shape, Point]]:
+    """How shape and point of an equilibrium change with its scene, nondimensional.
 
     Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
     """
+    form, begin = carried_to(scene, shape, point)
+    here = form.linearized(begin)
+    factors, is_critical, neutral = examined(form, begin, here, result.residual)
 
     def gradient(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         form, here = carried_to(scene, shape, point)
@@ -129,14 +128,14 @@ def _change(
         form, there = carried_to(scene, shape, point, motion)
         return shape.reached(form, there), form.settled(there)
 
-    form, begin = carried_to(scene, shape, point)
-    here = form.linearized(begin)
-    factors, is_critical, neutral = examined(form, begin, here, residual)
-    _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
-    # A factor, as a choice between numbers would leave the transpose without the one that is none.
-    sign = jnp.where(is_equilibrium & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
-    f, c = sign * f, sign * c
-    motion = Motion(*factors.solve(f, c)).without(neutral)
-    nothing = jax.tree.map(jnp.zeros_like, motion)
-    _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
-    return changes
+    def respond(scene_change: Scene) -> tuple[Shape, Point]:
+        _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
+        # A factor, as a choice between numbers would leave the transpose without the one that is none.
+        sign = jnp.where(result.converged & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
+        f, c = sign * f, sign * c
+        motion = Motion(*factors.solve(f, c)).without(neutral)
+        nothing = jax.tree.map(jnp.zeros_like, motion)
+        _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
+        return changes
+
+    return respond

@@ -157,13 +157,14 @@ class FrameForm(Form):
         by_frame = by_frame * self.is_free
         return by_frame if self.across is None else self.across[:, None] * (self.across @ by_frame)[None]
 
+    def _projected_columns(self, border: Float[Array, "3 k m"]) -> Float[Array, "3 k m"]:
+        return border * self.is_free[:, None] if self.across is None else _times(self._projection, border)
+
     @property
-    def projection(self) -> Float[Array, "3 3 m"]:
-        """The same as matrices."""
-        free = self.is_free
-        if self.across is None:
-            return jnp.eye(3, dtype=free.dtype)[..., None] * free[:, None]
-        return self.across[:, None, None] * (self.across[:, None] * free)[None]
+    def _projection(self) -> Float[Array, "3 3 m"]:
+        """The same in a plane, as matrices."""
+        assert self.across is not None
+        return self.across[:, None, None] * (self.across[:, None] * self.is_free)[None]
 
     @property
     def held_frames(self) -> list[HeldFrame]:
@@ -181,7 +182,7 @@ class FrameForm(Form):
 
     def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
         bases = columns(point.quaternions)
-        return bases * self.is_free[None] if self.across is None else _times(bases, self.projection)
+        return bases * self.is_free[None] if self.across is None else _times(bases, self._projection)
 
     def turn(self, point: FramePoint, bases: Float[Array, "3 3 m"], axis: Float[Array, "3"]) -> Float[Array, "3 m"]:
         return components(bases, jnp.broadcast_to(axis[:, None], point.tangents.shape))
@@ -372,16 +373,16 @@ class FrameForm(Form):
         field = self.field
         cells = derivatives(self._cells(point.quaternions, point.end_force))
         diagonal, lower, across = field.couplings(cells.second)
-        free = self.is_free
-        held = jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
         if self.across is None:
+            free = self.is_free
+            held = jnp.eye(3, dtype=free.dtype)[..., None] * (1 - free)[:, None]
             diagonal = diagonal * free[:, None] * free[None] + held
             lower = lower * free[:, None, 1:] * free[None, :, :-1]
             if across is not None:
                 across = across * free[:, None, 2::2] * free[None, :, 0:-1:2]
         else:
-            projection = self.projection
-            held = jnp.eye(3, dtype=free.dtype)[..., None] - projection
+            projection = self._projection
+            held = jnp.eye(3, dtype=projection.dtype)[..., None] - projection
             diagonal = _times(_times(projection, diagonal), projection) + held
             lower = _times(_times(projection[..., 1:], lower), projection[..., :-1])
             if across is not None:
@@ -399,7 +400,7 @@ class FrameForm(Form):
         if layout.size:
             value += jnp.sum(point.end_force * self.spans)
             closure = layout.components(self.spans - layout.sums(cells.way))
-            border = _times(self.projection, self.field.assembled(layout.columns(cells.by_force)))
+            border = self._projected_columns(self.field.assembled(layout.columns(cells.by_force)))
             compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),

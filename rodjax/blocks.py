@@ -1,4 +1,4 @@
-"""Small blocks along a rod, (b, b, n) with b = 1 to 3: sums written out, inverses, and the signs of eigenvalues."""
+"""Small blocks along a rod, (b, b, n), b = 1 to 3: sums written out, products, inverses, the signs of eigenvalues."""
 
 import functools
 
@@ -9,6 +9,16 @@ from jaxtyping import Array, Float, Int
 def short_sum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
     """Sum over an axis of few entries, written out: XLA makes a sum over an axis a loop at each place along the rod."""
     return functools.reduce(jnp.add, jnp.unstack(x, axis=axis)) if x.shape[axis] else jnp.sum(x, axis=axis)
+
+
+def product(a: Float[Array, "i k *m"], b: Float[Array, "k j *m"]) -> Float[Array, "i j *m"]:
+    """a b block by block."""
+    return short_sum(a[:, :, None] * b[None], axis=1)
+
+
+def transpose_product(a: Float[Array, "k i *m"], b: Float[Array, "k j *m"]) -> Float[Array, "i j *m"]:
+    """a^T b block by block."""
+    return short_sum(a[:, :, None] * b[:, None], axis=0)
 
 
 def inverse_of_blocks(

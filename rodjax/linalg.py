@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.blocks import inverse_of_blocks, short_sum
+from rodjax.blocks import inverse_of_blocks, product, short_sum, transpose_product
 from rodjax.chain import ChainFactors, ChainSystem, factor_chain
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
@@ -58,13 +58,13 @@ class SaddlePointSystem(eqx.Module):
     def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
         """The matrix times (x, y): the right sides f and c."""
         columns = x[:, None]
-        below = _product(self.lower, columns[..., :-1])[:, 0]
-        above = _transpose_product(self.lower, columns[..., 1:])[:, 0]
-        f = _product(self.diagonal, columns)[:, 0] + jnp.sum(self.border * y[None, :, None], axis=1)
+        below = product(self.lower, columns[..., :-1])[:, 0]
+        above = transpose_product(self.lower, columns[..., 1:])[:, 0]
+        f = product(self.diagonal, columns)[:, 0] + jnp.sum(self.border * y[None, :, None], axis=1)
         f = f.at[:, 1:].add(below).at[:, :-1].add(above)
         if self.across is not None:
-            f = f.at[:, 2::2].add(_product(self.across, columns[..., 0:-1:2])[:, 0])
-            f = f.at[:, 0:-1:2].add(_transpose_product(self.across, columns[..., 2::2])[:, 0])
+            f = f.at[:, 2::2].add(product(self.across, columns[..., 0:-1:2])[:, 0])
+            f = f.at[:, 0:-1:2].add(transpose_product(self.across, columns[..., 2::2])[:, 0])
         rows = self.border if self.rows is None else self.rows
         return f, jnp.sum(rows * x[:, None], axis=(0, 2)) - self.compliance @ y
 
@@ -231,15 +231,15 @@ class _Elimination(eqx.Module):
         eliminated = []
         for level in self.levels:
             goes, f = level.parted(f)
-            eliminated.append(_product(level.inverse, goes))
-            beside = _transpose_product(level.before, goes), _transpose_product(level.after, goes)
+            eliminated.append(product(level.inverse, goes))
+            beside = transpose_product(level.before, goes), transpose_product(level.after, goes)
             f -= level.added(*beside, f.shape[-1])
-        return self.back_substituted(_product(self.last_inverse, f), eliminated)
+        return self.back_substituted(product(self.last_inverse, f), eliminated)
 
     def back_substituted(self, x: Float[Array, "b j 1"], eliminated: list[Array]) -> Float[Array, "b j n"]:
         for level, goes in zip(reversed(self.levels), reversed(eliminated), strict=True):
             before, after = level.around(x)
-            x = level.joined(goes - _product(level.before, before) - _product(level.after, after), x)
+            x = level.joined(goes - product(level.before, before) - product(level.after, after), x)
         return x
 
 
@@ -268,20 +268,20 @@ def _eliminate(
         before = _padded(_shifted(lower[..., 1 - first :: 2], 1 - first), m)
         after = _padded(jnp.swapaxes(lower[..., first::2], 0, 1), m)
         inverse, below = inverse_of_blocks(goes[:, :b], least)
-        scaled = _product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
+        scaled = product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
         level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b], first)
         levels.append(level)
         eliminated.append(scaled[:, 2 * b :])
         negative += below
-        to_before = _transpose_product(before, jnp.concatenate([level.before, eliminated[-1]], axis=1))
-        to_after = _transpose_product(after, scaled[:, b:])
+        to_before = transpose_product(before, jnp.concatenate([level.before, eliminated[-1]], axis=1))
+        to_after = transpose_product(after, scaled[:, b:])
         rows = stays - level.added(to_before, to_after, k)
-        lower = -_shifted(_transpose_product(after, level.before), first - 1)[..., : k - 1]
+        lower = -_shifted(transpose_product(after, level.before), first - 1)[..., : k - 1]
         if across is not None:
             lower, across = lower + across, None
     last_inverse, below = inverse_of_blocks(rows[:, :b])
     elimination = _Elimination(tuple(levels), last_inverse)
-    x = elimination.back_substituted(_product(last_inverse, rows[:, b:]), eliminated)
+    x = elimination.back_substituted(product(last_inverse, rows[:, b:]), eliminated)
     return elimination, negative + below, x
 
 
@@ -299,15 +299,6 @@ def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"]
 def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:
     """A^T x."""
     return jnp.sum(border * x[:, None], axis=(0, -1))
-
-
-def _product(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
-    return short_sum(a[:, :, None] * b[None], axis=1)
-
-
-def _transpose_product(a: Float[Array, "k i m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
-    """a^T b block by block."""
-    return short_sum(a[:, :, None] * b[:, None], axis=0)
 
 
 def _shifted(x: Array, by: int) -> Array:

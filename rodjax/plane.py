@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rodjax.along import Along
 from rodjax.checks import is_known
 from rodjax.loads import DistributedForce
 from rodjax.scene import Scene, dead_end_moment
@@ -60,7 +61,8 @@ def check_planar(scene: Scene, twist: Float[Array, "..."] | float) -> None:
     """
     if dead_end_moment(scene) is not None:
         raise ValueError("planar must be False for a moment on a free end")
-    if scene.rod.rest_twist is not None:
+    rest_twist = scene.rod.rest_twist
+    if rest_twist is not None and (isinstance(rest_twist, Along) or not is_known(rest_twist) or np.any(rest_twist)):
         raise ValueError("planar must be False for a rod that is twisted at rest: it leaves the plane as it bends")
     if scene.turns is not None:
         raise ValueError("planar must be False for a scene with turns: a twisted rod leaves the plane")

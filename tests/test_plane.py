@@ -260,6 +260,8 @@ def test_rods_by_frames_in_a_plane():
     in_space = rj.solve(scene(0.0), segments=SEGMENTS, guess=planar, find="equilibrium")
     assert in_space.iterations == 0
     assert in_space.index >= 1
+    # A twist at rest of zero is none.
+    check_planar(dataclasses.replace(scene(0.0), rod=flat(rest_twist=0.0)), 0.0)
     # Of sections that stand askew the moment has a part out of the plane.
     with pytest.warns(rj.NotConvergedWarning, match="planar is True, but supports, loads or twist leave the plane"):
         rj.solve(scene(0.5), segments=SEGMENTS, planar=True)

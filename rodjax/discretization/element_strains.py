@@ -6,8 +6,8 @@ quaternion and x = r . r. With u for the v of the other end, h times the strain 
     T = 3 v + u - a v x u + b v x (v x u) = 3 s r + u - A r x u + B [r (r . u) - x u],    A = a s,  B = b s^2,
 
 and that in the middle the difference of both v. Derivatives from vector algebra take a third of the program that JAX
-makes of the strains. Arrays have the components first, then both
-ends, then the elements; matrices rows and columns first.
+makes of the strains. Arrays have the components first, then both ends, then the elements; matrices rows and columns
+first.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import short_sum
+from rodjax.blocks import product
 from rodjax.vectors import cross, diagonal, dot, skew
 
 
@@ -86,7 +86,7 @@ class ElementStrains:
         own += _times(b.value, diagonal(w) + _outer(r, u) - 2 * _outer(u, r))
         own += 2 * _outer(_times(b.first, _times(w, r) - _times(x, u)), r)
         by_other = diagonal(1 - b.value * x) - skew(_times(a.value, r)) + _outer(_times(b.value, r), r)
-        by_other = _product(by_other, self.by_parts[:, :, ::-1])
+        by_other = product(by_other, self.by_parts[:, :, ::-1])
         ends = [
             [-own[:, :, 0], -by_other[:, :, 0]],
             [-self.by_parts[:, :, 0], self.by_parts[:, :, 1]],
@@ -117,7 +117,7 @@ class ElementStrains:
         by_vectors = by_other[:, ::-1] + jnp.stack([-middle, middle], axis=1)
         g = dot(by_vectors, r)
         own += _times(2 * s.first, _both(by_vectors, r) + diagonal(g)) + _outer(_times(4 * s.second * g, r), r)
-        mixed = _product(mixed, self.by_parts[:, :, ::-1])
+        mixed = product(mixed, self.by_parts[:, :, ::-1])
         between = mixed[:, :, 0] + jnp.swapaxes(mixed[:, :, 1], 0, 1)
         rows = [[own[:, :, 0], between], [jnp.swapaxes(between, 0, 1), own[:, :, 1]]]
         return jnp.stack([jnp.stack(row, axis=1) for row in rows])
@@ -164,8 +164,8 @@ def slopes(x: Float[Array, "2 n"]) -> tuple[ByOneSize, ByOneSize, ByOneSize]:
     return s, a, ByOneSize(value, first, (q.second - 2 * first * d.first - value * d.second) / d.value)
 
 
-def _polynomial(coefficients: Sequence[float], x: Array) -> Array:
-    *others, last = coefficients
+def _polynomial(polynomial: Sequence[float], x: Array) -> Array:
+    *others, last = polynomial
     value = jnp.full_like(x, last)
     for c in reversed(others):
         value = c + x * value
@@ -195,7 +195,3 @@ def _outer(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 
 
 def _both(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
     return _outer(a, b) + _outer(b, a)
-
-
-def _product(a: Float[Array, "i k *m"], b: Float[Array, "k j *m"]) -> Float[Array, "i j *m"]:
-    return short_sum(a[:, :, None] * b[None], axis=1)

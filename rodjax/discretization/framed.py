@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.blocks import product as block_product
 from rodjax.blocks import short_sum
 from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
 from rodjax.discretization.cells import REFERENCE, Cells, strains_between
@@ -158,7 +159,7 @@ class FrameForm(Form):
         return by_frame if self.across is None else self.across[:, None] * (self.across @ by_frame)[None]
 
     def _projected_columns(self, border: Float[Array, "3 k m"]) -> Float[Array, "3 k m"]:
-        return border * self.is_free[:, None] if self.across is None else _times(self._projection, border)
+        return border * self.is_free[:, None] if self.across is None else block_product(self._projection, border)
 
     @property
     def _projection(self) -> Float[Array, "3 3 m"]:
@@ -182,7 +183,7 @@ class FrameForm(Form):
 
     def bases_at(self, point: FramePoint) -> Float[Array, "3 3 m"]:
         bases = columns(point.quaternions)
-        return bases * self.is_free[None] if self.across is None else _times(bases, self._projection)
+        return bases * self.is_free[None] if self.across is None else block_product(bases, self._projection)
 
     def turn(self, point: FramePoint, bases: Float[Array, "3 3 m"], axis: Float[Array, "3"]) -> Float[Array, "3 m"]:
         return components(bases, jnp.broadcast_to(axis[:, None], point.tangents.shape))
@@ -383,10 +384,10 @@ class FrameForm(Form):
         else:
             projection = self._projection
             held = jnp.eye(3, dtype=projection.dtype)[..., None] - projection
-            diagonal = _times(_times(projection, diagonal), projection) + held
-            lower = _times(_times(projection[..., 1:], lower), projection[..., :-1])
+            diagonal = block_product(block_product(projection, diagonal), projection) + held
+            lower = block_product(block_product(projection[..., 1:], lower), projection[..., :-1])
             if across is not None:
-                across = _times(_times(projection[..., 2::2], across), projection[..., 0:-1:2])
+                across = block_product(block_product(projection[..., 2::2], across), projection[..., 0:-1:2])
         return cells, self.projected(field.assembled(cells.first)), (diagonal, lower, across)
 
     def _with_cells(self, point: FramePoint) -> Linearization:
@@ -488,7 +489,3 @@ class FrameForm(Form):
         eps = jnp.finfo(largest.dtype).eps
         stiffest = jnp.maximum(self.sections.stiffest, 1.0)
         return FLOOR_SAFETY * eps * 4.0 * (largest + stiffest / self.field.finest**2)
-
-
-def _times(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Float[Array, "i j m"]:
-    return short_sum(a[:, :, None] * b[None], axis=1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import is_known, leaf, number_list
+from rodjax.checks import Numbers, is_known, leaf, number_list
 
 
 class Along(eqx.Module):
@@ -30,7 +30,7 @@ class Along(eqx.Module):
 
     @property
     @abstractmethod
-    def samples(self) -> Float[Array, "m"]:
+    def samples(self) -> Float[Numbers, "m"]:
         """Values close enough to one another to tell the least and the largest."""
 
     def mean(self, a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "*k"]:
@@ -92,8 +92,13 @@ class Smooth(Along):
         _check_increasing(self.s, "s")
 
     @property
-    def samples(self) -> Float[Array, "m"]:
+    def samples(self) -> Float[Numbers, "m"]:
         # Between its values a spline may overshoot.
+        if is_known(self):
+            from scipy.interpolate import CubicSpline  # the same spline; JAX would compile a program for each operation
+
+            s, values = np.asarray(self.s), np.asarray(self.values)
+            return np.concatenate([values, CubicSpline(s, values)(np.linspace(s[0], s[-1], 8 * len(s)))])
         fine = jnp.linspace(self.s[0], self.s[-1], 8 * len(self.s))
         return jnp.concatenate([self.values, self.at(fine, fine, fine)])
 

@@ -12,6 +12,7 @@ from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
 from rodjax.guess import Guess
+from rodjax.kept_programs import keep_programs
 from rodjax.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.modes import Mode, lowest_mode, squared_frequencies
 from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
@@ -127,6 +128,7 @@ __all__ = [
     "fit_each",
     "follow",
     "frame",
+    "keep_programs",
     "load",
     "lowest_mode",
     "margins",

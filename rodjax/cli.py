@@ -12,7 +12,6 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -159,11 +158,6 @@ def _segments(text: str) -> int:
 
 def _set_up_jax() -> None:
     jax.config.update("jax_enable_x64", True)
-    # Without a folder to write to every run compiles anew, which is slower but no mistake.
-    with suppress(OSError, RuntimeError):
-        folder = rodjax.enable_compilation_cache()
-        if not os.access(folder, os.W_OK):
-            jax.config.update("jax_compilation_cache_dir", None)
 
 
 def _demo(arguments: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import inspect
 import itertools
 import logging
 import os
@@ -10,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
+from rodjax import kept_programs
 from rodjax.checks import is_known
 
 # XLA's older generator of code for loops on a processor: half the compile time at the same run time, see
@@ -22,25 +25,92 @@ _OUTSIDE = get_opaque_trace_state()
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
 SHARE_OF_MAPS = 0.5
+# Settings of JAX that a program depends on, and those under which none is kept.
+PRECISION = "jax_enable_x64"
+SETTINGS = ("jax_disable_jit", "jax_default_device")
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _log = logging.getLogger("rodjax")
 
 
 class _Programs:
-    """All that one function has been compiled to, and when it was last called."""
+    """All that one function has been compiled to, and when it was last called.
+
+    `part`: as a part of another program; `quick`: by itself, as JAX compiles it; `kept`: by itself, from disk or to be
+    kept there, by the structure and types of the arguments; `None` where that cannot be.
+    """
 
     def __init__(self, function: Callable, static_argnames: Sequence[str]):
+        self.name = f"{function.__module__}.{function.__qualname__}"
         self.part: Any = jax.jit(function, static_argnames=static_argnames)
         self.quick: Any = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
+        self.kept: dict[Any, Any] = {}
+        self.static = frozenset(static_argnames)
+        names = list(inspect.signature(function).parameters)
+        self.static_places = frozenset(names.index(name) for name in static_argnames)
         self.last_call = 0
 
     @property
     def count(self) -> int:
-        return self.part._cache_size() + self.quick._cache_size()
+        return self.part._cache_size() + self.quick._cache_size() + len(self.kept)
 
     def clear(self) -> None:
         self.part.clear_cache()
         self.quick.clear_cache()
+        self.kept.clear()
+
+    def whole(self, args: tuple, options: dict[str, Any]) -> Any:
+        """Called as a program of its own."""
+        self.last_call = next(_calls)
+        settings = tuple(getattr(jax.config, name) for name in SETTINGS)
+        if not kept_programs.is_keeping() or any(settings):
+            return self._by_jax(args, options)
+        statics: tuple = ()
+        given, given_options = args, options
+        if self.static:
+            statics = tuple(args[k] for k in self.static_places if k < len(args))
+            statics += tuple((name, options[name]) for name in sorted(self.static & options.keys()))
+            given = tuple(value for k, value in enumerate(args) if k not in self.static_places)
+            given_options = {name: value for name, value in options.items() if name not in self.static}
+        leaves, tree = jax.tree.flatten((given, given_options))
+        kinds = tuple(map(_kind, leaves))
+        key = tree, kinds, statics, getattr(jax.config, PRECISION)
+        if key not in self.kept:
+            self.kept[key] = self._found_or_compiled(key, args, options)
+            _make_room()
+        program = self.kept.get(key)
+        return self._by_jax(args, options) if program is None else program(*given, **given_options)
+
+    def _found_or_compiled(self, key: tuple, args: tuple, options: dict[str, Any]) -> Any:
+        tree, kinds, statics, _ = key
+        if None in kinds:
+            return None
+        name = kept_programs.name_of(self.name, QUICK, statics, tree, kinds)
+        if name is None:
+            return None
+        program = kept_programs.load(name, tree)
+        if program is None:
+            run = self.quick if _knows_quick() else self.part
+            program, is_new = kept_programs.compiled(run.lower(*args, **options))
+            if is_new:
+                kept_programs.store(name, program)
+        return program
+
+    def _by_jax(self, args: tuple, options: dict[str, Any]) -> Any:
+        run = self.quick if _knows_quick() else self.part
+        known = run._cache_size()
+        result = run(*args, **options)
+        if run._cache_size() != known:
+            _make_room()
+        return result
+
+
+def _kind(leaf: Any) -> tuple | None:
+    """All of an argument that a program depends on; `None` where it may not lie in this process's first device."""
+    if isinstance(leaf, jax.Array):
+        return None if leaf.committed else (leaf.shape, leaf.dtype, leaf.weak_type)
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.shape, leaf.dtype
+    return (type(leaf).__name__,) if type(leaf) in (bool, int, float) else None
 
 
 _compiled: list[_Programs] = []
@@ -59,13 +129,7 @@ def compiled(function: Callable, static_argnames: Sequence[str] = ()) -> Callabl
     def call(*args, **options):
         if not _is_whole(args, options):
             return programs.part(*args, **options)
-        run = programs.quick if _knows_quick() else programs.part
-        known = run._cache_size()
-        result = run(*args, **options)
-        programs.last_call = next(_calls)
-        if run._cache_size() != known:
-            _make_room()
-        return result
+        return programs.whole(args, options)
 
     return call
 

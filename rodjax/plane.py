@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.along import Along
 from rodjax.checks import is_known
+from rodjax.compilation import compiled
 from rodjax.loads import DistributedForce
 from rodjax.scene import Scene, dead_end_moment
 from rodjax.supports import Clamp, Clip, Directed, Free, Held
@@ -74,7 +75,7 @@ def check_planar(scene: Scene, twist: Float[Array, "..."] | float) -> None:
         )
     if not is_known(scene):
         return
-    leaving, twisting = (jax.vmap(_asymmetry) if scene.rod.length.ndim else _asymmetry)(scene)
+    leaving, twisting = map(np.asarray, _asymmetries(scene))
     if not np.max(leaving) <= TOLERANCE:
         raise ValueError(
             "planar must be False for this scene: supports and loads must lie in one plane, "
@@ -94,6 +95,12 @@ def _asymmetry(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
     if not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
         return leaving, jnp.zeros_like(leaving)
     return leaving, jnp.max(jnp.abs(normal @ scene.start.frame - normal @ scene.end.frame))
+
+
+@compiled
+def _asymmetries(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The same of a scene or a stack of them."""
+    return (jax.vmap(_asymmetry) if scene.rod.length.ndim else _asymmetry)(scene)
 
 
 def _directions(scene: Scene) -> Float[Array, "k 3"]:

@@ -230,9 +230,9 @@ class Equilibrium(eqx.Module):
         """
         s = leaf(number_list(s, "s")).astype(self.s.dtype)
         if is_known(s, self.s):
-            length = float(np.min(self.s[..., -1]))
-            if np.any(s < 0) or np.any(s > length):
-                raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(s):g} to {np.max(s):g} m")
+            numbers, length = np.asarray(s), float(np.min(np.asarray(self.s)[..., -1]))
+            if np.any(numbers < 0) or np.any(numbers > length):
+                raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(numbers):g} to {np.max(numbers):g} m")
         return positions_at(self, s)
 
 

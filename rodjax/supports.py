@@ -4,7 +4,6 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -158,19 +157,20 @@ def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
 
     The derivative of a solve by a frame is meant for rotations: take it by this vector, at zero.
     """
-    turned = jnp.asarray(rotation(frame, "frame"))
-    x, y, z = checked = vector(rotation_vector, "rotation_vector")
+    turned, checked = rotation(frame, "frame"), vector(rotation_vector, "rotation_vector")
     if is_known(checked) and not np.max(np.abs(checked)) < LARGEST_TURN:
         raise ValueError(f"rotation_vector must be shorter than {LARGEST_TURN:g} rad, got {shown(rotation_vector)}")
+    xp = namespace(turned, checked)
+    turned, (x, y, z) = xp.asarray(turned), xp.asarray(checked)
     squared = x * x + y * y + z * z
     # Series near zero, where the derivatives of the length are infinite.
     is_small = squared < 1e-4
-    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
-    a = jnp.where(is_small, 1 - squared / 6 + squared**2 / 120 - squared**3 / 5040, jnp.sin(angle) / angle)
-    b = jnp.where(is_small, 0.5 - squared / 24 + squared**2 / 720 - squared**3 / 40320, (1 - jnp.cos(angle)) / angle**2)
-    zero = jnp.zeros_like(squared)
-    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    return turned + a * (cross @ turned) + b * (cross @ (cross @ turned))
+    angle = xp.sqrt(xp.where(is_small, 1.0, squared))
+    a = xp.where(is_small, 1 - squared / 6 + squared**2 / 120 - squared**3 / 5040, xp.sin(angle) / angle)
+    b = xp.where(is_small, 0.5 - squared / 24 + squared**2 / 720 - squared**3 / 40320, (1 - xp.cos(angle)) / angle**2)
+    zero = xp.zeros_like(squared)
+    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
+    return leaf(turned + a * (cross @ turned) + b * (cross @ (cross @ turned)))
 
 
 def frame(tangent: Any, d2: Any = DEFAULT_D2) -> Float[Array, "3 3"]:

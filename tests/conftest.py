@@ -36,6 +36,9 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 rodjax.enable_compilation_cache()
+# Tests replace functions of the library, of which programs kept on disk would know nothing.
+os.environ["RODJAX_CACHE"] = "off"
+rodjax.keep_programs(False)
 
 
 def pytest_addoption(parser):

@@ -20,7 +20,6 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
-from unittest import mock
 
 import h5py
 import hypothesis.strategies as st
@@ -1143,8 +1142,7 @@ def full_disk(after: int) -> Iterator[None]:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (after, limits[1]))
     try:
-        with mock.patch("rodjax.enable_compilation_cache", Path):  # which the command line calls
-            yield
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from rodjax.checks import number_array
+from rodjax.checks import leaf, number_array
 from rodjax.identification import refits
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment
@@ -192,7 +192,8 @@ class Fit:
         for result in self.found.evaluation.results:
             count = result.s.shape[0]
             if row < count:
-                return jax.tree.map(lambda leaf, row=row: leaf[row], result)
+                # Not JAX's arrays, of which each shape would be a program.
+                return jax.tree.map(lambda numbers, row=row: leaf(np.asarray(numbers)[row]), result)
             row -= count
         raise IndexError(k)
 
@@ -257,7 +258,7 @@ def count_of_numbers(setup: Setup, is_used: Bool[np.ndarray, "e"]) -> int:
 
 
 def _residuals(setup: Setup, found: Found) -> list[list[Float[np.ndarray, "k d"]]]:
-    of_experiments = (x for group in found.evaluation.rows for x in zip(*group, strict=True))
+    of_experiments = (x for group in found.evaluation.rows for x in zip(*map(np.asarray, group), strict=True))
     residuals: dict[int, list[np.ndarray]] = {}
     for k, rows in zip(setup.order, of_experiments, strict=True):
         weights = [np.asarray(measured.weights) for measured in setup.experiments[k].measured]

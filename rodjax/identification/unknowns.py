@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import number_array, one_of, positive, sequence, shown
+from rodjax.checks import Numbers, leaf, namespace, number_array, one_of, positive, sequence, shown
 from rodjax.identification.measurements import Experiment
 from rodjax.scene import Scene
 from rodjax.sensitivity import named_numbers
@@ -239,12 +239,14 @@ def inside(x: Float[Array, "*n"], low: Float[Array, "*n"], high: Float[Array, "*
 
     With one bound the distance from it is that of a hyperbola from its asymptote; with two a sigmoid between them.
     """
-    has_low, has_high = jnp.isfinite(low), jnp.isfinite(high)
-    low, high = jnp.where(has_low, low, -1.0), jnp.where(has_high, high, 1.0)
+    xp = namespace(x, low, high)
+    x, low, high = xp.asarray(x), xp.asarray(low), xp.asarray(high)
+    has_low, has_high = xp.isfinite(low), xp.isfinite(high)
+    low, high = xp.where(has_low, low, -1.0), xp.where(has_high, high, 1.0)
     middle, half = (low + high) / 2, (high - low) / 2
-    between = middle + half * jnp.tanh((x - middle) / half)
+    between = middle + half * xp.tanh((x - middle) / half)
     above, below = low + _positive_part(x - low), high - _positive_part(high - x)
-    return jnp.where(has_low & has_high, between, jnp.where(has_low, above, jnp.where(has_high, below, x)))
+    return leaf(xp.where(has_low & has_high, between, xp.where(has_low, above, xp.where(has_high, below, x))))
 
 
 def outside(x: Float[np.ndarray, "*n"], low: Float[np.ndarray, "*n"], high: Float[np.ndarray, "*n"]) -> np.ndarray:
@@ -258,5 +260,5 @@ def outside(x: Float[np.ndarray, "*n"], low: Float[np.ndarray, "*n"], high: Floa
     return np.where(has_low & has_high, between, np.where(has_low, above, np.where(has_high, below, x)))
 
 
-def _positive_part(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    return (x + jnp.sqrt(x * x + 1)) / 2
+def _positive_part(x: Float[Numbers, "*n"]) -> Float[Numbers, "*n"]:
+    return (x + namespace(x).sqrt(x * x + 1)) / 2

@@ -1,0 +1,182 @@
+"""Programs kept on disk: found by all that they depend on, harmless where they are damaged or cannot be written."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+import rodjax as rj
+from rodjax import kept_programs
+from rodjax.compilation import compiled
+
+# Solves, and says how many programs were compiled for that and where the rod is. Under a moment LAPACK takes part.
+SCRIPT = """
+import jax; jax.config.update("jax_enable_x64", True)
+import rodjax as rj
+compiled = [0]
+def listen(name, *_, **more): compiled[0] += name.endswith("backend_compile_duration")
+jax.monitoring.register_event_duration_secs_listener(listen)
+clamp = rj.Clamp((0, 0, 0), rj.frame(tangent=(1, 0, 0)))
+result = rj.solve(rj.Scene(rj.Rod(1.0, 1.0, 1.0, 1e4), clamp, rj.Free(moment=(0.1, 0.2, 0.3))), segments=4)
+print(compiled[0], result.nodes.tolist())
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A new folder in which programs are kept, without JAX's cache: what comes from there cannot be."""
+    jaxs = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
+    yield rj.keep_programs(tmp_path / "programs")
+    rj.keep_programs(False)
+    jax.config.update("jax_compilation_cache_dir", jaxs)
+    compilation_cache.reset_cache()
+
+
+def program(scale: float = 2.0, name: str = "scaled"):
+    """A small program as if it were the library's, new to this process."""
+
+    def scaled(x, options=None):
+        return {"scaled": scale * x} if options is None else (x, options)
+
+    scaled.__module__, scaled.__qualname__ = "rodjax.example", name
+    return compiled(scaled)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.program"))
+
+
+def test_another_process_compiles_nothing(tmp_path):
+    def run() -> tuple[int, str]:
+        settings = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+        settings["RODJAX_CACHE"] = str(tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=settings, capture_output=True, text=True, check=True, timeout=300
+        )
+        count, said = done.stdout.split(" ", 1)
+        return int(count), said
+
+    (first, there), (second, again) = run(), run()
+    assert first >= 2
+    assert second == 0
+    assert there == again
+
+
+def test_a_program_is_found_by_its_arguments(folder):
+    x = jnp.arange(3.0)
+    np.testing.assert_array_equal(program()(x)["scaled"], [0, 2, 4])
+    assert len(files(folder)) == 1
+    # As if by another version of the source: what is kept under that name is taken.
+    np.testing.assert_array_equal(program(scale=5.0)(x)["scaled"], [0, 2, 4])
+    for other in (jnp.arange(4.0), np.float32([1, 2]), 1.5, 2):
+        result = program(scale=5.0)(other)["scaled"]
+        np.testing.assert_array_equal(result, 5.0 * np.asarray(other))
+    assert len(files(folder)) == 5
+    with jax.default_matmul_precision("float32"):
+        assert program(scale=5.0)(x)["scaled"][1] == 5.0
+    assert len(files(folder)) == 6
+    # Structure and static values count too.
+    program()(x, rj.Newton())
+    program()(x, rj.NonlinearCG())
+    assert len(files(folder)) == 8
+
+
+def test_another_source_is_another_program(folder, monkeypatch):
+    program()(1.0)
+    monkeypatch.setattr(kept_programs, "_surroundings", lambda: "another version")
+    assert program(scale=5.0)(1.0)["scaled"] == 5.0
+    assert len(files(folder)) == 2
+
+
+class Elsewhere(eqx.Module):
+    value: float = 1.0
+
+
+def test_what_is_defined_elsewhere_is_not_kept(folder):
+    """Its source may change, and its name stay the same."""
+    program()(1.0, Elsewhere())
+    outside = compiled(lambda x: x)
+    assert outside(1.0) == 1.0
+    # A program of another device.
+    x = jax.device_put(jnp.ones(3), jax.devices()[0])
+    np.testing.assert_array_equal(program()(x)["scaled"], [2, 2, 2])
+    assert not files(folder)
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:100], lambda content: content[:-1] + b"x", lambda _: b""])
+def test_a_damaged_file_is_written_anew(folder, damage):
+    program()(1.0)
+    (file,) = files(folder)
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert program(scale=3.0)(1.0)["scaled"] == 3.0
+    assert len(file.read_bytes()) > 100
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_of_once(folder, monkeypatch, caplog):
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(kept_programs, "replace_file", full)
+    for value in (1.0, np.ones(2)):
+        np.testing.assert_array_equal(program()(value)["scaled"], 2 * value)
+    assert len(caplog.records) == 1
+    assert "No space left on device" in caplog.text
+    # A folder that is a file.
+    (folder.parent / "file").touch()
+    rj.keep_programs(folder.parent / "file")
+    assert program()(np.ones(3))["scaled"][0] == 2.0
+    assert len(caplog.records) == 2
+
+
+def test_those_used_longest_ago_go(folder, monkeypatch):
+    program()(np.ones(1))
+    (first,) = files(folder)
+    size = first.stat().st_size
+    monkeypatch.setattr(kept_programs, "MOST_BYTES", int(4.5 * size))
+    for k in range(2, 5):
+        program()(np.ones(k))
+    for age, file in enumerate(sorted(files(folder), key=lambda file: file != first)):
+        os.utime(file, (1e9 - age, 1e9 - age))
+    assert len(files(folder)) == 4
+    program()(np.ones(1))  # used now
+    program()(np.ones(5))
+    # Three quarters of what fits are left, the first among them.
+    assert len(files(folder)) == 3
+    assert first in files(folder)
+
+
+def test_it_can_be_turned_off(folder):
+    assert rj.keep_programs(False) is None
+    program()(1.0)
+    assert not folder.exists()
+    with pytest.raises(TypeError, match=r"where must be True, False or the name of a folder, got 1\.5"):
+        rj.keep_programs(1.5)
+
+
+def test_what_jax_had_in_its_own_cache_is_not_kept(folder, tmp_path):
+    """XLA would write down a program without its code."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
+    program()(1.0)
+    (file,) = files(folder)
+    file.unlink()
+    jax.clear_caches()
+    assert program()(1.0)["scaled"] == 2.0
+    assert not files(folder)
+
+
+def test_calls_in_a_trace_stay_parts_of_it(folder):
+    inside = program()
+    np.testing.assert_array_equal(jax.vmap(inside)(jnp.ones(2))["scaled"], [2, 2])
+    assert jax.grad(lambda x: inside(x)["scaled"])(1.0) == 2.0
+    assert not files(folder)

@@ -6,12 +6,16 @@ what.
 """
 
 import argparse
+import contextlib
+import functools
 import io
 import json
 import os
 import sys
+import tempfile
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -19,6 +23,7 @@ import jax
 import numpy as np
 
 import rodjax
+from rodjax import compilation, kept_programs
 from rodjax.atomic_write import replace_file
 from rodjax.equilibrium import MAX_SEGMENTS
 from rodjax.files import SUFFIX, load, save
@@ -35,6 +40,8 @@ if TYPE_CHECKING:
     from rodjax.identification.refits import Profile
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+# Seconds of compiling after which a terminal is told what the wait is.
+TOLD_AFTER = 2.0
 
 
 class CommandError(ValueError):
@@ -83,6 +90,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_sweep(commands)
     _add_fit(commands)
     _add_report(commands)
+    warm = commands.add_parser("warm", help="compile what will be needed, so that first answers come at once")
+    warm.add_argument(
+        "file", metavar="FILE.toml", type=Path, nargs="?", help="of a scene, fit, report or route; the usual scenes"
+    )
+    warm.add_argument("data", metavar="DATA.csv", type=Path, nargs="*", help="of a fit: what was measured")
+    warm.set_defaults(run=_warm)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
     demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
@@ -158,6 +171,39 @@ def _segments(text: str) -> int:
 
 def _set_up_jax() -> None:
     jax.config.update("jax_enable_x64", True)
+    if sys.stderr.isatty():
+        compilation.waiting = _told
+
+
+def _warm(arguments: argparse.Namespace) -> int:
+    from rodjax.warm import command_for, usual_jobs, warm
+
+    if arguments.file is None:
+        warm(usual_jobs(), sys.stderr.isatty())
+        code = 0
+    else:
+        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+            code = main(command_for(arguments.file, arguments.data, Path(folder)))
+    folder = kept_programs.folder()
+    print("no programs are kept" if folder is None else f"programs are kept in {folder}")
+    return min(code, 2)
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """A wait that lasts says what it is, once."""
+    timer = threading.Timer(TOLD_AFTER, _tell)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@functools.cache
+def _tell() -> None:
+    print("rodjax: compiling, once for this kind of scene and mesh: a few seconds each", file=sys.stderr, flush=True)
 
 
 def _demo(arguments: argparse.Namespace) -> int:

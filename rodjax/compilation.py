@@ -1,5 +1,6 @@
 """How the library's programs are compiled: in half the time, and once only where they are kept on disk."""
 
+import contextlib
 import functools
 import gc
 import inspect
@@ -28,6 +29,8 @@ SHARE_OF_MAPS = 0.5
 # Settings of JAX that a program depends on, and those under which none is kept.
 PRECISION = "jax_enable_x64"
 SETTINGS = ("jax_disable_jit", "jax_default_device")
+# Around what may take seconds; the command line says so there.
+waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _log = logging.getLogger("rodjax")
 
@@ -90,7 +93,8 @@ class _Programs:
         program = kept_programs.load(name, tree)
         if program is None:
             run = self.quick if _knows_quick() else self.part
-            program, is_new = kept_programs.compiled(run.lower(*args, **options))
+            with waiting():
+                program, is_new = kept_programs.compiled(run.lower(*args, **options))
             if is_new:
                 kept_programs.store(name, program)
         return program

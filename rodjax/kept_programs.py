@@ -69,6 +69,11 @@ def keep_programs(where: str | os.PathLike[str] | bool = True) -> Path | None:
     return _folder
 
 
+def folder() -> Path | None:
+    """Where programs are kept now."""
+    return _folder
+
+
 def is_keeping() -> bool:
     """Whether programs are looked for on disk."""
     return _folder is not None and _is_single_processor()

@@ -1,0 +1,70 @@
+"""`rodjax warm`: compiles what will be needed, so that the first answers come at once."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from rodjax.equilibrium import solve
+from rodjax.obstacles import Plane
+from rodjax.path import solve_path
+from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
+from rodjax.quantities import in_file
+from rodjax.result import Equilibrium, describe
+from rodjax.rod import Rod
+from rodjax.scene import Scene
+from rodjax.scene_file import read_text, toml_tables
+from rodjax.supports import Clip
+
+# Of an experiment's or a route's file, tables that no scene has.
+OF_FITS, OF_ROUTES, OF_REPORTS = (
+    {"unknown", "measured", "experiments"},
+    {"variables", "objective"},
+    {"limits", "cables"},
+)
+
+
+def usual_jobs() -> dict[str, Callable[[], object]]:
+    """Cables as most are, each between two clamps under its own weight, by what is special about them."""
+    plain = hanging_cable()
+    rods = [Rod(1.0, (4e-3, 8e-3), 4e-3, 800.0, 0.1, rest_curvature=at_rest) for at_rest in (None, (1.0, 0.0))]
+    clip, floor = Clip(0.5, (0.4, 0.05, -0.1)), Plane((0.0, 0.0, -0.15), (0.0, 0.0, 1.0))
+    scenes = {
+        "a cable": plain,
+        "a flat cable": hanging_cable(rod=rods[0]),
+        "a curved hose": hanging_cable(rod=rods[1]),
+        "a cable in a clip": Scene(cable(), plain.start, plain.end, plain.gravity, clips=[clip]),
+        "a cable on a floor": Scene(cable(), plain.start, plain.end, plain.gravity, obstacles=[floor]),
+    }
+
+    def solved(scene: Scene) -> Equilibrium:
+        result = solve(scene)
+        describe(result)
+        return solve(scene, guess=result)
+
+    jobs: dict[str, Callable[[], object]] = {name: lambda scene=scene: solved(scene) for name, scene in scenes.items()}
+    jobs["a path"] = lambda: solve_path(figure_1(), segments=16, guess=figure_1_start())
+    return jobs
+
+
+def command_for(file: Path, data: Sequence[Path], folder: Path) -> list[str]:
+    """The command that a file is for, its results in a folder."""
+    with in_file(file):
+        tables = set(toml_tables(read_text(file)))
+    if tables & OF_FITS:
+        return ["fit", str(file), *map(str, data), "--out", str(folder)]
+    if tables & OF_ROUTES:
+        return ["route", str(file), "--out", str(folder)]
+    if tables & OF_REPORTS:
+        return ["report", str(file), "--out", str(folder)]
+    return ["solve", str(file), "-o", str(folder / "result.vtkhdf")]
+
+
+def warm(jobs: dict[str, Callable[[], object]], progress: bool) -> None:
+    """Does each of the jobs, with a bar that names it."""
+    with tqdm(jobs.items(), disable=not progress, unit="job") as bar, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, job in bar:
+            bar.set_description(name)
+            job()

@@ -67,6 +67,12 @@ class _Programs:
         settings = tuple(getattr(jax.config, name) for name in SETTINGS)
         if not kept_programs.is_keeping() or any(settings):
             return self._by_jax(args, options)
+        if len(self.kept) == 1 and not self.static:
+            # Mostly it is the same again: the program itself tells that sooner than a key does.
+            (only,) = self.kept.values()
+            with contextlib.suppress(TypeError, ValueError):
+                if only is not None:
+                    return only(*args, **options)
         statics: tuple = ()
         given, given_options = args, options
         if self.static:
@@ -108,13 +114,15 @@ class _Programs:
         return result
 
 
-def _kind(leaf: Any) -> tuple | None:
+def _kind(leaf: Any) -> Any:
     """All of an argument that a program depends on; `None` where it may not lie in this process's first device."""
-    if isinstance(leaf, jax.Array):
-        return None if leaf.committed else (leaf.shape, leaf.dtype, leaf.weak_type)
+    try:  # an array of JAX's: to ask whether it is one takes longer
+        return None if leaf.committed else leaf.aval
+    except AttributeError:
+        pass
     if isinstance(leaf, np.ndarray | np.generic):
         return leaf.shape, leaf.dtype
-    return (type(leaf).__name__,) if type(leaf) in (bool, int, float) else None
+    return type(leaf).__name__ if type(leaf) in (bool, int, float) else None
 
 
 _compiled: list[_Programs] = []

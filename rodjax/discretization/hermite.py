@@ -11,7 +11,7 @@ t approaches pi: an element has no way through a fold. All strains are rational 
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rodjax.blocks import short_sum
+from rodjax.discretization.element_bending import SIMPSON, bending_energies, by_chords
 from rodjax.discretization.form import Form
 from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed import MixedPoint
@@ -35,8 +36,6 @@ from rodjax.strain import swept_angle
 from rodjax.supports import Clamp, Directed, Free, Held
 from rodjax.vectors import components, cross, dot
 
-# Simpson's weights of the three points of an element.
-SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 # The pairs of points whose chords shape an element, and the weights of their arcs in its twist: of the areas that
 # polygons of half and whole elements enclose, Richardson's extrapolation.
 PAIRS = ((0, 1), (1, 2), (0, 2))
@@ -122,23 +121,14 @@ class HermiteElements(eqx.Module):
     # --- strains -----------------------------------------------------------------------------------------------------
 
     def bending_energy(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
-        return jnp.sum(_bending_energies(scene.rod, _half_squared_chords(tangents), self.h))
+        return jnp.sum(bending_energies(_density_of(scene.rod), _half_squared_chords(tangents), self.h))
 
     def bending(
         self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]
     ) -> tuple[Float[Array, ""], Blocks]:
         """The bending energy and its derivatives by rotations of the tangents."""
-        chords = _half_squared_chords(tangents)
-
-        def gradient(chords):
-            return jax.grad(lambda chords: jnp.sum(_bending_energies(scene.rod, chords, self.h)))(chords)
-
-        first, by_all = jax.linearize(gradient, chords)
-        along = jnp.eye(3, dtype=chords.dtype)[..., None] * jnp.ones_like(chords)[None]
-        second = jax.vmap(by_all)(along)  # each chord changed in all elements at once
-        return jnp.sum(_bending_energies(scene.rod, chords, self.h)), _by_chords(
-            first, second, tangents, self.basis(scene, bases)
-        )
+        energies, first, second = by_chords(_density_of(scene.rod), _half_squared_chords(tangents), self.h)
+        return jnp.sum(energies), _by_chords(first, second, tangents, self.basis(scene, bases))
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]) -> Blocks:
         """Derivatives of the total twist by rotations of the tangents."""
@@ -171,7 +161,7 @@ class HermiteElements(eqx.Module):
         rod = scene.rod
         chords = _half_squared_chords(tangents)
         first, last = _of_pairs(tangents)
-        by_chord = jax.grad(lambda chords: jnp.sum(_bending_energies(rod, chords, self.h)))(chords)
+        by_chord = jax.grad(lambda chords: jnp.sum(bending_energies(_density_of(rod), chords, self.h)))(chords)
         normals = (torque * jnp.array(ARC_WEIGHTS, torque.dtype))[None, :, None] * twist_gradient(first, last)
         points = jnp.stack([tangents[:, 0:-1:2], tangents[:, 2::2]], axis=1)
         strain = axial_strain_under(rod, dot(forces, points))
@@ -401,8 +391,12 @@ def _half_squared_chords(tangents: Float[Array, "3 m"]) -> Float[Array, "3 n"]:
     return dot(last - first, last - first) / 2
 
 
+def _density_of(rod: Rod) -> Callable[[Array], Array]:
+    return lambda squared_curvature: density(rod, squared_curvature=squared_curvature)
+
+
 def _by_chords(
-    first: Float[Array, "3 n"], second: Float[Array, "3 3 n"], tangents: Float[Array, "3 m"], bases: Array
+    first: Float[Array, "3 n"], second: list[list[Float[Array, "n"]]], tangents: Float[Array, "3 m"], bases: Array
 ) -> Blocks:
     """Derivatives by rotations from those by the three chords of each element."""
     points, point_bases = _of_pairs(tangents), _of_pairs(bases)
@@ -412,7 +406,7 @@ def _by_chords(
     falls: list[dict[int, Array]] = [{}, {}, {}]
     for p, (i, j) in enumerate(PAIRS):
         falls[i][p], falls[j][p] = toward_last[:, p], toward_first[:, p]
-    bent = [[_added(second[p, q][None] * fall for p, fall in falls[i].items()) for q in range(3)] for i in range(3)]
+    bent = [[_added(second[p][q][None] * fall for p, fall in falls[i].items()) for q in range(3)] for i in range(3)]
 
     def block(i: int, j: int) -> Float[Array, "b b n"]:
         return _added(outer(bent[i][q], fall) for q, fall in falls[j].items())
@@ -430,33 +424,3 @@ def _by_chords(
         diagonal=(on_diagonal(0), on_diagonal(1), on_diagonal(2)),
         below=jnp.stack([block(j, i) for i, j in PAIRS], axis=2) - between,
     )
-
-
-def _bending_energies(rod: Rod, chords: Float[Array, "3 n"], h: Float[Array, "n"]) -> Float[Array, "n"]:
-    at_ends, middle = _squared_curvatures(chords)
-    ends = density(rod, squared_curvature=at_ends / (h**2)[None])
-    return h * (SIMPSON[0] * (ends[0] + ends[1]) + SIMPSON[1] * density(rod, squared_curvature=middle / h**2))
-
-
-def _squared_curvatures(chords: Float[Array, "3 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "n"]]:
-    """|dt/dx|^2, x = s/h, at both ends and in the middle of an element, from `_half_squared_chords`."""
-    ab, bc, ac = chords
-    x = chords[:2] / 2  # squared sines of half the angles
-    ratio, rest = _series(x)
-    squared = 4 * x * ratio  # |v_a|^2, |v_c|^2
-    root = jnp.sqrt(ratio / (1 - x))
-    product = root[0] * root[1] * (ab + bc - ac - ab * bc)  # v_a . v_c
-    # v changes by 3 v_a + v_c; across v_a that moves the tangent only by sin(t)/t as much.
-    whole = 9 * squared + squared[::-1] + 6 * product[None]
-    at_ends = whole - (x * rest / ratio) * squared[::-1] + rest / (4 * ratio**2) * (product**2)[None]
-    return at_ends, squared[0] + squared[1] - 2 * product
-
-
-def _series(x: Float[Array, "2 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
-    """t^2/(4 x) for x = sin(t/2)^2 as far as x^4, then growing to infinity at x = 1; and what it is above 1 - x, by x.
-
-    t^2/4 = x + x^2/3 + 8 x^3/45 + 4 x^4/35 + 128 x^5/1575 + ...
-    """
-    tail = x**3 * (128 / 1575) / (1 - x)
-    above = 1 / 3 + x * (8 / 45) + x**2 * (4 / 35) + tail
-    return 1 + x * above, 1 + above

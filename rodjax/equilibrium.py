@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
 from rodjax.compilation import compiled
@@ -199,11 +199,16 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
             finer,
-            (finer.iterations + result.iterations, finer.evaluations + result.evaluations),
+            (_sum(finer.iterations, result.iterations), _sum(finer.evaluations, result.evaluations)),
         )
     if result.converged:
         _warn_if_inaccurate(error, rtol, options)
     return result
+
+
+def _sum(a: Int[Array, ""], b: Int[Array, ""]) -> Int[Array, ""]:
+    """Of counts that are known; JAX would compile a program."""
+    return leaf(np.asarray(a) + np.asarray(b))
 
 
 def refined_together(

@@ -72,9 +72,10 @@ def graded(s: Float[Array, "n+1"], defects: Float[Array, "n"], segments: int) ->
     return nodes.at[0].set(0.0).at[-1].set(1.0)
 
 
-def shares(values: Float[Array, "n"]) -> Float[Array, "n"]:
+def shares(values: Float[Array, "n"]) -> Float[np.ndarray, "n"]:
     """Parts of their sum; nothing of nothing."""
-    return values / (jnp.sum(values) + jnp.finfo(values.dtype).tiny)
+    numbers = np.asarray(values)
+    return numbers / (np.sum(numbers) + np.finfo(numbers.dtype).tiny)
 
 
 class Depth:

@@ -603,7 +603,7 @@ def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | f
     status = np.asarray(equilibrium.status)
     if not status.any():  # all CONVERGED
         return
-    if not np.all(equilibrium.converged):
+    if not np.all(np.asarray(equilibrium.converged)):
         warn(_outcome(equilibrium), NotConvergedWarning)
     is_overstretched = status == Status.OVERSTRETCHED
     # In the continuum strains may be traced where the status is not.

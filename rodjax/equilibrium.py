@@ -78,6 +78,8 @@ LEAST_RTOL = 1e-10
 LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
 # At least so many in the span between two clips, on average, of the first mesh.
 SPAN_SEGMENTS = 10
+# The same beside obstacles: on fewer a rod that touches takes many iterations, and then finer meshes.
+CONTACT_SEGMENTS = 32
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
@@ -373,6 +375,8 @@ def checked_options(
         segments = max(guess.s.shape[-1] - 1, least)
     elif rtol is not None and is_known(scene, guess):
         wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
+        if scene.obstacles:
+            wanted = max(wanted, CONTACT_SEGMENTS)
         segments = first_size(rtol, discretization, max(wanted, least))
     else:
         segments = TRACED_SEGMENTS[discretization]

@@ -122,7 +122,10 @@ def deepest(result: rj.Equilibrium) -> float:
 @pytest.mark.parametrize(
     "scene",
     [
-        Scene(cable(1.2), Clamp((0, 0, 0.2), LEVEL), Clamp((0.8, 0, 0.2), LEVEL), GRAVITY, obstacles=[FLOOR]),
+        pytest.param(
+            Scene(cable(1.2), Clamp((0, 0, 0.2), LEVEL), Clamp((0.8, 0, 0.2), LEVEL), GRAVITY, obstacles=[FLOOR]),
+            marks=pytest.mark.exhaustive,
+        ),
         Scene(
             cable(mass_per_length=0.0),
             Clamp((0, 0, 0.1), LEVEL),

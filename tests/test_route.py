@@ -117,7 +117,7 @@ def test_a_softest_motion_may_be_limited(shortest):
     # The same arc as without: what is asked of the motion it has, to the reserve of the bend radius.
     assert kept["stability"] == pytest.approx(1 / 0.9 - 1, abs=5e-3)
     assert route.objective == pytest.approx(shortest.objective, rel=1e-4)
-    stiffer = rj.Limits(stability=4 * stiffness)
+    stiffer = rj.Limits(bend_radius=1e-3, stability=4 * stiffness)  # the same programs
     route = rj.route(corner(), VARIABLES, limits=stiffer, starts=2, segments=16, solver=TIGHT)
     assert route.feasible
     assert float(rj.lowest_mode(route.verified).stiffness) >= 4 * stiffness

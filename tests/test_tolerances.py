@@ -54,7 +54,7 @@ def test_a_taut_wire():
     assert "not of first order: bend radius" in str(envelope)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_taut_wire_beside_a_monte_carlo():
     envelope = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=2000, seed=1)
     first, sampled = envelope.first_order, envelope.sampled

@@ -51,18 +51,19 @@ _is_broken = False
 
 def keep_programs(where: str | os.PathLike[str] | bool = True) -> Path | None:
     """Where compiled programs are kept from here on: in a folder, with `True` the user's cache folder (the default),
-    with `False` nowhere. Returns the folder.
+    with `False` nowhere. Returns the folder, `None` where there is none.
 
     The environment variable `RODJAX_CACHE`, a folder or `off`, says the same from the start. The folder holds code
     that is run: nobody else should be able to write there.
     """
     global _folder, _is_broken
     if where is True:
-        _folder = platformdirs.user_cache_path("rodjax", appauthor=False) / "programs"
+        path = platformdirs.user_cache_path("rodjax", appauthor=False) / "programs"
+        _folder = path if path.is_absolute() else None  # of a user without a home
     elif where is False:
         _folder = None
     elif isinstance(where, str | os.PathLike):
-        _folder = Path(where)
+        _folder = Path(where).absolute()
     else:
         raise TypeError(f"where must be True, False or the name of a folder, got {where!r}")
     _is_broken = False

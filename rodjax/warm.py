@@ -28,7 +28,8 @@ OF_FITS, OF_ROUTES, OF_REPORTS = (
 def usual_jobs() -> dict[str, Callable[[], object]]:
     """Cables as most are, each between two clamps under its own weight, by what is special about them."""
     plain = hanging_cable()
-    rods = [Rod(1.0, (4e-3, 8e-3), 4e-3, 800.0, 0.1, rest_curvature=at_rest) for at_rest in (None, (1.0, 0.0))]
+    curvatures = None, (1.0, 0.0)
+    rods = [Rod(1.0, (4e-3, 8e-3), 4e-3, 800.0, 0.1, radius=5e-3, rest_curvature=at_rest) for at_rest in curvatures]
     clip, floor = Clip(0.5, (0.4, 0.05, -0.1)), Plane((0.0, 0.0, -0.15), (0.0, 0.0, 1.0))
     scenes = {
         "a cable": plain,

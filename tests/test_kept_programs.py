@@ -175,6 +175,12 @@ def test_what_jax_had_in_its_own_cache_is_not_kept(folder, tmp_path):
     assert not files(folder)
 
 
+def test_a_user_without_a_home_keeps_none(monkeypatch):
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda *args, **more: Path("~/.cache"))
+    assert rj.keep_programs() is None
+    rj.keep_programs(False)
+
+
 def test_calls_in_a_trace_stay_parts_of_it(folder):
     inside = program()
     np.testing.assert_array_equal(jax.vmap(inside)(jnp.ones(2))["scaled"], [2, 2])

@@ -90,16 +90,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_sweep(commands)
     _add_fit(commands)
     _add_report(commands)
+    demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
+    demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
+    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
+    demo.set_defaults(run=_demo)
     warm = commands.add_parser("warm", help="compile what will be needed, so that first answers come at once")
     warm.add_argument(
         "file", metavar="FILE.toml", type=Path, nargs="?", help="of a scene, fit, report or route; the usual scenes"
     )
     warm.add_argument("data", metavar="DATA.csv", type=Path, nargs="*", help="of a fit: what was measured")
     warm.set_defaults(run=_warm)
-    demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
-    demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
-    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
-    demo.set_defaults(run=_demo)
     return parser
 
 

@@ -184,9 +184,11 @@ def _warm(arguments: argparse.Namespace) -> int:
     else:
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
             code = main(command_for(arguments.file, arguments.data, Path(folder)))
+    if code == 2:
+        return code
     folder = kept_programs.folder()
     print("no programs are kept" if folder is None else f"programs are kept in {folder}")
-    return min(code, 2)
+    return 0
 
 
 @contextlib.contextmanager

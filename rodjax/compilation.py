@@ -1,4 +1,4 @@
-"""How the library's programs are compiled: in half the time, and once only where they are kept on disk."""
+"""How the library's programs are compiled: quickly, once where they are kept on disk, as many as there is room for."""
 
 import contextlib
 import functools
@@ -26,7 +26,7 @@ _OUTSIDE = get_opaque_trace_state()
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
 SHARE_OF_MAPS = 0.5
-# Settings of JAX that a program depends on, and those under which none is kept.
+# A setting of JAX that changes the types of arguments, and those under which no program is kept.
 PRECISION = "jax_enable_x64"
 SETTINGS = ("jax_disable_jit", "jax_default_device")
 # Around what may take seconds; the command line says so there.
@@ -54,7 +54,11 @@ class _Programs:
 
     @property
     def count(self) -> int:
-        return self.part._cache_size() + self.quick._cache_size() + len(self.kept)
+        return (
+            self.part._cache_size()
+            + self.quick._cache_size()
+            + sum(program is not None for program in self.kept.values())
+        )
 
     def clear(self) -> None:
         self.part.clear_cache()
@@ -83,10 +87,11 @@ class _Programs:
         leaves, tree = jax.tree.flatten((given, given_options))
         kinds = tuple(map(_kind, leaves))
         key = tree, kinds, statics, getattr(jax.config, PRECISION)
-        if key not in self.kept:
-            self.kept[key] = self._found_or_compiled(key, args, options)
+        try:
+            program = self.kept[key]
+        except KeyError:
+            program = self.kept[key] = self._found_or_compiled(key, args, options)
             _make_room()
-        program = self.kept.get(key)
         return self._by_jax(args, options) if program is None else program(*given, **given_options)
 
     def _found_or_compiled(self, key: tuple, args: tuple, options: dict[str, Any]) -> Any:
@@ -189,8 +194,7 @@ def _say_once() -> None:
     # Not a warning, which may have been made an exception: the result of the call would be lost.
     _log.warning(
         "rodjax drops compiled programs, those used longest ago first: more would crash the process, which Linux "
-        "allows %s memory maps (vm.max_map_count). Scenes of one structure and mesh share programs; "
-        "rodjax.enable_compilation_cache() keeps them on disk.",
+        "allows %s memory maps (vm.max_map_count). Scenes of one structure and mesh share programs.",
         _most_maps(),
     )
 
@@ -213,10 +217,11 @@ def _knows_quick() -> bool:
 
 
 def enable_compilation_cache(directory: str | os.PathLike[str] | None = None) -> Path:
-    """Keep compiled programs on disk, in `directory` or `$XDG_CACHE_HOME/rodjax`, and return where.
+    """Turn JAX's persistent compilation cache on, in `directory` or `$XDG_CACHE_HOME/rodjax`, and return where.
 
-    A process that calls this before its first solve compiles nothing that an earlier one compiled. It changes JAX's
-    configuration for the whole process; rodjax calls it only in its command line and tests.
+    It is for programs of one's own in which solves are parts, such as a `jax.jit` or `jax.grad` around them: a process
+    that calls this before compiles none that an earlier one compiled, but traces them again. Solves that are programs
+    by themselves are kept anyway (`rodjax.keep_programs`). It changes JAX's configuration for the whole process.
     """
     if directory is None:
         directory = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rodjax"

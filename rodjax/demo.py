@@ -56,7 +56,7 @@ def run(out: Path, segments: int) -> int:
         f"First run, with compiling: {first:.1f} s"
     )
     print(f"written: {', '.join(map(str, files))}")
-    if np.all(path.converged):
+    if np.all(np.asarray(path.converged)):
         return 0
     print(f"rodjax: {describe(path)}", file=sys.stderr)
     return 3
@@ -76,7 +76,7 @@ def _table(path: Equilibrium) -> str:
 def _write_csv(path: Equilibrium, file: Path) -> None:
     header = ["scene", "energy_J", "total_twist_rad"]
     header += [f"end_{kind}_{axis}_{unit}" for kind, unit in (("force", "N"), ("moment", "Nm")) for axis in "xyz"]
-    columns = [path.energy, path.total_twist, *path.end_force.T, *path.end_moment.T]
+    columns = [path.energy, path.total_twist, *np.asarray(path.end_force).T, *np.asarray(path.end_moment).T]
     with open(file, "w", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow([*header, "iterations", "converged"])

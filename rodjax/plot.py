@@ -16,7 +16,8 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from rodjax.along import Along, Value, value_at
-from rodjax.checks import instance, positive
+from rodjax.checks import instance, leaf, positive
+from rodjax.compilation import compiled
 from rodjax.discretization.twist import angle_about, transport
 from rodjax.result import Equilibrium
 
@@ -140,14 +141,12 @@ def tube(
     the tangent; the middle of the first `STRIP_FACES` is along d1.
     """
     turns = abs(float(equilibrium.total_twist)) / (2 * np.pi)
-    s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], int(max(200, 24 * turns)) + 1)
-    centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
-    tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
-    d1 = np.asarray(_directors(equilibrium, s, tangents))
+    nodes = np.asarray(equilibrium.s)
+    s = leaf(np.linspace(nodes[0], nodes[-1], int(max(200, 24 * turns)) + 1, dtype=nodes.dtype))
+    centerline, tangents, d1 = map(np.asarray, _framed(equilibrium, s))
     d2 = np.cross(tangents, d1)
     angle = 2 * np.pi / FACES_AROUND * (np.arange(FACES_AROUND + 1) - STRIP_FACES / 2)
     around = np.cos(angle)[:, None] * d1[:, None] + np.sin(angle)[:, None] * d2[:, None]
-    centerline = np.asarray(centerline)
     true = equilibrium.scene.rod.radius
     rings = np.full(len(s), radius)
     if isinstance(true, Along):
@@ -164,6 +163,16 @@ def radius_along(radius: Value, s: Float[jax.Array, "k"]) -> Float[np.ndarray, "
 def largest_radius(radius: Value) -> float:
     """[m] Along the rod."""
     return float(jnp.max(radius.samples) if isinstance(radius, Along) else radius)
+
+
+@compiled
+def _framed(
+    equilibrium: Equilibrium, s: Float[jax.Array, "k"]
+) -> tuple[Float[jax.Array, "k 3"], Float[jax.Array, "k 3"], Float[jax.Array, "k 3"]]:
+    """Centerline, tangents and d1 between the nodes."""
+    centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
+    tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
+    return centerline, tangents, _directors(equilibrium, s, tangents)
 
 
 def _directors(

@@ -180,12 +180,11 @@ def _warm(arguments: argparse.Namespace) -> int:
 
     if arguments.file is None:
         warm(usual_jobs(), sys.stderr.isatty())
-        code = 0
     else:
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
             code = main(command_for(arguments.file, arguments.data, Path(folder)))
-    if code == 2:
-        return code
+        if code == 2:  # bad input; what did not converge has its programs all the same
+            return code
     folder = kept_programs.folder()
     print("no programs are kept" if folder is None else f"programs are kept in {folder}")
     return 0

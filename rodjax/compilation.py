@@ -105,7 +105,7 @@ class _Programs:
         if program is None:
             run = self.quick if _knows_quick() else self.part
             with waiting():
-                program, is_new = kept_programs.compiled(run.lower(*args, **options))
+                program, is_new = kept_programs.compile_lowered(run.lower(*args, **options))
             if is_new:
                 kept_programs.store(name, program)
         return program

@@ -29,6 +29,7 @@ import platformdirs
 from jax.experimental import serialize_executable
 
 from rodjax.atomic_write import replace_file
+from rodjax.checks import file_path, shown
 
 # The environment variable: "off", or a folder.
 VARIABLE = "RODJAX_CACHE"
@@ -53,19 +54,20 @@ def keep_programs(where: str | os.PathLike[str] | bool = True) -> Path | None:
     """Where compiled programs are kept from here on: in a folder, with `True` the user's cache folder (the default),
     with `False` nowhere. Returns the folder, `None` where there is none.
 
-    The environment variable `RODJAX_CACHE`, a folder or `off`, says the same from the start. The folder holds code
-    that is run: nobody else should be able to write there.
+    The environment variable `RODJAX_CACHE`, a folder, `on` or `off`, says the same from the start. The folder holds
+    code that is run: nobody else should be able to write there. Raises `TypeError` or `ValueError` for what is no
+    folder's name; a folder that cannot be written to is told of once, where the first program would be kept.
     """
     global _folder, _is_broken
+    if not isinstance(where, bool | str | os.PathLike):
+        raise TypeError(f"where must be True, False or the name of a folder, got {shown(where)}")
     if where is True:
         path = platformdirs.user_cache_path("rodjax", appauthor=False) / "programs"
         _folder = path if path.is_absolute() else None  # of a user without a home
     elif where is False:
         _folder = None
-    elif isinstance(where, str | os.PathLike):
-        _folder = Path(where).absolute()
     else:
-        raise TypeError(f"where must be True, False or the name of a folder, got {where!r}")
+        _folder = file_path(where, "where").expanduser().absolute()
     _is_broken = False
     return _folder
 
@@ -85,8 +87,8 @@ def name_of(function: str, options: dict[str, Any], statics: Sequence[Any], tree
     structure, fixed = _tree_text(tree), _text(tuple(statics))
     if structure is None or fixed is None or not function.startswith("rodjax."):
         return None
-    said = "\n".join([_surroundings(), _settings(), function, repr(options), fixed, structure, repr(leaves)])
-    return hashlib.sha256(said.encode()).hexdigest()
+    text = "\n".join([_surroundings(), _settings(), function, repr(options), fixed, structure, repr(leaves)])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def load(name: str, tree: Any) -> Any:
@@ -117,13 +119,13 @@ def load(name: str, tree: Any) -> Any:
     return program
 
 
-class Compiling(threading.local):
+class _Compiling(threading.local):
     """Whether JAX has taken a program of this thread from a cache of its own: XLA cannot write it down once more."""
 
     taken = False
 
 
-_compiling = Compiling()
+_compiling = _Compiling()
 
 
 def _listen(event: str, **_: Any) -> None:
@@ -134,7 +136,7 @@ def _listen(event: str, **_: Any) -> None:
 jax.monitoring.register_event_listener(_listen)
 
 
-def compiled(lowered: Any) -> tuple[Any, bool]:
+def compile_lowered(lowered: Any) -> tuple[Any, bool]:
     """The program, and whether it can be kept."""
     _compiling.taken = False
     program = lowered.compile()
@@ -230,9 +232,9 @@ def _settings() -> str:
 def _surroundings() -> str:
     """All that stays the same in a process: source, versions, processor, flags."""
     source = hashlib.sha256()
-    package = Path(__file__).parent
-    for path in sorted(package.rglob("*.py")):
-        source.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        source.update(str(path.relative_to(root)).encode() + path.read_bytes())
     versions = [f"{package} {importlib.metadata.version(package)}" for package in PACKAGES]
     versions += [sys.version, _devices()[0].client.platform_version]
     processor = [platform.machine(), platform.processor()]
@@ -259,5 +261,12 @@ def _prepare_lapack() -> None:
     jax.jit(jax.lax.linalg.cholesky).lower(np.eye(1))
 
 
-_said = os.environ.get(VARIABLE, "")
-keep_programs(_said.lower() not in ("off", "0", "false") if _said.lower() in ("", "off", "0", "false") else _said)
+def said(value: str) -> str | bool:
+    """What the environment variable asks for."""
+    word = value.strip().lower()
+    if word in ("off", "0", "false"):
+        return False
+    return word in ("", "on", "1", "true") or value
+
+
+keep_programs(said(os.environ.get(VARIABLE, "")))

@@ -53,13 +53,10 @@ def command_for(file: Path, data: Sequence[Path], folder: Path) -> list[str]:
     """The command that a file is for, its results in a folder."""
     with in_file(file):
         tables = set(toml_tables(read_text(file)))
-    if tables & OF_FITS:
-        return ["fit", str(file), *map(str, data), "--out", str(folder)]
-    if tables & OF_ROUTES:
-        return ["route", str(file), "--out", str(folder)]
-    if tables & OF_REPORTS:
-        return ["report", str(file), "--out", str(folder)]
-    return ["solve", str(file), "-o", str(folder / "result.vtkhdf")]
+    of_tables = {"fit": OF_FITS, "route": OF_ROUTES, "report": OF_REPORTS}
+    command = next((name for name, known in of_tables.items() if tables & known), "solve")
+    output = ["-o", str(folder / "result.vtkhdf")] if command == "solve" else ["--out", str(folder)]
+    return [command, str(file), *map(str, data), *output]
 
 
 def warm(jobs: dict[str, Callable[[], object]], progress: bool) -> None:

@@ -52,6 +52,15 @@ def test_steps_have_the_mean_of_a_stretch():
     np.testing.assert_allclose(steps.mean(a, b), [1, 2, 3, 2], rtol=1e-14)
 
 
+@pytest.mark.parametrize("knots", [(0, 1), (0, 0.4, 1), (0, 0.2, 0.5, 1), (0, 0.2, 0.5, 0.6, 1)])
+def test_samples_are_of_the_spline(knots):
+    """By SciPy where its numbers are known; to roundings."""
+    spline = rj.Smooth(knots, np.cos(3 * np.array(knots)))
+    fine = jnp.linspace(0, 1, 8 * len(knots))
+    expected = np.concatenate([spline.values, spline.at(fine, fine, fine)])
+    np.testing.assert_allclose(spline.samples, expected, rtol=0, atol=1e-14)
+
+
 def test_samples_tell_the_largest_value():
     """Also of a spline that overshoots: a cubic through 0, 1, 1, 0 has its largest value in the middle."""
     assert float(jnp.max(rj.Steps([0.4, 0.5], [1.0, 3.0, 2.0]).samples)) == 3

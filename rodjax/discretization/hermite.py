@@ -11,7 +11,7 @@ t approaches pi: an element has no way through a fold. All strains are rational 
 """
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -30,7 +30,6 @@ from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
 from rodjax.energy import axial_strain_under, density
 from rodjax.guess import cubic
-from rodjax.rod import Rod
 from rodjax.scene import Scene
 from rodjax.strain import swept_angle
 from rodjax.supports import Clamp, Directed, Free, Held
@@ -121,13 +120,14 @@ class HermiteElements(eqx.Module):
     # --- strains -----------------------------------------------------------------------------------------------------
 
     def bending_energy(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
-        return jnp.sum(bending_energies(_density_of(scene.rod), _half_squared_chords(tangents), self.h))
+        return jnp.sum(bending_energies(functools.partial(density, scene.rod), _half_squared_chords(tangents), self.h))
 
     def bending(
         self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]
     ) -> tuple[Float[Array, ""], Blocks]:
         """The bending energy and its derivatives by rotations of the tangents."""
-        energies, first, second = by_chords(_density_of(scene.rod), _half_squared_chords(tangents), self.h)
+        of_section = functools.partial(density, scene.rod)
+        energies, first, second = by_chords(of_section, _half_squared_chords(tangents), self.h)
         return jnp.sum(energies), _by_chords(first, second, tangents, self.basis(scene, bases))
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]) -> Blocks:
@@ -161,7 +161,8 @@ class HermiteElements(eqx.Module):
         rod = scene.rod
         chords = _half_squared_chords(tangents)
         first, last = _of_pairs(tangents)
-        by_chord = jax.grad(lambda chords: jnp.sum(bending_energies(_density_of(rod), chords, self.h)))(chords)
+        of_section = functools.partial(density, rod)
+        by_chord = jax.grad(lambda chords: jnp.sum(bending_energies(of_section, chords, self.h)))(chords)
         normals = (torque * jnp.array(ARC_WEIGHTS, torque.dtype))[None, :, None] * twist_gradient(first, last)
         points = jnp.stack([tangents[:, 0:-1:2], tangents[:, 2::2]], axis=1)
         strain = axial_strain_under(rod, dot(forces, points))
@@ -389,10 +390,6 @@ def _half_squared_chords(tangents: Float[Array, "3 m"]) -> Float[Array, "3 n"]:
     """1 - cos of the angles between the points of each pair, without cancellation."""
     first, last = _of_pairs(tangents)
     return dot(last - first, last - first) / 2
-
-
-def _density_of(rod: Rod) -> Callable[[Array], Array]:
-    return lambda squared_curvature: density(rod, squared_curvature=squared_curvature)
 
 
 def _by_chords(

@@ -10,6 +10,7 @@ from scipy.integrate import solve_bvp
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
+from rodjax.equilibrium import checked_options
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
 DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)
@@ -139,6 +140,12 @@ def test_meshes_are_as_fine_as_contacts_between_nodes_need(scene):
     result = rj.solve(scene)
     assert deepest(result) < DEEPEST
     assert "pressed into" not in rj.describe(result)
+
+
+def test_the_first_mesh_beside_obstacles_is_finer():
+    scene = lifted(0.3)
+    assert checked_options(scene)[0].segments == 32
+    assert checked_options(dataclasses.replace(scene, obstacles=()))[0].segments == 8
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from rodjax import problems
 from rodjax.along import Smooth, Steps
 from rodjax.batch import solve_batch
 from rodjax.clearance import Clearance, clearance
-from rodjax.compilation import enable_compilation_cache
+from rodjax.compilation import enable_compilation_cache, numpy_first
 from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
 from rodjax.equilibrium import solve
 from rodjax.files import load, save
@@ -132,6 +132,7 @@ __all__ = [
     "load",
     "lowest_mode",
     "margins",
+    "numpy_first",
     "orthographic",
     "pinhole",
     "problems",

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
 from rodjax.checks import instance, is_known, sequence
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.equilibrium import (
@@ -56,6 +56,7 @@ LANES = 8
 CHUNKS = (16, 128, 1024)
 
 
+@one_answer
 def solve_batch(
     scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene,
     *,

@@ -1,4 +1,4 @@
-"""How the library's programs are compiled: quickly, once where they are kept on disk, as many as there is room for."""
+"""How the library's programs run: as NumPy code for a first answer, then compiled, as many as there is room for."""
 
 import contextlib
 import functools
@@ -6,17 +6,22 @@ import gc
 import inspect
 import itertools
 import logging
+import math
 import os
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
 from rodjax import kept_programs
-from rodjax.checks import is_known
+from rodjax.checks import is_known, shown
+from rodjax.numpy_code import AnswerCode, NotInNumpyError
+from rodjax.numpy_operations import TookTooLongError
 
 # XLA's older generator of code for loops on a processor: half the compile time at the same run time, see
 # `docs/design.md`. jaxlib 0.12 has it no more.
@@ -26,89 +31,149 @@ _OUTSIDE = get_opaque_trace_state()
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
 SHARE_OF_MAPS = 0.5
+# Compiling takes about so many seconds for a byte of the program's NumPy code; and NumPy may take this part of them.
+COMPILE_SECONDS = 2.5e-5
+PATIENCE = 0.5
+# The environment variable: "off" for no NumPy code.
+VARIABLE = "RODJAX_NUMPY_FIRST"
 # A setting of JAX that changes the types of arguments, and those under which no program is kept.
 PRECISION = "jax_enable_x64"
 SETTINGS = ("jax_disable_jit", "jax_default_device")
 # Around what may take seconds; the command line says so there.
 waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+F = TypeVar("F", bound=Callable)
 _log = logging.getLogger("rodjax")
 
 
-class _Programs:
-    """All that one function has been compiled to, and when it was last called.
+class _Program:
+    """What a function becomes for arguments of one structure and types: NumPy code, an executable, or one after the
+    other.
 
-    `part`: as a part of another program; `quick`: by itself, as JAX compiles it; `kept`: by itself, from disk or to be
-    kept there, by the structure and types of the arguments; `None` where that cannot be.
+    `name`: on disk, `None` where it is not kept.
     """
 
-    def __init__(self, function: Callable, static_argnames: Sequence[str]):
+    def __init__(self, run: Any, tree: Any, name: str | None, is_patient: bool):
+        self.run, self.tree, self.name, self.is_patient = run, tree, name, is_patient
+        self.executable: Any = None
+        self.code: AnswerCode | None = None
+        self.traced: Any = None
+        self.answer = _answers.number
+        self.seconds_left = math.inf
+
+    def prepare(self, args: tuple, options: dict[str, Any]) -> None:
+        """Finds or makes what the first call needs."""
+        if not _answers.by_numpy:
+            return self._compile(args, options)
+        if self.name is not None:
+            self.code = kept_programs.load_code(self.name)
+            if self.code is None:
+                self.executable = kept_programs.load(self.name, self.tree)
+        if self.code is None and self.executable is None:
+            self.traced = self.run.trace(*args, **options)
+            try:
+                self.code = AnswerCode.of(self.traced)
+            except NotInNumpyError as missing:
+                _log.info("compiled at once, as NumPy code lacks %s", missing)
+                return self._compile(args, options)
+            if self.name is not None:
+                kept_programs.store_code(self.name, self.code)
+        if self.code is not None:
+            self.seconds_left = PATIENCE * COMPILE_SECONDS * len(self.code.code)
+
+    def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
+        if self.executable is None and self._is_by_numpy():
+            assert self.code is not None
+            begin = time.perf_counter()
+            try:
+                return self.code(leaves, self.seconds_left)
+            except TookTooLongError:
+                pass
+            finally:
+                self.seconds_left -= time.perf_counter() - begin
+        if self.executable is None:
+            self._compile(args, options)
+        return self.executable(*given, **named)
+
+    def _is_by_numpy(self) -> bool:
+        """Within the answer for which it was made, as long as compiling would take longer."""
+        is_same = self.is_patient or _answers.is_patient or self.answer == _answers.number
+        return _answers.by_numpy and self.code is not None and is_same and self.seconds_left > 0
+
+    def _compile(self, args: tuple, options: dict[str, Any]) -> None:
+        if self.name is not None:
+            self.executable = kept_programs.load(self.name, self.tree)
+        if self.executable is None:
+            traced = self.traced or self.run.trace(*args, **options)
+            with waiting():
+                self.executable, is_new = kept_programs.compile_lowered(traced.lower())
+            if is_new and self.name is not None:
+                kept_programs.store(self.name, self.executable)
+        self.code = self.traced = None
+        _make_room()
+
+
+class _Programs:
+    """All that one function has become, and when it was last called.
+
+    `part`: as a part of another program; `quick`: by itself, as JAX compiles it; `known`: by itself, by the structure
+    and types of the arguments.
+    """
+
+    def __init__(self, function: Callable, static_argnames: Sequence[str], is_patient: bool):
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.part: Any = jax.jit(function, static_argnames=static_argnames)
         self.quick: Any = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
-        self.kept: dict[Any, Any] = {}
+        self.known: dict[Any, _Program] = {}
         self.static = frozenset(static_argnames)
         names = list(inspect.signature(function).parameters)
         self.static_places = frozenset(names.index(name) for name in static_argnames)
+        self.is_patient = is_patient
         self.last_call = 0
 
     @property
     def count(self) -> int:
-        return (
-            self.part._cache_size()
-            + self.quick._cache_size()
-            + sum(program is not None for program in self.kept.values())
-        )
+        return self.part._cache_size() + self.quick._cache_size() + len(self.known)
 
     def clear(self) -> None:
         self.part.clear_cache()
         self.quick.clear_cache()
-        self.kept.clear()
+        self.known.clear()
 
     def whole(self, args: tuple, options: dict[str, Any]) -> Any:
         """Called as a program of its own."""
         self.last_call = next(_calls)
-        settings = tuple(getattr(jax.config, name) for name in SETTINGS)
-        if not kept_programs.is_keeping() or any(settings):
+        if any(getattr(jax.config, name) for name in SETTINGS) or not kept_programs.is_single_processor():
             return self._by_jax(args, options)
-        if len(self.kept) == 1 and not self.static:
+        if len(self.known) == 1 and not self.static:
             # Mostly it is the same again: the program itself tells that sooner than a key does.
-            (only,) = self.kept.values()
+            (only,) = self.known.values()
             with contextlib.suppress(TypeError, ValueError):
-                if only is not None:
-                    return only(*args, **options)
+                if only.executable is not None:
+                    return only.executable(*args, **options)
         statics: tuple = ()
-        given, given_options = args, options
+        given, named = args, options
         if self.static:
             statics = tuple(args[k] for k in self.static_places if k < len(args))
             statics += tuple((name, options[name]) for name in sorted(self.static & options.keys()))
             given = tuple(value for k, value in enumerate(args) if k not in self.static_places)
-            given_options = {name: value for name, value in options.items() if name not in self.static}
-        leaves, tree = jax.tree.flatten((given, given_options))
+            named = {name: value for name, value in options.items() if name not in self.static}
+        leaves, tree = jax.tree.flatten((given, named))
         kinds = tuple(map(_kind, leaves))
-        key = tree, kinds, statics, getattr(jax.config, PRECISION)
-        try:
-            program = self.kept[key]
-        except KeyError:
-            program = self.kept[key] = self._found_or_compiled(key, args, options)
-            _make_room()
-        return self._by_jax(args, options) if program is None else program(*given, **given_options)
-
-    def _found_or_compiled(self, key: tuple, args: tuple, options: dict[str, Any]) -> Any:
-        tree, kinds, statics, _ = key
         if None in kinds:
-            return None
-        name = kept_programs.name_of(self.name, QUICK, statics, tree, kinds)
-        if name is None:
-            return None
-        program = kept_programs.load(name, tree)
-        if program is None:
-            run = self.quick if _knows_quick() else self.part
-            with waiting():
-                program, is_new = kept_programs.compile_lowered(run.lower(*args, **options))
-            if is_new:
-                kept_programs.store(name, program)
-        return program
+            return self._by_jax(args, options)
+        key = tree, kinds, statics, getattr(jax.config, PRECISION)
+        with _answers.one():
+            try:
+                program = self.known[key]
+            except KeyError:
+                name = None
+                if kept_programs.is_keeping():
+                    name = kept_programs.name_of(self.name, QUICK, statics, tree, kinds)
+                program = _Program(self.quick if _knows_quick() else self.part, tree, name, self.is_patient)
+                program.prepare(args, options)
+                self.known[key] = program
+            return program(args, options, leaves, given, named)
 
     def _by_jax(self, args: tuple, options: dict[str, Any]) -> Any:
         run = self.quick if _knows_quick() else self.part
@@ -117,6 +182,66 @@ class _Programs:
         if run._cache_size() != known:
             _make_room()
         return result
+
+
+class _Answers:
+    """Which programs run as NumPy code: those made for the answer that is being worked on.
+
+    `number`: of that answer; `is_patient`: whether programs made for earlier answers may run so too.
+    """
+
+    def __init__(self) -> None:
+        self.by_numpy, self.is_patient = True, False
+        self.number = self.depth = 0
+        self.lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def one(self) -> Iterator[None]:
+        """All that is called in here is one answer, also where that is part of another."""
+        with self.lock:
+            self.number += not self.depth
+            self.depth += 1
+        try:
+            yield
+        finally:
+            with self.lock:
+                self.depth -= 1
+
+
+_answers = _Answers()
+
+
+class numpy_first:  # noqa: N801 - called as a function
+    """Whether first answers come from NumPy code, as they do unless told otherwise: `rj.numpy_first(False)` from here
+    on, `with rj.numpy_first(False): ...` in a block.
+
+    A program that XLA compiles in seconds runs as NumPy code for the first answer, some fifty times as slowly, and is
+    compiled when another answer asks for it. The two agree to rounding. Without NumPy code the first answer waits for
+    the compiler, and all answers of a process are the same to the last bit. The environment variable
+    `RODJAX_NUMPY_FIRST=off` says so from the start.
+    """
+
+    def __init__(self, enabled: bool = True):
+        if not isinstance(enabled, bool):
+            raise TypeError(f"enabled must be True or False, got {shown(enabled)}")
+        self._before, _answers.by_numpy = _answers.by_numpy, enabled
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        _answers.by_numpy = self._before
+
+
+def one_answer(function: F) -> F:
+    """A function that calls the same programs many times for one answer, such as a fit."""
+
+    @functools.wraps(function)
+    def answer(*args, **options):
+        with _answers.one():
+            return function(*args, **options)
+
+    return cast(F, answer)
 
 
 def _kind(leaf: Any) -> Any:
@@ -134,12 +259,14 @@ _compiled: list[_Programs] = []
 _calls = itertools.count(1)
 
 
-def compiled(function: Callable, static_argnames: Sequence[str] = ()) -> Callable:
-    """`jax.jit` of a function, compiled with `QUICK` where it is a program of its own and not a part of another.
+def compiled(function: Callable, static_argnames: Sequence[str] = (), *, is_patient: bool = False) -> Callable:
+    """`jax.jit` of a function, which runs as NumPy code at first (`numpy_first`) and is then compiled with `QUICK`,
+    where it is a program of its own and not a part of another.
 
-    Programs are kept as long as the process has room for them, see `SHARE_OF_MAPS`.
+    `is_patient`: as NumPy code beyond the first answer too, as long as compiling would take longer. Programs are kept
+    as long as the process has room for them, see `SHARE_OF_MAPS`.
     """
-    programs = _Programs(function, static_argnames)
+    programs = _Programs(function, static_argnames, is_patient)
     _compiled.append(programs)
 
     @functools.wraps(function)
@@ -232,3 +359,6 @@ def enable_compilation_cache(directory: str | os.PathLike[str] | None = None) ->
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     return path
+
+
+numpy_first(kept_programs.said(os.environ.get(VARIABLE, "")) is not False)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.branch import Along, mode_at, scene_at
 from rodjax.checks import instance, is_known, number_array, positive, whole_number
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.critical import differentiable_parameter
 from rodjax.equilibrium import Discretization, Solver, solve
 from rodjax.guess import Guess
@@ -71,6 +71,7 @@ class Branch(eqx.Module):
     ended: BranchEnd = eqx.field(static=True)
 
 
+@one_answer
 def follow(
     scenes: Sequence[Scene] | Scene,
     *,
@@ -118,6 +119,7 @@ def follow(
     )
 
 
+@one_answer
 def critical_points(
     scenes: Sequence[Scene] | Scene,
     path: Equilibrium,
@@ -153,6 +155,7 @@ def critical_points(
     return tuple(map(_critical_point, found))
 
 
+@one_answer
 def critical_point(
     scenes: Sequence[Scene] | Scene,
     *,
@@ -198,6 +201,7 @@ def critical_point(
     return eqx.tree_at(lambda point: point.parameter, point, parameter)
 
 
+@one_answer
 def switch_branch(
     scenes: Sequence[Scene] | Scene, point: CriticalPoint, *, side: int = 1, distance: float = SWITCH
 ) -> tuple[Float[Array, ""], Equilibrium]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.contact_search import find_touching
 from rodjax.discretization.cells import segments_for_jumps
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
@@ -106,6 +106,7 @@ class Options:
     find: Find = "minimum"
 
 
+@one_answer
 def solve(
     scene: Scene,
     *,

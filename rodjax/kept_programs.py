@@ -18,10 +18,10 @@ import platform
 import sys
 import threading
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -30,6 +30,7 @@ from jax.experimental import serialize_executable
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, shown
+from rodjax.numpy_code import AnswerCode, skeleton
 
 # The environment variable: "off", or a folder.
 VARIABLE = "RODJAX_CACHE"
@@ -37,6 +38,8 @@ VARIABLE = "RODJAX_CACHE"
 MOST_BYTES = 512 * 2**20
 LEFT = 0.75
 SUFFIX = ".program"
+# Of the same as NumPy code.
+CODE_SUFFIX = ".numpy"
 # What the first bytes of a file are, before a hash of the rest.
 MARK = b"rodjax program 1\n"
 # What JAX tells when it finds a program in the persistent cache of its own.
@@ -45,6 +48,7 @@ TAKEN = "/jax/compilation_cache/cache_hits"
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "numpy", "scipy")
 # Of JAX's settings, those that change no program.
 WITHOUT_EFFECT = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_traceback")
+T = TypeVar("T")
 _log = logging.getLogger("rodjax")
 _folder: Path | None
 _is_broken = False
@@ -79,7 +83,7 @@ def folder() -> Path | None:
 
 def is_keeping() -> bool:
     """Whether programs are looked for on disk."""
-    return _folder is not None and _is_single_processor()
+    return _folder is not None and is_single_processor()
 
 
 def name_of(function: str, options: dict[str, Any], statics: Sequence[Any], tree: Any, leaves: Any) -> str | None:
@@ -93,9 +97,26 @@ def name_of(function: str, options: dict[str, Any], statics: Sequence[Any], tree
 
 def load(name: str, tree: Any) -> Any:
     """The program of that name, to be called with arguments of this structure; `None` where there is none."""
+
+    def loaded(executable: bytes, skeleton: Any) -> Any:
+        if b"lapack_" in executable:
+            _prepare_lapack()
+        out_tree = jax.tree.structure(skeleton)
+        return serialize_executable.deserialize_and_load(executable, tree, out_tree, execution_devices=_devices())
+
+    return _read(name + SUFFIX, loaded)
+
+
+def load_code(name: str) -> AnswerCode | None:
+    """The same as NumPy code."""
+    return _read(name + CODE_SUFFIX, AnswerCode.unpacked)
+
+
+def _read(name: str, made_of: Callable[..., T]) -> T | None:
+    """What is made of the content of a file; `None` where there is none, or a damaged one, which is deleted."""
     if _folder is None:
         return None
-    path = _folder / (name + SUFFIX)
+    path = _folder / name
     try:
         content = path.read_bytes()
     except OSError:
@@ -104,11 +125,7 @@ def load(name: str, tree: Any) -> Any:
         mark, digest, packed = content[: len(MARK)], content[len(MARK) : len(MARK) + 32], content[len(MARK) + 32 :]
         if mark != MARK or digest != hashlib.sha256(packed).digest():
             raise ValueError("its content is not what was written")
-        executable, skeleton = pickle.loads(zlib.decompress(packed))
-        if b"lapack_" in executable:
-            _prepare_lapack()
-        out_tree = jax.tree.structure(skeleton)
-        program = serialize_executable.deserialize_and_load(executable, tree, out_tree, execution_devices=_devices())
+        result = made_of(*pickle.loads(zlib.decompress(packed)))
     except Exception as error:  # whatever a damaged file leads to: the program is compiled again
         _log.info("%s is not used: %s", path, error)
         with suppress(OSError):
@@ -116,7 +133,7 @@ def load(name: str, tree: Any) -> Any:
         return None
     with suppress(OSError):
         os.utime(path)
-    return program
+    return result
 
 
 class _Compiling(threading.local):
@@ -145,7 +162,6 @@ def compile_lowered(lowered: Any) -> tuple[Any, bool]:
 
 def store(name: str, program: Any) -> None:
     """Keeps a program, if that is possible; a folder that cannot be written to is told of once."""
-    global _is_broken
     if _folder is None or _is_broken:
         return
     try:
@@ -156,11 +172,22 @@ def store(name: str, program: Any) -> None:
     # Beside functions of this process that are called by their address, and classes that others may lack.
     if b"python_cpu_callback" in executable or _tree_text(out_tree) is None:
         return
-    skeleton = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-    packed = zlib.compress(pickle.dumps((executable, skeleton)), 1)
+    _write(name + SUFFIX, (executable, skeleton(out_tree)))
+
+
+def store_code(name: str, code: AnswerCode) -> None:
+    """Keeps NumPy code, if that is possible."""
+    if _folder is not None and not _is_broken and _tree_text(code.out_tree) is not None:
+        _write(name + CODE_SUFFIX, code.packed())
+
+
+def _write(name: str, content: tuple[Any, ...]) -> None:
+    global _is_broken
+    assert _folder is not None
+    packed = zlib.compress(pickle.dumps(content), 1)
     try:
         _folder.mkdir(parents=True, exist_ok=True)
-        replace_file(_folder / (name + SUFFIX), MARK + hashlib.sha256(packed).digest() + packed)
+        replace_file(_folder / name, MARK + hashlib.sha256(packed).digest() + packed)
         _make_room(_folder)
     except OSError as error:
         _is_broken = True
@@ -176,10 +203,11 @@ def store(name: str, program: Any) -> None:
 def _make_room(folder: Path) -> None:
     """Files used longest ago go where all take too much. Another process may take them away at the same time."""
     files = []
-    for path in folder.glob("*" + SUFFIX):
+    for path in folder.iterdir():
         with suppress(OSError):
             stat = path.stat()
             files.append((stat.st_mtime, stat.st_size, path))
+    files = [file for file in files if file[2].suffix in (SUFFIX, CODE_SUFFIX)]
     total = sum(size for _, size, _ in files)
     if total <= MOST_BYTES:
         return
@@ -251,7 +279,8 @@ def _devices() -> tuple[Any, ...]:
 
 
 @functools.cache
-def _is_single_processor() -> bool:
+def is_single_processor() -> bool:
+    """Whether this is one process without an accelerator."""
     return jax.default_backend() == "cpu" and jax.process_count() == 1
 
 

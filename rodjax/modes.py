@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from rodjax.along import Along
 from rodjax.checks import instance, is_known, whole_number
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve
@@ -33,6 +33,7 @@ class Mode(eqx.Module):
     displacement: Float[Array, "... n+1 3"]
 
 
+@one_answer
 def lowest_mode(equilibrium: Equilibrium) -> Mode:
     """The lowest eigenvalue of the energy's second variation at an equilibrium under its supports, and its motion.
 
@@ -50,6 +51,7 @@ def lowest_mode(equilibrium: Equilibrium) -> Mode:
     return _lowest_mode(equilibrium)
 
 
+@one_answer
 def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
     """Squares of the lowest angular frequencies of small vibrations [1/s^2], (count,) complex, by their size.
 

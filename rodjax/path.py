@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.equilibrium import (
     Discretization,
@@ -53,6 +53,7 @@ LEAST_ALIGNMENT = 0.8
 MOST_EXTRAPOLATION = 2.0
 
 
+@one_answer
 def solve_path(
     scenes: Sequence[Scene] | Scene,
     *,

@@ -290,8 +290,10 @@ def equilibrium(
     )
 
 
-def over_leading_axes(function: Callable) -> Callable:
-    """The function of one equilibrium as one of any number of them, compiled."""
+def over_leading_axes(function: Callable, *, is_patient: bool = True) -> Callable:
+    """The function of one equilibrium as one of any number of them, `compiled`: patiently, as most results are asked
+    for a few of their numbers only.
+    """
 
     @functools.wraps(function)
     def mapped(equilibrium: Equilibrium, *shared: Any):
@@ -300,7 +302,7 @@ def over_leading_axes(function: Callable) -> Callable:
             mapped = jax.vmap(mapped, in_axes=(0, *[None] * len(shared)))
         return mapped(equilibrium, *shared)
 
-    return compiled(mapped)
+    return compiled(mapped, is_patient=is_patient)
 
 
 def estimated_errors(equilibrium: Equilibrium) -> Errors:
@@ -317,7 +319,7 @@ def _moment_error(errors: Errors) -> Float[Array, "..."]:
     return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
 
 
-@over_leading_axes
+@functools.partial(over_leading_axes, is_patient=False)  # a part of each solve without `segments`
 def _errors(equilibrium: Equilibrium) -> Errors:
     return _errors_of(equilibrium, is_turn_held=False)
 

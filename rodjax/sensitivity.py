@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, sequence
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.equilibrium import solve
 from rodjax.implicit import differentiable
 from rodjax.result import Equilibrium
@@ -38,6 +38,7 @@ FIELDS = (
 )
 
 
+@one_answer
 def sensitivities(
     scene: Scene, *, of: Sequence[str], wrt: Sequence[str], **options: Any
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
@@ -68,6 +69,7 @@ def sensitivities(
     return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names
 
 
+@one_answer
 def end_stiffness(scene: Scene, **options: Any) -> Float[Array, "k k"]:
     """The stiffness that the support at s = L feels: second derivatives of the energy by its motion, global axes.
 

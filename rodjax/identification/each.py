@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
 from rodjax.checks import leaf
-from rodjax.compilation import compiled
+from rodjax.compilation import compiled, one_answer
 from rodjax.equilibrium import Discretization
 from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates
@@ -74,6 +74,7 @@ class Fits:
         return low, np.where(self.is_log, self.estimates * factor, self.estimates + reach)
 
 
+@one_answer
 def fit_each(
     experiments: Sequence[Experiment],
     unknowns: Sequence[Unknown | str],

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from rodjax.checks import leaf
+from rodjax.compilation import one_answer
 from rodjax.continuation import critical_point
 from rodjax.equilibrium import Discretization
 from rodjax.identification.least_squares import Coordinates
@@ -41,6 +42,7 @@ MAX_ROUNDS = 20
 SETTLED = 1e-6
 
 
+@one_answer
 def fit(
     experiments: Sequence[Experiment | CriticalValue],
     unknowns: Sequence[Unknown | str],

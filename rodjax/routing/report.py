@@ -13,6 +13,7 @@ import numpy as np
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
+from rodjax.compilation import one_answer
 from rodjax.obstacles import Obstacle, checked_obstacles
 from rodjax.result import Equilibrium
 from rodjax.routing import records, words
@@ -114,6 +115,7 @@ class Report:
         return [sight(cable.name, cable.equilibrium, cable.limits, size) for cable in self.cables]
 
 
+@one_answer
 def report(
     equilibrium: Any,
     *,

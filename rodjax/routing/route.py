@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from rodjax.batch import solve_first, solve_stack
 from rodjax.checks import instance, positive, whole_number
+from rodjax.compilation import one_answer
 from rodjax.equilibrium import Options, Solver, checked_options, solve
 from rodjax.result import Equilibrium, NotConvergedWarning
 from rodjax.routing.limits import Limits
@@ -153,6 +154,7 @@ class Route(eqx.Module):
         return f"It is optimal to first order: {gain}; held by {told or 'no limit'}."
 
 
+@one_answer
 def route(
     scene: Scene,
     variables: Any,

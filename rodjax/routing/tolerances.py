@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import linalg, stats
 
 from rodjax.checks import Numbers, instance, is_known, leaf, number_array, positive, sequence, shown, whole_number
+from rodjax.compilation import one_answer
 from rodjax.identification.unknowns import Unknown, known_names, target
 from rodjax.result import Equilibrium
 from rodjax.routing.limits import Limits
@@ -175,6 +176,7 @@ class Envelope:
         return "\n".join(lines)
 
 
+@one_answer
 def tolerances(
     equilibrium: Equilibrium,
     tolerances: Sequence[Tolerance],

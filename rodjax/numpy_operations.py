@@ -1,0 +1,386 @@
+"""The operations of JAX's programs that NumPy has under no name of its own, for `numpy_code`.
+
+Arrays come first, then what is fixed when the program is traced. The names and the meaning of the fixed arguments are
+those of `jax.lax`.
+"""
+
+import contextlib
+import itertools
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+Values = tuple[Any, ...]
+
+
+class TookTooLongError(Exception):
+    """Loops took more time than they were given."""
+
+
+class _Limit(threading.local):
+    """Until when loops of this thread may run, by `time.perf_counter`."""
+
+    until = math.inf
+
+
+_limit = _Limit()
+
+
+@contextlib.contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Loops raise `TookTooLongError` after so many seconds."""
+    before, _limit.until = _limit.until, time.perf_counter() + seconds
+    try:
+        yield
+    finally:
+        _limit.until = before
+
+
+def _look_at_clock() -> None:
+    if time.perf_counter() > _limit.until:
+        raise TookTooLongError
+
+
+# --- loops and branches ----------------------------------------------------------------------------------------------
+
+
+def loop(condition: Callable[..., Values], body: Callable[..., Values], carry: Values) -> Values:
+    """`while_loop`; the condition of a batch of loops is an array, and those that are done keep what they have."""
+    while True:
+        _look_at_clock()
+        (holds,) = condition(*carry)
+        if not np.ndim(holds):
+            if not holds:
+                return carry
+            carry = body(*carry)
+            continue
+        if not holds.any():
+            return carry
+        new = body(*carry)
+        carry = tuple(
+            np.where(np.reshape(holds, holds.shape + (1,) * (np.ndim(b) - holds.ndim)), b, a)
+            for a, b in zip(carry, new, strict=True)
+        )
+
+
+def scan(
+    body: Callable[..., Values],
+    constants: Values,
+    carry: Values,
+    columns: Values,
+    length: int,
+    reverse: bool,
+    kinds: Sequence[tuple[tuple[int, ...], np.dtype]],
+) -> Values:
+    """`kinds`: shape and type of what each step gives besides the carry."""
+    rows = tuple(np.empty((length, *shape), dtype) for shape, dtype in kinds)
+    count = len(carry)
+    for k in range(length - 1, -1, -1) if reverse else range(length):
+        _look_at_clock()
+        new = body(*constants, *carry, *[column[k] for column in columns])
+        carry = new[:count]
+        for row, value in zip(rows, new[count:], strict=True):
+            row[k] = value
+    return carry + rows
+
+
+# --- shapes ----------------------------------------------------------------------------------------------------------
+
+
+def filled(x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An array that broadcasts to a shape, of that shape."""
+    result = np.empty(shape, x.dtype)
+    result[...] = x
+    return result
+
+
+def stack(arrays: Values, axis: int) -> np.ndarray:
+    first = arrays[0]
+    shape = first.shape
+    result = np.empty((*shape[:axis], len(arrays), *shape[axis:]), first.dtype)
+    before = (slice(None),) * axis
+    for k, array in enumerate(arrays):
+        result[(*before, k)] = array
+    return result
+
+
+def unstack(x: np.ndarray, axis: int) -> Values:
+    return tuple(x if not axis else np.moveaxis(x, axis, 0))
+
+
+def split(x: np.ndarray, sizes: Sequence[int], axis: int) -> Values:
+    return tuple(np.split(x, list(itertools.accumulate(sizes))[:-1], axis))
+
+
+def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
+    """Edges that are negative cut off; `config`: low, high and interior padding of each axis."""
+    x = np.asarray(x)
+    spread = [max(0, n + (n - 1) * gap) if n else 0 for n, (_, _, gap) in zip(x.shape, config, strict=True)]
+    sizes = [n + low + high for n, (low, high, _) in zip(spread, config, strict=True)]
+    result = np.full(sizes, value, x.dtype)
+    from_, to = [], []
+    for n, size, (low, _, gap) in zip(x.shape, sizes, config, strict=True):
+        step = gap + 1
+        first = -(min(low, 0) // step)  # the first entry that is not cut off
+        last = min(n, -(-(size - low) // step))
+        from_.append(slice(first, max(first, last)))
+        to.append(slice(low + first * step, low + max(last - 1, first - 1) * step + 1, step))
+    if all(part.stop > part.start for part in from_):
+        result[tuple(to)] = x[tuple(from_)]
+    return result
+
+
+def _starts(starts: Values, sizes: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, ...]:
+    firsts = [min(max(int(start), 0), n - size) for start, size, n in zip(starts, sizes, shape, strict=True)]
+    return tuple(slice(first, first + size) for first, size in zip(firsts, sizes, strict=True))
+
+
+def dynamic_slice(x: np.ndarray, starts: Values, sizes: Sequence[int]) -> np.ndarray:
+    return x[_starts(starts, sizes, x.shape)]
+
+
+def dynamic_update_slice(x: np.ndarray, update: np.ndarray, starts: Values) -> np.ndarray:
+    result = np.array(x)
+    result[_starts(starts, update.shape, x.shape)] = update
+    return result
+
+
+# --- places ----------------------------------------------------------------------------------------------------------
+
+
+def _places(
+    shape: tuple[int, ...],
+    starts: np.ndarray,
+    windows: Sequence[int],
+    mapped: Sequence[int],
+    fixed: Sequence[int],
+    batched: Sequence[int],
+    batched_starts: Sequence[int],
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Of each axis of an array the places that windows take, over the axes of `starts` and then those of a window; and
+    which windows lie within the array. Windows beyond it are moved into it.
+
+    `windows`: their size along each axis; `mapped`: the axes that the numbers of `starts` speak of; `fixed`: axes of
+    the array that windows lack; `batched`: axes that go with the axes `batched_starts` of `starts`.
+    """
+    outer = starts.ndim - 1
+    inner = [axis for axis in range(len(shape)) if axis not in fixed and axis not in batched]
+    is_within = np.ones(starts.shape[:-1], bool)
+    places = []
+    for axis, (n, size) in enumerate(zip(shape, windows, strict=True)):
+        if axis in batched:
+            own = batched_starts[list(batched).index(axis)]
+            place = np.arange(n).reshape([-1 if k == own else 1 for k in range(outer)])
+        elif axis in mapped:
+            place = starts[..., list(mapped).index(axis)].astype(np.intp)
+            is_within &= (place >= 0) & (place <= n - size)
+            place = np.clip(place, 0, n - size)
+        else:
+            place = np.zeros((1,) * outer, np.intp)
+        place = place.reshape(place.shape + (1,) * len(inner))
+        if axis in inner and size > 1:
+            along = outer + inner.index(axis)
+            place = place + np.arange(size).reshape([-1 if k == along else 1 for k in range(outer + len(inner))])
+        places.append(place)
+    return places, is_within
+
+
+def gather(
+    x: Any,
+    starts: np.ndarray,
+    shape: tuple[int, ...],
+    sizes: Sequence[int],
+    offset_dims: Sequence[int],
+    collapsed: Sequence[int],
+    mapped: Sequence[int],
+    batched: Sequence[int],
+    batched_starts: Sequence[int],
+    missing: Any,
+) -> np.ndarray:
+    """`shape`: of the result; `missing`: what stands for a window beyond the array, `None` where such are moved."""
+    x = np.asarray(x)
+    places, is_within = _places(x.shape, starts, sizes, mapped, collapsed, batched, batched_starts)
+    outer = starts.ndim - 1
+    inner = len(offset_dims)
+    others = [axis for axis in range(len(shape)) if axis not in offset_dims]
+    whole = [shape[axis] for axis in others] + [shape[axis] for axis in offset_dims]
+    result = np.broadcast_to(x[tuple(places)], whole)
+    if missing is not None and not is_within.all():
+        result = np.where(is_within.reshape(is_within.shape + (1,) * inner), result, missing)
+    order = [
+        outer + list(offset_dims).index(axis) if axis in offset_dims else others.index(axis)
+        for axis in range(len(shape))
+    ]
+    return result.transpose(order)
+
+
+def scatter(
+    x: Any,
+    starts: np.ndarray,
+    updates: Any,
+    combine: Any,
+    window_dims: Sequence[int],
+    inserted: Sequence[int],
+    mapped: Sequence[int],
+    batched: Sequence[int],
+    batched_starts: Sequence[int],
+    moves: bool,
+) -> np.ndarray:
+    """`combine`: a ufunc, `None` to replace; `moves`: whether windows beyond the array are moved, not left out."""
+    result, updates = np.array(x), np.asarray(updates)
+    others = [axis for axis in range(updates.ndim) if axis not in window_dims]
+    updates = updates.transpose([*others, *window_dims])
+    sizes = iter(updates.shape[len(others) :])
+    windows = [1 if axis in inserted or axis in batched else next(sizes) for axis in range(result.ndim)]
+    places, is_within = _places(result.shape, starts, windows, mapped, inserted, batched, batched_starts)
+    if not moves and not is_within.all():
+        inner = (1,) * len(window_dims)
+        chosen = np.broadcast_to(is_within.reshape(is_within.shape + inner), updates.shape)
+        places = [np.broadcast_to(place, updates.shape)[chosen] for place in places]
+        updates = updates[chosen]
+    if combine is None:
+        result[tuple(places)] = updates
+    else:
+        combine.at(result, tuple(places), updates)
+    return result
+
+
+# --- sums, orders, products ------------------------------------------------------------------------------------------
+
+
+def accumulate(x: np.ndarray, ufunc: np.ufunc, axis: int, reverse: bool) -> np.ndarray:
+    if not reverse:
+        return ufunc.accumulate(x, axis)
+    return np.flip(ufunc.accumulate(np.flip(x, axis), axis), axis)
+
+
+def sort(arrays: Values, axis: int, keys: int) -> Values:
+    """By the first arrays, the others along with them; equal ones stay in their order."""
+    order = np.argsort(arrays[0], axis, kind="stable")
+    if keys > 1:
+        order = np.lexsort(arrays[keys - 1 :: -1], axis)
+    return tuple(np.take_along_axis(array, order, axis) for array in arrays)
+
+
+def top_k(x: np.ndarray, k: int, axis: int) -> Values:
+    order = np.flip(np.argsort(np.flip(x, axis), axis, kind="stable"), axis)  # of equal ones the first comes first
+    order = np.take(x.shape[axis] - 1 - order, np.arange(k), axis)
+    return np.take_along_axis(x, order, axis), order.astype(np.int32)
+
+
+def before_in_order(a: Any, b: Any, or_same: bool) -> Any:
+    """a < b, with -0 before 0 and what is no number last."""
+    if not np.issubdtype(a.dtype, np.floating):
+        return a <= b if or_same else a < b
+    # Numbers as integers in the same order: those below zero have their other bits reversed.
+    whole = np.dtype(f"i{a.dtype.itemsize}")
+    a, b = (np.asarray(x).view(whole) for x in (a, b))
+    a, b = (np.where(x < 0, x ^ np.iinfo(whole).max, x) for x in (a, b))
+    return a <= b if or_same else a < b
+
+
+def dot_general(
+    a: np.ndarray,
+    b: np.ndarray,
+    contracted: tuple[Sequence[int], Sequence[int]],
+    batched: tuple[Sequence[int], Sequence[int]],
+) -> Any:
+    free = [
+        [axis for axis in range(x.ndim) if axis not in over and axis not in along]
+        for x, over, along in zip((a, b), contracted, batched, strict=True)
+    ]
+    shape = [a.shape[axis] for axis in (*batched[0], *free[0])] + [b.shape[axis] for axis in free[1]]
+    outer = [a.shape[axis] for axis in batched[0]]
+    n = math.prod(a.shape[axis] for axis in contracted[0])
+    rows = math.prod(a.shape[axis] for axis in free[0])
+    columns = math.prod(b.shape[axis] for axis in free[1])
+    left = a.transpose([*batched[0], *free[0], *contracted[0]]).reshape([*outer, rows, n])
+    right = b.transpose([*batched[1], *contracted[1], *free[1]]).reshape([*outer, n, columns])
+    return np.matmul(left, right).reshape(shape)
+
+
+# --- linear algebra --------------------------------------------------------------------------------------------------
+
+
+def _each_matrix(function: Callable[..., Values], *arrays: np.ndarray) -> Values:
+    """A function of matrices for all of a batch."""
+    outer = arrays[0].shape[:-2]
+    if not outer:
+        return function(*arrays)
+    flat = [array.reshape(-1, *array.shape[len(outer) :]) for array in arrays]
+    results = [function(*row) for row in zip(*flat, strict=True)]
+    columns = [np.stack(column) for column in zip(*results, strict=True)]
+    return tuple(column.reshape(outer + column.shape[1:]) for column in columns)
+
+
+def cholesky(x: np.ndarray) -> np.ndarray:
+    """Not a number where a matrix is not positive definite, as in JAX."""
+
+    def one(matrix: np.ndarray) -> Values:
+        try:
+            return (np.linalg.cholesky(matrix),)
+        except np.linalg.LinAlgError:
+            return (np.full_like(matrix, np.nan),)
+
+    return _each_matrix(one, x)[0]
+
+
+def lu(x: np.ndarray) -> Values:
+    def one(matrix: np.ndarray) -> Values:
+        if not np.isfinite(matrix).all():
+            n = min(matrix.shape)
+            return np.full_like(matrix, np.nan), np.arange(n, dtype=np.int32), np.arange(len(matrix), dtype=np.int32)
+        factors, pivots, _ = _getrf(matrix)
+        return factors, pivots, permutation(pivots, len(matrix))
+
+    return _each_matrix(one, x)
+
+
+def _getrf(matrix: np.ndarray) -> Values:
+    (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (matrix,))
+    factors, pivots, info = getrf(matrix)
+    return factors, pivots.astype(np.int32), info
+
+
+def permutation(pivots: np.ndarray, size: int) -> np.ndarray:
+    """The order of rows after exchanges."""
+    if pivots.ndim > 1:
+        return np.stack([permutation(row, size) for row in pivots])
+    order = np.arange(size, dtype=np.int32)
+    for k, other in enumerate(pivots):
+        order[[k, other]] = order[[other, k]]
+    return order
+
+
+def triangular_solve(
+    a: np.ndarray, b: np.ndarray, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool
+) -> np.ndarray:
+    """x of op(a) x = b, or of x op(a) = b."""
+
+    def one(a: np.ndarray, b: np.ndarray) -> Values:
+        is_transposed = transpose_a == left_side
+        right = b if left_side else b.T
+        (trtrs,) = scipy.linalg.get_lapack_funcs(("trtrs",), (a, right))
+        x, info = trtrs(a, right, lower=lower, trans=int(is_transposed), unitdiag=unit_diagonal)
+        if info:  # a zero on the diagonal
+            x = np.full_like(right, np.nan)
+        return (x if left_side else x.T,)
+
+    return _each_matrix(one, a, b)[0]
+
+
+def eigh(x: np.ndarray, lower: bool) -> Values:
+    """Vectors, then values."""
+
+    def one(matrix: np.ndarray) -> Values:
+        if not np.isfinite(matrix).all():
+            return np.full_like(matrix, np.nan), np.full_like(matrix[0], np.nan)
+        values, vectors = np.linalg.eigh(matrix, "L" if lower else "U")
+        return vectors, values
+
+    return _each_matrix(one, x)

@@ -1,0 +1,234 @@
+"""How the library's programs are compiled: quickly, once where they are kept on disk, as many as there is room for."""
+
+import contextlib
+import functools
+import gc
+import inspect
+import itertools
+import logging
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import get_opaque_trace_state
+
+from rodjax.checks import is_known
+from rodjax.programs import kept
+
+# XLA's older generator of code for loops on a processor: half the compile time at the same run time, see
+# `docs/design.md`. jaxlib 0.12 has it no more.
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+_OUTSIDE = get_opaque_trace_state()
+
+# A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
+# crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
+SHARE_OF_MAPS = 0.5
+# A setting of JAX that changes the types of arguments, and those under which no program is kept.
+PRECISION = "jax_enable_x64"
+SETTINGS = ("jax_disable_jit", "jax_default_device")
+# Around what may take seconds; the command line says so there.
+waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+_MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+_log = logging.getLogger("rodjax")
+
+
+class _Programs:
+    """All that one function has been compiled to, and when it was last called.
+
+    `part`: as a part of another program; `quick`: by itself, as JAX compiles it; `kept`: by itself, from disk or to be
+    kept there, by the structure and types of the arguments; `None` where that cannot be.
+    """
+
+    def __init__(self, function: Callable, static_argnames: Sequence[str]):
+        self.name = f"{function.__module__}.{function.__qualname__}"
+        self.part: Any = jax.jit(function, static_argnames=static_argnames)
+        self.quick: Any = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
+        self.kept: dict[Any, Any] = {}
+        self.static = frozenset(static_argnames)
+        names = list(inspect.signature(function).parameters)
+        self.static_places = frozenset(names.index(name) for name in static_argnames)
+        self.last_call = 0
+
+    @property
+    def count(self) -> int:
+        return (
+            self.part._cache_size()
+            + self.quick._cache_size()
+            + sum(program is not None for program in self.kept.values())
+        )
+
+    def clear(self) -> None:
+        self.part.clear_cache()
+        self.quick.clear_cache()
+        self.kept.clear()
+
+    def whole(self, args: tuple, options: dict[str, Any]) -> Any:
+        """Called as a program of its own."""
+        self.last_call = next(_calls)
+        settings = tuple(getattr(jax.config, name) for name in SETTINGS)
+        if not kept.is_keeping() or any(settings):
+            return self._by_jax(args, options)
+        if len(self.kept) == 1 and not self.static:
+            # Mostly it is the same again: the program itself tells that sooner than a key does.
+            (only,) = self.kept.values()
+            with contextlib.suppress(TypeError, ValueError):
+                if only is not None:
+                    return only(*args, **options)
+        statics: tuple = ()
+        given, given_options = args, options
+        if self.static:
+            statics = tuple(args[k] for k in self.static_places if k < len(args))
+            statics += tuple((name, options[name]) for name in sorted(self.static & options.keys()))
+            given = tuple(value for k, value in enumerate(args) if k not in self.static_places)
+            given_options = {name: value for name, value in options.items() if name not in self.static}
+        leaves, tree = jax.tree.flatten((given, given_options))
+        kinds = tuple(map(_kind, leaves))
+        key = tree, kinds, statics, getattr(jax.config, PRECISION)
+        try:
+            program = self.kept[key]
+        except KeyError:
+            program = self.kept[key] = self._found_or_compiled(key, args, options)
+            _make_room()
+        return self._by_jax(args, options) if program is None else program(*given, **given_options)
+
+    def _found_or_compiled(self, key: tuple, args: tuple, options: dict[str, Any]) -> Any:
+        tree, kinds, statics, _ = key
+        if None in kinds:
+            return None
+        name = kept.name_of(self.name, QUICK, statics, tree, kinds)
+        if name is None:
+            return None
+        program = kept.load(name, tree)
+        if program is None:
+            run = self.quick if _knows_quick() else self.part
+            with waiting():
+                program, is_new = kept.compile_lowered(run.lower(*args, **options))
+            if is_new:
+                kept.store(name, program)
+        return program
+
+    def _by_jax(self, args: tuple, options: dict[str, Any]) -> Any:
+        run = self.quick if _knows_quick() else self.part
+        known = run._cache_size()
+        result = run(*args, **options)
+        if run._cache_size() != known:
+            _make_room()
+        return result
+
+
+def _kind(leaf: Any) -> Any:
+    """All of an argument that a program depends on; `None` where it may not lie in this process's first device."""
+    try:  # an array of JAX's: to ask whether it is one takes longer
+        return None if leaf.committed else leaf.aval
+    except AttributeError:
+        pass
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.shape, leaf.dtype
+    return type(leaf).__name__ if type(leaf) in (bool, int, float) else None
+
+
+_compiled: list[_Programs] = []
+_calls = itertools.count(1)
+
+
+def compiled(function: Callable, static_argnames: Sequence[str] = ()) -> Callable:
+    """`jax.jit` of a function, compiled with `QUICK` where it is a program of its own and not a part of another.
+
+    Programs are kept as long as the process has room for them, see `SHARE_OF_MAPS`.
+    """
+    programs = _Programs(function, static_argnames)
+    _compiled.append(programs)
+
+    @functools.wraps(function)
+    def call(*args, **options):
+        if not _is_whole(args, options):
+            return programs.part(*args, **options)
+        return programs.whole(args, options)
+
+    return call
+
+
+def program_count() -> int:
+    """How many programs the library's own functions have been compiled to and keep in memory."""
+    return sum(programs.count for programs in _compiled)
+
+
+def _make_room() -> None:
+    """Drops programs, those of the functions called longest ago first, where the process has nearly too many maps."""
+    most = _most_maps()
+    if most is None or _maps() <= SHARE_OF_MAPS * most:
+        return
+    _say_once()
+    by_age = sorted((programs for programs in _compiled if programs.count), key=lambda programs: programs.last_call)
+    # Half of the functions at a time: a collection takes seconds in a process that holds millions of objects.
+    half = (len(by_age) + 1) // 2
+    for oldest in (by_age[:half], by_age[half:]):
+        for programs in oldest:
+            programs.clear()
+        gc.collect()
+        if _maps() <= SHARE_OF_MAPS * most / 2:
+            return
+    if _maps() > SHARE_OF_MAPS * most:
+        # Programs that others have compiled.
+        jax.clear_caches()
+
+
+def _maps() -> int:
+    return _MAPS.read_bytes().count(b"\n")
+
+
+@functools.cache
+def _most_maps() -> int | None:
+    """As many memory maps as a process may have; `None` where none is known to be the most."""
+    try:
+        return int(_MOST_MAPS.read_text()) if _MAPS.exists() else None
+    except (OSError, ValueError):
+        return None
+
+
+@functools.cache
+def _say_once() -> None:
+    # Not a warning, which may have been made an exception: the result of the call would be lost.
+    _log.warning(
+        "rodjax drops compiled programs, those used longest ago first: more would crash the process, which Linux "
+        "allows %s memory maps (vm.max_map_count). Scenes of one structure and mesh share programs.",
+        _most_maps(),
+    )
+
+
+def _is_whole(*args: Any) -> bool:
+    """Whether a function of these arguments is called as a program of its own."""
+    if get_opaque_trace_state() == _OUTSIDE:
+        return True
+    # Beside the derivatives of something, but not in a program that is being traced.
+    return is_known(args) and is_known(jax.lax.full((), 0.0))
+
+
+@functools.cache
+def _knows_quick() -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options=QUICK)()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+def enable_compilation_cache(directory: str | os.PathLike[str] | None = None) -> Path:
+    """Turn JAX's persistent compilation cache on, in `directory` or `$XDG_CACHE_HOME/rodjax`, and return where.
+
+    It is for programs of one's own in which solves are parts, such as a `jax.jit` or `jax.grad` around them: a process
+    that calls this before compiles none that an earlier one compiled, but traces them again. Solves that are programs
+    by themselves are kept anyway (`rodjax.keep_programs`). It changes JAX's configuration for the whole process.
+    """
+    if directory is None:
+        directory = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rodjax"
+    path = Path(directory)
+    path.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    # By default programs that compile in less than a second are not kept: rodjax has dozens of those.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    return path

@@ -27,7 +27,7 @@ from validation import LEVEL, ORIGIN, cantilever_tip, root, table
 
 import rodjax
 from rodjax import Clamp, Equilibrium, Free, Guess, Newton, PointForce, Rod, Scene, frame, problems, rotate
-from rodjax.sensitivity import moved
+from rodjax.analysis.sensitivity import moved
 
 INEXTENSIBLE = 1e9  # EA L^2/EI
 # Below the default, as what is left of the residual is divided by the steps of the differences.

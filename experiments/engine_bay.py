@@ -25,12 +25,12 @@ import numpy as np
 from scipy.optimize import differential_evolution, minimize
 
 import rodjax as rj
-from rodjax.batch import solve_first, solve_stack
-from rodjax.equilibrium import checked_options
-from rodjax.result import Equilibrium
+from rodjax.paths.batch import solve_first, solve_stack
 from rodjax.routing.problem import Problem, arranged, scenes_of, spare_lengths, valued
 from rodjax.routing.route import RESERVE, SEGMENTS, TOLERANCE
 from rodjax.routing.variables import checked_variables
+from rodjax.solving.equilibrium import checked_options
+from rodjax.solving.result import Equilibrium
 
 jax.config.update("jax_enable_x64", True)  # before the numbers below are made
 

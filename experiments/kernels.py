@@ -38,15 +38,15 @@ from rodjax.discretization.joints import (
 )
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.results import resultants
-from rodjax.equilibrium import Options, first_state
-from rodjax.linalg import SaddlePointSystem, factor, factor_and_solve
-from rodjax.path import stack_scenes
-from rodjax.plane import plane
-from rodjax.result import Found, SolverState, equilibrium
-from rodjax.scene import nondimensional
-from rodjax.status import Outcome
-from rodjax.strain import swept_angle
-from rodjax.vectors import dot
+from rodjax.geometry.vectors import dot
+from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
+from rodjax.mechanics.strain import swept_angle
+from rodjax.model.plane import plane
+from rodjax.model.scene import nondimensional
+from rodjax.paths.path import stack_scenes
+from rodjax.solving.equilibrium import Options, first_state
+from rodjax.solving.result import Found, SolverState, equilibrium
+from rodjax.solving.status import Outcome
 
 LOOPS = 300
 NUDGE = 1e-30

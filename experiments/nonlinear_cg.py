@@ -18,7 +18,7 @@ from measuring import ROUND_SECONDS, CppRuns, Timed, compiled, conditions, machi
 
 import rodjax
 from rodjax import problems
-from rodjax.path import stack_scenes
+from rodjax.paths.path import stack_scenes
 
 STEPS = 25
 

@@ -19,7 +19,7 @@ from measuring import ROUND_SECONDS, Timed, compiled, conditions, machine, numbe
 
 import rodjax
 from rodjax import problems
-from rodjax.path import stack_scenes
+from rodjax.paths.path import stack_scenes
 
 DISCRETIZATION = "finite_difference"
 SOLVERS = {"default": None, "newton": rodjax.Newton(), "ncg": rodjax.NonlinearCG()}

@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 
 import rodjax
-from rodjax.scene_writing import write_scene
+from rodjax.io.scene_writing import write_scene
 
 HEADER = "rod.length,rod.EI,end.position.0,end.spin,loads.gravity.1"
 

@@ -35,7 +35,7 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc, jv
 
 import rodjax
 from rodjax import Clamp, Equilibrium, Free, Guess, Pin, Rod, Scene, Swivel, frame, problems
-from rodjax.path import stack_scenes
+from rodjax.paths.path import stack_scenes
 
 INEXTENSIBLE = 1e10  # EA L^2/EI
 HELIX_EA = 1e12

@@ -28,9 +28,9 @@ import rodjax
 from rodjax import problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist
-from rodjax.equilibrium import Discretization, Options, first_state
-from rodjax.path import stack_scenes
-from rodjax.scene import nondimensional
+from rodjax.model.scene import nondimensional
+from rodjax.paths.path import stack_scenes
+from rodjax.solving.equilibrium import Discretization, Options, first_state
 
 TOLERANCE = 1e-8  # largest component of the gradient [EI/L^2], of every method
 # Above this mesh the C++ program, which keeps positions and not edges, cannot reach that, and gets a looser one.

@@ -4,35 +4,36 @@ import importlib
 from typing import TYPE_CHECKING
 
 from rodjax import problems
-from rodjax.along import Smooth, Steps
-from rodjax.batch import solve_batch
-from rodjax.clearance import Clearance, clearance
-from rodjax.compilation import enable_compilation_cache, numpy_first
-from rodjax.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
-from rodjax.equilibrium import solve
-from rodjax.files import load, save
-from rodjax.guess import Guess
-from rodjax.kept_programs import keep_programs
-from rodjax.loads import DistributedCouple, DistributedForce, PointForce
-from rodjax.modes import Mode, lowest_mode, squared_frequencies
-from rodjax.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
-from rodjax.path import solve_path
-from rodjax.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
-from rodjax.rod import Law, Rod
-from rodjax.scene import Scene
-from rodjax.scene_file import SceneFileError, read_scene
-from rodjax.scene_writing import write_scene
-from rodjax.sensitivity import end_stiffness, sensitivities
-from rodjax.solvers.line_search import LineSearch
-from rodjax.solvers.newton import Newton
-from rodjax.solvers.nonlinear_cg import NonlinearCG
-from rodjax.status import Status
-from rodjax.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
-from rodjax.tracing import BranchEnd
-from rodjax.triangle_mesh import Mesh
+from rodjax.analysis.clearance import Clearance, clearance
+from rodjax.analysis.sensitivity import end_stiffness, sensitivities
+from rodjax.io.files import load, save
+from rodjax.io.scene_file import SceneFileError, read_scene
+from rodjax.io.scene_writing import write_scene
+from rodjax.model.along import Smooth, Steps
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.rod import Law, Rod
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
+from rodjax.model.triangle_mesh import Mesh
+from rodjax.paths.batch import solve_batch
+from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
+from rodjax.paths.path import solve_path
+from rodjax.paths.tracing import BranchEnd
+from rodjax.programs.compilation import enable_compilation_cache, numpy_first
+from rodjax.programs.kept import keep_programs
+from rodjax.solving.equilibrium import solve
+from rodjax.solving.guess import Guess
+from rodjax.solving.line_search import LineSearch
+from rodjax.solving.newton import Newton
+from rodjax.solving.nonlinear_cg import NonlinearCG
+from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
+from rodjax.solving.status import Status
+from rodjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from rodjax.continuum import solve_continuum
+    from rodjax.analysis.continuum import solve_continuum
     from rodjax.identification.each import Fits, fit_each
     from rodjax.identification.fit import fit
     from rodjax.identification.measurements import (
@@ -54,8 +55,6 @@ if TYPE_CHECKING:
     from rodjax.routing.route import Route, route
     from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
     from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Between",
@@ -155,7 +154,7 @@ __all__ = [
 
 # diffrax, optimistix and scipy take a second to import, which a solve without them need not wait for.
 _LATER = {
-    "solve_continuum": "continuum",
+    "solve_continuum": "analysis.continuum",
     "fit": "identification.fit",
     "Fit": "identification.result",
     "NotIdentifiableError": "identification.result",

@@ -23,16 +23,16 @@ import jax
 import numpy as np
 
 import rodjax
-from rodjax import compilation, kept_programs
 from rodjax.atomic_write import replace_file
-from rodjax.equilibrium import MAX_SEGMENTS
-from rodjax.files import SUFFIX, load, save
-from rodjax.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
-from rodjax.scene_file import SceneFile, SceneFileError, read_scene_file
-from rodjax.status import Status
-from rodjax.sweep import SUFFIX as SWEEP_SUFFIX
-from rodjax.sweep import Summary, merge, sweep
-from rodjax.sweep_cases import SweepError
+from rodjax.io.files import SUFFIX, load, save
+from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
+from rodjax.programs import compilation, kept
+from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.status import Status
+from rodjax.sweep.cases import SweepError
+from rodjax.sweep.sweep import SUFFIX as SWEEP_SUFFIX
+from rodjax.sweep.sweep import Summary, merge, sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"rodjax {rodjax.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     solve = commands.add_parser("solve", help="solve the scene, or the path, in a TOML file")
-    solve.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.scene_file")
+    solve.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
     solve.set_defaults(run=_solve)
@@ -108,7 +108,7 @@ def _add_sweep(commands: Any) -> None:
         metavar=f"SWEEP{SWEEP_SUFFIX}", type=Path, required=True, help="the file to write: pydoc rodjax.sweep"
     )
     run = commands.add_parser("sweep", help="solve a scene for all cases of a grid or table, many or few")
-    run.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.scene_file")
+    run.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     run.add_argument("--over", metavar="GRID.toml|TABLE.csv", type=Path, required=True, help="pydoc rodjax.sweep")
     run.add_argument("-o", "--output", **output)
     run.add_argument("--shard", metavar="i/n", type=_shard, default=(1, 1), help="only part i of n, to be merged")
@@ -185,7 +185,7 @@ def _warm(arguments: argparse.Namespace) -> int:
             code = main(command_for(arguments.file, arguments.data, Path(folder)))
         if code == 2:  # bad input; what did not converge has its programs all the same
             return code
-    folder = kept_programs.folder()
+    folder = kept.folder()
     print("no programs are kept" if folder is None else f"programs are kept in {folder}")
     return 0
 

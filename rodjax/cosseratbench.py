@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 import rodjax
-from rodjax.supports import Support
+from rodjax.model.supports import Support
 
 # Not by `import`: where it is not installed, a type checker takes this very file for it.
 bench: Any = importlib.import_module("cosseratbench")

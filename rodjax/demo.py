@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 from rodjax import problems
-from rodjax.files import save
-from rodjax.path import solve_path
+from rodjax.io.files import save
+from rodjax.paths.path import solve_path
 from rodjax.plot import plot_figure_1
-from rodjax.result import Equilibrium, NotConvergedWarning, describe
+from rodjax.solving.result import Equilibrium, NotConvergedWarning, describe
 
 REPORT_MILLISECONDS = 6.0  # a step, with 10 segments, on a 2.2 GHz AMD of 2008
 REPEATS = 9

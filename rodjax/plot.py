@@ -15,11 +15,11 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rodjax.along import Along, Value, value_at
 from rodjax.checks import instance, leaf, positive
-from rodjax.compilation import compiled
 from rodjax.discretization.twist import angle_about, transport
-from rodjax.result import Equilibrium
+from rodjax.model.along import Along, Value, value_at
+from rodjax.programs.compilation import compiled
+from rodjax.solving.result import Equilibrium
 
 Field = Literal["curvature", "twist", "tension"]
 LABELS = {"curvature": "curvature [1/m]", "twist": "twist rate [rad/m]", "tension": "tension [N]"}

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rodjax.guess import Guess
-from rodjax.rod import Rod
-from rodjax.scene import Scene
-from rodjax.supports import Clamp, Free, frame
+from rodjax.model.rod import Rod
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Free, frame
+from rodjax.solving.guess import Guess
 
 # Half angle a of a circular arc of length 1 over a chord of 0.6: sin(a)/a = 0.6.
 ARC_HALF_ANGLE = 1.6600348132646194

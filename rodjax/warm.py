@@ -6,16 +6,16 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from rodjax.equilibrium import solve
-from rodjax.obstacles import Plane
-from rodjax.path import solve_path
+from rodjax.io.quantities import in_file
+from rodjax.io.scene_file import read_text, toml_tables
+from rodjax.model.obstacles import Plane
+from rodjax.model.rod import Rod
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clip
+from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
-from rodjax.quantities import in_file
-from rodjax.result import Equilibrium, describe
-from rodjax.rod import Rod
-from rodjax.scene import Scene
-from rodjax.scene_file import read_text, toml_tables
-from rodjax.supports import Clip
+from rodjax.solving.equilibrium import solve
+from rodjax.solving.result import Equilibrium, describe
 
 # Of an experiment's or a route's file, tables that no scene has.
 OF_FITS, OF_ROUTES, OF_REPORTS = (

@@ -21,7 +21,7 @@ if not IS_OPTIMIZED:
     os.environ["XLA_FLAGS"] += " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
     # Parting a program for several threads takes another sixth, and each worker has one core.
     os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
-    # As `rodjax.compilation.QUICK`, also for the programs in which tests use solves.
+    # As `rodjax.programs.compilation.QUICK`, also for the programs in which tests use solves.
     if jax.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # Memory that compiling frees stays with the process: asking the system for it again and again takes 15 % of the time.

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import rodjax as rj
-from rodjax.obstacles import Obstacle
-from rodjax.rest import SpaceCurve
-from rodjax.supports import Support
+from rodjax.model.obstacles import Obstacle
+from rodjax.model.rest import SpaceCurve
+from rodjax.model.supports import Support
 
 LENGTH = 1.0
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax.along import Spline
 from rodjax.discretization.cells import ElementCells
-from rodjax.equilibrium import checked_options
-from rodjax.rod import torsion_constant
-from rodjax.scene import nondimensional
+from rodjax.model.along import Spline
+from rodjax.model.rod import torsion_constant
+from rodjax.model.scene import nondimensional
+from rodjax.solving.equilibrium import checked_options
 
 LINE = np.stack([np.arange(5.0), np.zeros(5), np.zeros(5)], axis=1)
 FRAMES = np.stack([np.eye(3)] * 5)

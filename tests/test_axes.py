@@ -10,8 +10,8 @@ import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, PointForce, Rod, Scene, Swivel
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
-from rodjax.equilibrium import Options, _first_point, first_state, in_units_of
-from rodjax.scene import nondimensional, scene_axes
+from rodjax.model.scene import nondimensional, scene_axes
+from rodjax.solving.equilibrium import Options, _first_point, first_state, in_units_of
 
 IDENTITY = Rotation.identity()
 SEGMENTS = 16

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax import Clamp, Scene, batch, frame, problems, rotate, solve_batch, solve_path
+from rodjax import Clamp, Scene, frame, problems, rotate, solve_batch, solve_path
+from rodjax.paths import batch
 
 OPTIONS = {"segments": 8, "discretization": "finite_difference"}
 COUNT = 40
@@ -146,7 +147,8 @@ if processes > 1:
 import numpy as np
 from test_batch import OPTIONS, assert_same, random_scenes
 import rodjax as rj
-from rodjax import batch
+from rodjax.paths import batch
+from rodjax.paths.path import stack_scenes
 rj.enable_compilation_cache()
 mesh = jax.make_mesh((jax.device_count(),), ("scenes",), axis_types=(jax.sharding.AxisType.Auto,))
 scenes = random_scenes()
@@ -160,7 +162,7 @@ for ours, theirs in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=
 if processes == 1:
     odd = rj.solve_batch(scenes[:-3], mesh=mesh, **OPTIONS)
     assert_same(odd.nodes, alone.nodes[:-3])
-    stacked = rj.path.stack_scenes(scenes)
+    stacked = stack_scenes(scenes)
     nodes = jax.jit(lambda scenes: rj.solve_batch(scenes, mesh=mesh, **OPTIONS).nodes)
     assert_same(nodes(stacked), alone.nodes)
     try:

@@ -9,7 +9,7 @@ import rodjax as rj
 from rodjax.discretization.cells import ElementCells, JointCells
 from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.framed import FrameForm, FramePoint
-from rodjax.scene import nondimensional
+from rodjax.model.scene import nondimensional
 
 CELLS = 3
 

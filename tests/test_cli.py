@@ -10,8 +10,8 @@ import pytest
 
 import rodjax
 from rodjax.cli import main
-from rodjax.files import load
-from rodjax.scene_writing import write_scene
+from rodjax.io.files import load
+from rodjax.io.scene_writing import write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
 HANGING = str(SCENES / "hanging_cable.toml")

@@ -7,6 +7,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame, problems, rotate
+from rodjax.model.scene import between
 
 # Thick rods bent within short spans: strains up to 0.2, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
@@ -372,7 +373,7 @@ def test_paths_and_batches():
             # Each from another start, to the solver's tolerance.
             np.testing.assert_allclose(found.clip_forces[k], alone.clip_forces, rtol=0, atol=1e-7 * size)
             np.testing.assert_allclose(found.nodes[k], alone.nodes, rtol=0, atol=1e-8)
-    half = rj.scene.between(scenes[0], scenes[1], jnp.asarray(0.5))
+    half = between(scenes[0], scenes[1], jnp.asarray(0.5))
     np.testing.assert_allclose(half.clips[0].at, 0.255, rtol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(half.clips[0].tangent), 1.0, rtol=1e-15)
 

@@ -8,6 +8,7 @@ from test_clips import BETWEEN_PINS, GRAVITY, LEVEL, ORIGIN, TIGHT, in_space, su
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, Swivel, frame, problems, rotate
+from rodjax.model.scene import between
 
 # Thick rods bent within short spans: strains up to 0.2, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
@@ -423,7 +424,7 @@ def test_loads_without_a_potential_are_carried():
 
 def test_full_and_banded_derivatives_are_the_same(resting):
     """The system of Newton's method by cells, and by one derivative of all that is out of balance."""
-    from rodjax.result import form_and_point
+    from rodjax.solving.result import form_and_point
 
     form, point = form_and_point(resting)
     generator = np.random.default_rng(0)
@@ -564,7 +565,7 @@ def test_frames_of_clips_in_a_scene_file(tmp_path):
 
 
 def test_frames_of_clips_have_keys_and_names(tmp_path):
-    from rodjax.scene_keys import SceneVariations
+    from rodjax.io.scene_keys import SceneVariations
 
     path = tmp_path / "scene.toml"
     path.write_text(SCENE_FILE)
@@ -584,7 +585,7 @@ def test_frames_of_clips_have_keys_and_names(tmp_path):
 
 
 def test_a_scene_half_way_turns_the_frames_of_clips():
-    half = rj.scene.between(straight(0.4, 0.0), straight(1.0, 0.0), jnp.asarray(0.5))
+    half = between(straight(0.4, 0.0), straight(1.0, 0.0), jnp.asarray(0.5))
     np.testing.assert_allclose(half.clips[0].frame, spun(0.7), atol=1e-15)
 
 

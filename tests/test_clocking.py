@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 import rodjax as rj
 from rodjax.cli import main
 from rodjax.identification.files import read_fit_files
+from rodjax.io.scene_file import SceneFileError, SceneReader, read_scene_file
+from rodjax.io.scene_keys import SceneVariations
+from rodjax.io.scene_writing import write_scene
 from rodjax.routing.files import read_route_file
-from rodjax.scene_file import SceneFileError, SceneReader, read_scene_file
-from rodjax.scene_keys import SceneVariations
-from rodjax.scene_writing import write_scene
-from rodjax.sweep_cases import CaseReader, SweepError
+from rodjax.sweep.cases import CaseReader, SweepError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -283,7 +283,7 @@ def test_what_is_written_is_read_as_the_same(tmp_path):
         write_scene(written, tmp_path / "scene.toml")
         again = read_scene_file(tmp_path / "scene.toml")
         assert again.unclocked == ()
-        assert rj.scene.Scene is type(again.scenes[0])
+        assert rj.Scene is type(again.scenes[0])
         assert (type(again.scenes[0].start), type(again.scenes[0].end)) == (type(written.start), type(written.end))
 
 

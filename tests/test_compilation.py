@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax import compilation
+from rodjax.programs import compilation
 
 
 def test_the_cache_is_filled(tmp_path):

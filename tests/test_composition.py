@@ -9,7 +9,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Clip, DistributedCouple, DistributedForce, Free, Pin, PointForce, Rod, Scene, Steps, Swivel
-from rodjax.equilibrium import checked_options
+from rodjax.solving.equilibrium import checked_options
 
 SEGMENTS = 8
 X = (1.0, 0.0, 0.0)

@@ -10,7 +10,8 @@ from scipy.integrate import solve_bvp
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
-from rodjax.equilibrium import checked_options
+from rodjax.model.supports import Support
+from rodjax.solving.equilibrium import checked_options
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
 DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)
@@ -365,7 +366,7 @@ def test_derivatives_of_a_curved_cable_in_a_clip_on_a_floor():
 # --- bad input -------------------------------------------------------------------------------------------------------
 
 
-def with_floor(rod: Rod | None = None, end: rj.supports.Support | None = None, **others) -> Scene:
+def with_floor(rod: Rod | None = None, end: Support | None = None, **others) -> Scene:
     return Scene(rod or cable(), Clamp((0, 0, 1), LEVEL), end or Free(), GRAVITY, obstacles=[FLOOR], **others)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rodjax import Rod
-from rodjax.energy import (
+from rodjax.mechanics.energy import (
     axial_strain_under,
     bending_moment_at,
     curvature_under,
@@ -65,7 +65,7 @@ import jax
 import numpy as np
 jax.config.update("jax_enable_x64", True)
 import rodjax as rj
-from rodjax import energy
+from rodjax.mechanics import energy
 EI, GJ, EA = json.loads(sys.argv[1])
 if sys.argv[2] == "more":
     def density(rod, squared_curvature=None, twist=None, axial_strain=None):

@@ -11,10 +11,10 @@ import pytest
 
 import rodjax as rj
 from rodjax.discretization.error import bulge
-from rodjax.path import stack_scenes
-from rodjax.refinement import SECTION_FACTOR
-from rodjax.result import warn_of_unknown_mesh
-from rodjax.rotations import columns
+from rodjax.geometry.rotations import columns
+from rodjax.paths.path import stack_scenes
+from rodjax.solving.refinement import SECTION_FACTOR
+from rodjax.solving.result import warn_of_unknown_mesh
 
 # Rods as soft as EA L^2/EI = 1e3 in tight spans are strained by up to 0.4.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")

@@ -46,8 +46,8 @@ from rodjax import (
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
-from rodjax.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, point_data, save
-from rodjax.passage import Before
+from rodjax.io.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, point_data, save
+from rodjax.mechanics.passage import Before
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
 CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))
@@ -428,7 +428,7 @@ WRITE_FOREVER = """
 import sys
 import jax
 jax.config.update("jax_enable_x64", True)
-from rodjax.files import load, save
+from rodjax.io.files import load, save
 versions = [load(path) for path in sys.argv[2:]]
 save(versions[0], sys.argv[1])
 print("writing", flush=True)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist
-from rodjax.scene import nondimensional
+from rodjax.model.scene import nondimensional
 
 N = 8
 

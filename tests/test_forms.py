@@ -11,7 +11,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clip, Pin, Rod, Scene
-from rodjax.result import form_and_point
+from rodjax.solving.result import form_and_point
 
 AXIS = jnp.array([1.0, 0.0, 0.0])
 CLIP = Clip(0.4, (0.3, 0.0, 0.0))

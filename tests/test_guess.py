@@ -7,8 +7,9 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Pin, Scene, frame, problems
-from rodjax.guess import cubic, first_shape, resampled
-from rodjax.scene import nondimensional
+from rodjax.discretization.first_shape import first_shape
+from rodjax.geometry.interpolation import cubic, resampled
+from rodjax.model.scene import nondimensional
 
 
 def shape(scene: Scene, segments: int = 200) -> np.ndarray:

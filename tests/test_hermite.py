@@ -19,7 +19,7 @@ from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Status
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
-from rodjax.scene import nondimensional
+from rodjax.model.scene import nondimensional
 
 LEVEL = frame((1, 0, 0))
 ORIGIN = (0.0, 0.0, 0.0)

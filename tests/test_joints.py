@@ -15,7 +15,7 @@ from rodjax.discretization.joints import (
     tangent_bases,
     twist_derivatives,
 )
-from rodjax.strain import swept_angle
+from rodjax.mechanics.strain import swept_angle
 
 ROD = Rod(1.0, EI=2.0, GJ=3.0, EA=5.0)
 SPACING = 0.1

@@ -14,8 +14,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 import rodjax as rj
-from rodjax import kept_programs
-from rodjax.compilation import compiled
+from rodjax.programs import kept
+from rodjax.programs.compilation import compiled
 
 # Solves, and says how many programs were compiled for that and where the rod is. Under a moment LAPACK takes part.
 SCRIPT = """
@@ -97,7 +97,7 @@ def test_a_program_is_found_by_its_arguments(folder):
 
 def test_another_source_is_another_program(folder, monkeypatch):
     program()(1.0)
-    monkeypatch.setattr(kept_programs, "_surroundings", lambda: "another version")
+    monkeypatch.setattr(kept, "_surroundings", lambda: "another version")
     assert program(scale=5.0)(1.0)["scaled"] == 5.0
     assert len(files(folder)) == 2
 
@@ -131,7 +131,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_of_once(folder, monkeypatch,
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(kept_programs, "replace_file", full)
+    monkeypatch.setattr(kept, "replace_file", full)
     for value in (1.0, np.ones(2)):
         np.testing.assert_array_equal(program()(value)["scaled"], 2 * value)
     assert len(caplog.records) == 1
@@ -147,7 +147,7 @@ def test_those_used_longest_ago_go(folder, monkeypatch):
     program()(np.ones(1))
     (first,) = files(folder)
     size = first.stat().st_size
-    monkeypatch.setattr(kept_programs, "MOST_BYTES", int(4.5 * size))
+    monkeypatch.setattr(kept, "MOST_BYTES", int(4.5 * size))
     for k in range(2, 5):
         program()(np.ones(k))
     for age, file in enumerate(sorted(files(folder), key=lambda file: file != first)):
@@ -172,7 +172,7 @@ def test_it_can_be_turned_off(folder):
 
 @pytest.mark.parametrize(("value", "asked"), [("", True), ("on", True), ("Off", False), ("0", False), ("/a/b", "/a/b")])
 def test_the_variable_says_where(value, asked):
-    assert kept_programs.said(value) == asked
+    assert kept.said(value) == asked
 
 
 def test_what_jax_had_in_its_own_cache_is_not_kept(folder, tmp_path):
@@ -201,7 +201,7 @@ class Stiffer(rj.Law):
 
 def test_no_program_under_a_law_of_the_users_is_kept():
     def name(scene: object) -> str | None:
-        return kept_programs.name_of("rodjax.example", {}, (), jax.tree.structure(scene), ())
+        return kept.name_of("rodjax.example", {}, (), jax.tree.structure(scene), ())
 
     assert name(rj.problems.cable()) is not None
     assert name(Stiffer()) is None

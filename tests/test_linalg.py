@@ -9,9 +9,9 @@ import pytest
 from jax.test_util import check_grads
 
 import rodjax as rj
-from rodjax.chain import ChainSystem
-from rodjax.linalg import DenseSystem, SaddlePointSystem, factor, factor_and_solve
-from rodjax.result import form_and_point
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.saddle_point import DenseSystem, SaddlePointSystem, factor, factor_and_solve
+from rodjax.solving.result import form_and_point
 
 
 def random_system(n: int, b: int, k: int, *, dominance: float = 8.0, seed: int = 0) -> SaddlePointSystem:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax.analysis.sensitivity import moved
 from rodjax.routing.margins import measured
-from rodjax.sensitivity import moved
 
 TIGHT = rj.Newton(tolerance=1e-12)
 RADIUS = 0.005

@@ -17,8 +17,8 @@ from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import transport_along, twist_under_moment
-from rodjax.linalg import SaddlePointSystem
-from rodjax.scene import nondimensional
+from rodjax.linalg.saddle_point import SaddlePointSystem
+from rodjax.model.scene import nondimensional
 
 N = 4
 

@@ -7,8 +7,8 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
-from rodjax.compilation import program_count
-from rodjax.solvers import newton
+from rodjax.programs.compilation import program_count
+from rodjax.solving import newton
 
 # The twisting moment M L/EI up to which a rod between two clamps stays straight: smallest root of tan(M/2) = M/2.
 GREENHILL = 8.986819

@@ -8,7 +8,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import problems
-from rodjax.solvers.line_search import Bracket, LineSearch
+from rodjax.solving.line_search import Bracket, LineSearch
 
 
 def figure_1(segments: int, solver: rj.NonlinearCG) -> rj.Equilibrium:

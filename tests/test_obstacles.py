@@ -16,7 +16,7 @@ import trimesh
 from hypothesis import given, settings
 
 import rodjax as rj
-from rodjax.obstacles import checked_obstacles
+from rodjax.model.obstacles import checked_obstacles
 
 FRAME = np.asarray(rj.frame((1, 2, 3), (0, 1, 1)))
 CENTER, SIZE = np.array([0.3, -0.2, 0.1]), np.array([0.8, 0.5, 0.3])

@@ -7,8 +7,9 @@ import pytest
 
 import rodjax as rj
 from rodjax import Pin, Rod, Scene
-from rodjax.passage import PLACES, Before, passage
-from rodjax.status import Status
+from rodjax.mechanics.passage import PLACES, Before, passage
+from rodjax.model.obstacles import InUnits
+from rodjax.solving.status import Status
 
 RADIUS, SPAN = 0.01, 0.8
 PIPE = rj.Capsule((0.4, -2, -0.05), (0.4, 2, -0.05), 0.1)  # its top is 0.05 above the pins
@@ -34,7 +35,7 @@ judged = jax.jit(passage)
 def found(before, after, obstacle, raised=0.0):
     """`raised`: by how much the obstacle goes up meanwhile."""
     radius, nowhere = jnp.full(PLACES, RADIUS), jnp.full((PLACES, 3), jnp.nan)
-    here, there = (rj.obstacles.InUnits(obstacle, jnp.array([0, 0, -up]), jnp.ones(())) for up in (0.0, raised))
+    here, there = (InUnits(obstacle, jnp.array([0, 0, -up]), jnp.ones(())) for up in (0.0, raised))
     return judged(Before(jnp.asarray(before), (here,)), jnp.asarray(after), (there,), radius, nowhere)
 
 
@@ -130,7 +131,7 @@ def test_random_heavy_cables_never_come_through_without_a_word():
     assert right >= 0.7 * len(scenes)
 
 
-def above_or_not_converged(result: rj.Equilibrium, axis: rj.obstacles.Obstacle) -> None:
+def above_or_not_converged(result: rj.Equilibrium, axis: rj.Obstacle) -> None:
     """From left to right a rod goes clockwise round what is below it."""
     assert isinstance(axis, rj.Capsule)
     assert not result.converged or turn_about(np.asarray(result.nodes), np.asarray(axis.start)) < 0

@@ -9,8 +9,8 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Pin, Scene, Status, frame, problems
-from rodjax.path import MAX_SPLITS
-from rodjax.scene import between
+from rodjax.model.scene import between
+from rodjax.paths.path import MAX_SPLITS
 
 SEGMENTS = 10
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, PointForce, Rod, Scene, frame, problems
-from rodjax.path import stack_scenes
-from rodjax.plane import check_planar, plane
+from rodjax.model.plane import check_planar, plane
+from rodjax.paths.path import stack_scenes
 
 SEGMENTS = 12
 SCENES = {

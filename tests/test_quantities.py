@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from rodjax.identification.files import read_fit_files
-from rodjax.quantities import LISTS, OF_TABLES, QUANTITIES, SceneFileError, is_unit, number_in, si_value, si_values
+from rodjax.io.quantities import LISTS, OF_TABLES, QUANTITIES, SceneFileError, is_unit, number_in, si_value, si_values
+from rodjax.io.scene_file import read_scene_file
 from rodjax.routing.files import read_route_file
 from rodjax.routing.variables import Between
-from rodjax.scene_file import read_scene_file
-from rodjax.sweep_cases import SweepError, read_cases
+from rodjax.sweep.cases import SweepError, read_cases
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 # By table, key, SI unit, shape and example, of all that files have.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax.ranges import check_ranges
+from rodjax.solving.ranges import check_ranges
 
 LEVEL = np.asarray(rj.frame((1, 0, 0)))
 MESH = {"segments": 8}
@@ -39,7 +39,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_stack_is_refused_by_the_name_of_its_case(name, monkeypatch):
     """Made by vmap, inside of which no number is known."""
-    for module in ("batch._solve_many", "path._solve_path"):
+    for module in ("paths.batch._solve_many", "paths.path._solve_path"):
         monkeypatch.setattr(f"rodjax.{module}", lambda *_: pytest.fail("solved"))
     wrong, message = WRONG[name]
     default = {"end": 0.8, "EI": 1.0, "at": 0.3, "clip": 0.5}.get(name, 0.0)
@@ -109,7 +109,7 @@ def test_traced_numbers_are_told_by_the_status_of_the_case():
 
 def test_what_a_derivative_is_taken_by_is_checked(monkeypatch):
     """There the numbers become known where the solve begins."""
-    monkeypatch.setattr("rodjax.equilibrium._solve", lambda *_: pytest.fail("solved"))
+    monkeypatch.setattr("rodjax.solving.equilibrium._solve", lambda *_: pytest.fail("solved"))
     with pytest.raises(ValueError, match=r"scene: the ends are 1\.6 m apart"):
         jax.grad(lambda end: rj.solve(hanging(end, 1.0, 0.3), **MESH).energy)(1.6)
 

@@ -8,9 +8,9 @@ from scipy.interpolate import CubicSpline
 
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
-from rodjax.compilation import program_count
-from rodjax.equilibrium import TRACED_SEGMENTS, Discretization
-from rodjax.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
+from rodjax.programs.compilation import program_count
+from rodjax.solving.equilibrium import TRACED_SEGMENTS, Discretization
+from rodjax.solving.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
 TWISTED = Scene(
     problems.cable(),

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rodjax.rotations import (
+from rodjax.geometry.rotations import (
     carried,
     columns,
     continuous,

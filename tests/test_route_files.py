@@ -14,12 +14,12 @@ import trimesh
 
 import rodjax as rj
 from rodjax.cli import main
+from rodjax.io.scene_keys import SceneVariations
 from rodjax.routing import files as routing_files
 from rodjax.routing.files import read_route_file
 from rodjax.routing.report import FILES
 from rodjax.routing.route import Starts
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned
-from rodjax.scene_keys import SceneVariations
 
 ROUTES = Path(__file__).parents[1] / "experiments" / "routes"
 

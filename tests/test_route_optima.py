@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax.batch import solve_batch
+from rodjax.paths.batch import solve_batch
 from rodjax.routing.variables import checked_variables, with_numbers
 
 SEGMENTS = 16

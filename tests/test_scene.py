@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rodjax import Clamp, Clip, Free, Guess, Pin, PointForce, Rod, Scene, Swivel, frame, problems
-from rodjax.scene import between, nondimensional
+from rodjax.model.scene import between, nondimensional
 
 ROD = Rod(2.0, EI=3.0, GJ=2.0, EA=500.0, mass_per_length=0.5)
 LEVEL = frame((1, 0, 0))

@@ -33,10 +33,10 @@ from rodjax import (
     Swivel,
     Union,
     problems,
-    scene_file,
 )
-from rodjax.scene_file import SceneFileError, read_scene, read_scene_file
-from rodjax.scene_writing import write_scene
+from rodjax.io import scene_file
+from rodjax.io.scene_file import SceneFileError, read_scene, read_scene_file
+from rodjax.io.scene_writing import write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rodjax.strain import axial_strain, squared_curvature_between, swept_angle
+from rodjax.mechanics.strain import axial_strain, squared_curvature_between, swept_angle
 
 
 def test_axial_strain_of_a_stretched_helix():

@@ -8,7 +8,7 @@ from scipy import stats
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Limits, PointForce, Rod, Scene, Sphere, Tolerance, frame, problems
-from rodjax.batch import solve_batch
+from rodjax.paths.batch import solve_batch
 from rodjax.routing import scatter
 
 ORIGIN = (0.0, 0.0, 0.0)

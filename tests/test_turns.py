@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Rod, Scene, frame
-from rodjax.supports import Support
+from rodjax.model.supports import Support
 
 LEVEL = Rotation.from_matrix(np.asarray(frame((1, 0, 0))))
 NO_TURN = Rotation.identity()

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import short_sum
 from rodjax.discretization.cells import REFERENCE, Cells, Strains
-from rodjax.energy import Sections
-from rodjax.rotations import columns, rotated
-from rodjax.staging import staged
-from rodjax.vectors import cross, diagonal, dot, skew
+from rodjax.geometry.rotations import columns, rotated
+from rodjax.geometry.vectors import cross, diagonal, dot, skew
+from rodjax.linalg.blocks import short_sum
+from rodjax.mechanics.energy import Sections
+from rodjax.programs.staging import staged
 
 
 class CellStates(NamedTuple):

@@ -20,15 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rodjax.along import Steps, stiffness_at
-from rodjax.blocks import short_sum
 from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
-from rodjax.energy import Sections
-from rodjax.rod import Rod
-from rodjax.rotations import inverse, product, unit
-from rodjax.scene import Scene
+from rodjax.geometry.rotations import inverse, product, unit
+from rodjax.linalg.blocks import short_sum
+from rodjax.mechanics.energy import Sections
+from rodjax.model.along import Steps, stiffness_at
+from rodjax.model.rod import Rod
+from rodjax.model.scene import Scene
 
 # The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
 REFERENCE = 1

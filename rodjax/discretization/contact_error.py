@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.error import Errors
 from rodjax.discretization.form_results import positions_between_nodes
 from rodjax.discretization.touching import TouchingForm
-from rodjax.vectors import dot, root
+from rodjax.geometry.vectors import dot, root
 
 # A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
 # displaces it by about half of that.

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.energy import dead_load_energy
-from rodjax.loads import DistributedForce
-from rodjax.scene import Scene
-from rodjax.supports import Free, Held
+from rodjax.mechanics.energy import dead_load_energy
+from rodjax.model.loads import DistributedForce
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Free, Held
 from rodjax.units import Units
 
 

@@ -18,10 +18,10 @@ from rodjax.discretization.joints import (
 from rodjax.discretization.nodes import held_nodes, with_nodes_at_clips
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, swept_twist, transport_along
-from rodjax.energy import curvature_under, density
-from rodjax.scene import Scene
-from rodjax.supports import Clamp, Directed, Free, Held
-from rodjax.vectors import dot
+from rodjax.geometry.vectors import dot
+from rodjax.mechanics.energy import curvature_under, density
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Directed, Free, Held
 
 
 class EdgeTangents(eqx.Module):

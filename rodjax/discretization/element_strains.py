@@ -18,8 +18,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import product
-from rodjax.vectors import cross, diagonal, dot, skew
+from rodjax.geometry.vectors import cross, diagonal, dot, skew
+from rodjax.linalg.blocks import product
 
 
 class ByOneSize(NamedTuple):

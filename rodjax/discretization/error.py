@@ -19,19 +19,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.blocks import short_sum
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.motion import Motion, neutral_turn
 from rodjax.discretization.results import clip_moments, resultants
 from rodjax.discretization.twist import transport
-from rodjax.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
-from rodjax.linalg import factor_and_solve
-from rodjax.scene import slides
-from rodjax.stability import Motion, neutral_turn
-from rodjax.strain import swept_angle
-from rodjax.supports import Held
-from rodjax.vectors import components, cross, dot, root
+from rodjax.geometry.vectors import components, cross, dot, root
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.saddle_point import factor_and_solve
+from rodjax.mechanics.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
+from rodjax.mechanics.strain import swept_angle
+from rodjax.model.scene import slides
+from rodjax.model.supports import Held
 
 # Steps of the integration of an element: an even number.
 STEPS = 4

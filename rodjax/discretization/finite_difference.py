@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.blocks import short_sum
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes, load_energy
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.first_twist import FirstTwist, twist_on
@@ -35,13 +34,14 @@ from rodjax.discretization.twist import (
     total_twist,
     twist_under_moment,
 )
-from rodjax.energy import axial_strain_under, density
-from rodjax.guess import resampled
-from rodjax.linalg import AnyFactors, Factors, SaddlePointSystem, factor
-from rodjax.scene import Scene, dead_end_moment, held_at_both_ends
-from rodjax.strain import axial_strain
-from rodjax.supports import Clamp, Directed, Held
-from rodjax.vectors import components, dot
+from rodjax.geometry.interpolation import resampled
+from rodjax.geometry.vectors import components, dot
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.saddle_point import AnyFactors, Factors, SaddlePointSystem, factor
+from rodjax.mechanics.energy import axial_strain_under, density
+from rodjax.mechanics.strain import axial_strain
+from rodjax.model.scene import Scene, dead_end_moment, held_at_both_ends
+from rodjax.model.supports import Clamp, Directed, Held
 
 
 class Polyline(Shape):

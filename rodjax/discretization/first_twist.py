@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import FramedTangents, TwistReference, nearest_twist, total_twist
-from rodjax.scene import Scene
-from rodjax.supports import Clamp
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp
 
 
 class Last(NamedTuple):

@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
-from rodjax.linalg import AnySystem
-from rodjax.scene import Scene
-from rodjax.supports import Free
-from rodjax.vectors import dot
+from rodjax.geometry.vectors import dot
+from rodjax.linalg.saddle_point import AnySystem
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Free
 
 # Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
 # a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It

@@ -9,7 +9,7 @@ from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching_forms import TouchingFrames, TouchingTangents
-from rodjax.scene import Scene
+from rodjax.model.scene import Scene
 
 
 def form_of(scene: Scene, shape: Shape) -> Form:

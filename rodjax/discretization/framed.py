@@ -21,8 +21,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.blocks import product as block_product
-from rodjax.blocks import short_sum
 from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
 from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.dead_loads import total_force
@@ -30,13 +28,15 @@ from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearizatio
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
-from rodjax.energy import Sections
-from rodjax.linalg import AnySystem, DenseSystem, SaddlePointSystem
-from rodjax.loads import DistributedCouple, DistributedForce
-from rodjax.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
-from rodjax.scene import Scene, has_potential, held_position
-from rodjax.supports import Clamp, Directed, Free, Held
-from rodjax.vectors import components, dot
+from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
+from rodjax.geometry.vectors import components, dot
+from rodjax.linalg.blocks import product as block_product
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.saddle_point import AnySystem, DenseSystem, SaddlePointSystem
+from rodjax.mechanics.energy import Sections
+from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.scene import Scene, has_potential, held_position
+from rodjax.model.supports import Clamp, Directed, Free, Held
 
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
 # and of EI/L^2: directions count as lying in the plane up to as much.

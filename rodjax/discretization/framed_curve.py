@@ -8,18 +8,19 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.first_shape import first_shape
 from rodjax.discretization.first_twist import FirstTwist, more_turns
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist
-from rodjax.guess import cubic, first_shape
-from rodjax.rest import RestStrain
-from rodjax.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
-from rodjax.scene import Scene, held_at_both_ends, scene_axes
-from rodjax.supports import Clamp, Directed, Held, Swivel
-from rodjax.vectors import dot
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
+from rodjax.geometry.vectors import dot
+from rodjax.model.rest import RestStrain
+from rodjax.model.scene import Scene, held_at_both_ends, scene_axes
+from rodjax.model.supports import Clamp, Directed, Held, Swivel
 
 
 class FramedCurve(Shape):

@@ -5,13 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.along import Along
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.layout import SpanForces
-from rodjax.loads import DistributedForce
-from rodjax.rotations import inverse, rotated, tangent
-from rodjax.scene import Scene
-from rodjax.supports import Free, Held
+from rodjax.geometry.rotations import inverse, rotated, tangent
+from rodjax.model.along import Along
+from rodjax.model.loads import DistributedForce
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Free, Held
 
 
 def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:

@@ -18,12 +18,12 @@ from rodjax.discretization.error import (
 )
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.results import Resultants
-from rodjax.energy import Sections
-from rodjax.guess import cubic
-from rodjax.rotations import columns, inverse, product, rotated, tangent, unit
-from rodjax.scene import slides
-from rodjax.supports import Directed, Free, Held
-from rodjax.vectors import cross, dot, root
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.rotations import columns, inverse, product, rotated, tangent, unit
+from rodjax.geometry.vectors import cross, dot, root
+from rodjax.mechanics.energy import Sections
+from rodjax.model.scene import slides
+from rodjax.model.supports import Directed, Free, Held
 
 
 class NodeStrains(eqx.Module):

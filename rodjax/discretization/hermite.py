@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.blocks import short_sum
 from rodjax.discretization.element_bending import SIMPSON, bending_energies, by_chords
 from rodjax.discretization.form import Form
 from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
@@ -28,12 +27,13 @@ from rodjax.discretization.nodes import held_nodes, with_nodes_at, with_nodes_at
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, transport_along
-from rodjax.energy import axial_strain_under, density
-from rodjax.guess import cubic
-from rodjax.scene import Scene
-from rodjax.strain import swept_angle
-from rodjax.supports import Clamp, Directed, Free, Held
-from rodjax.vectors import components, cross, dot
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.vectors import components, cross, dot
+from rodjax.linalg.blocks import short_sum
+from rodjax.mechanics.energy import axial_strain_under, density
+from rodjax.mechanics.strain import swept_angle
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Directed, Free, Held
 
 # The pairs of points whose chords shape an element, and the weights of their arcs in its twist: of the areas that
 # polygons of half and whole elements enclose, Richardson's extrapolation.

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import short_sum
-from rodjax.energy import density
-from rodjax.rod import Rod
-from rodjax.scene import Scene
-from rodjax.strain import squared_curvature_between
-from rodjax.supports import Directed
-from rodjax.vectors import components, cross, dot
+from rodjax.geometry.vectors import components, cross, dot
+from rodjax.linalg.blocks import short_sum
+from rodjax.mechanics.energy import density
+from rodjax.mechanics.strain import squared_curvature_between
+from rodjax.model.rod import Rod
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Directed
 
 # In a Gauss-Newton Hessian a joint bent further than this counts as one bent so far: it stays definite.
 LEAST_COSINE = 0.1

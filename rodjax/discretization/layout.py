@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.scene import Scene
-from rodjax.supports import Held
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Held
 
 
 class SpanForces(eqx.Module):

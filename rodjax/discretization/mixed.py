@@ -16,7 +16,7 @@ A dead moment M on a free end has no potential. There the virtual work M . (rota
 the tangent t turns by t x dt, and the section spins about it by as much as keeps the torque M . t along the rod.
 
 The second derivatives couple neighbouring edges only, two numbers each; the closures and the torsion, which many edges
-share, are a border of a few columns (`linalg.SaddlePointSystem`). Arrays along the rod have the components first.
+share, are a border of a few columns (`saddle_point.SaddlePointSystem`). Arrays along the rod have the components first.
 """
 
 import dataclasses
@@ -28,8 +28,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import short_sum
-from rodjax.chain import ChainSystem
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
@@ -38,11 +36,13 @@ from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
-from rodjax.energy import axial_strain_under, density
-from rodjax.linalg import AnySystem, SaddlePointSystem
-from rodjax.scene import Scene, dead_end_moment, held_position
-from rodjax.supports import Clamp, Free
-from rodjax.vectors import components, dot
+from rodjax.geometry.vectors import components, dot
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
+from rodjax.mechanics.energy import axial_strain_under, density
+from rodjax.model.scene import Scene, dead_end_moment, held_position
+from rodjax.model.supports import Clamp, Free
 
 
 class MixedPoint(eqx.Module):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.scene import Scene
+from rodjax.model.scene import Scene
 
 # Point forces nearer to one another, to a clip or to an end, in parts of an element, share it: shorter ones would cost
 # digits.

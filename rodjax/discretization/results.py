@@ -11,11 +11,11 @@ from rodjax.discretization.joints import Joints, bending_derivatives, tangent_ba
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.twist import angle_about, transport, transport_along
-from rodjax.energy import axial_strain_under, curvature_under, torque_at
-from rodjax.rod import Rod
-from rodjax.scene import Scene
-from rodjax.supports import Clamp, Directed, Free, Support
-from rodjax.vectors import cross, dot, root
+from rodjax.geometry.vectors import cross, dot, root
+from rodjax.mechanics.energy import axial_strain_under, curvature_under, torque_at
+from rodjax.model.rod import Rod
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Directed, Free, Support
 
 
 class Resultants(eqx.Module):

@@ -5,7 +5,7 @@ from typing import Protocol
 import equinox as eqx
 from jaxtyping import Array, Float, Int
 
-from rodjax.scene import Scene
+from rodjax.model.scene import Scene
 
 
 class Blocks(eqx.Module):

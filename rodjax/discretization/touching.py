@@ -21,14 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.along import Value, largest_beside, value_at
 from rodjax.discretization.form import FLOOR_SAFETY, Form
-from rodjax.guess import cubic
-from rodjax.loads import DistributedForce
-from rodjax.obstacles import Obstacle, least
-from rodjax.passage import PLACES
-from rodjax.supports import Free
-from rodjax.vectors import dot
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.vectors import dot
+from rodjax.mechanics.passage import PLACES
+from rodjax.model.along import Value, largest_beside, value_at
+from rodjax.model.loads import DistributedForce
+from rodjax.model.obstacles import Obstacle, least
+from rodjax.model.supports import Free
 
 # A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
 PENETRATION = 3e-5

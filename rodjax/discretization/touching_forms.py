@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.blocks import short_sum
-from rodjax.chain import ChainSystem
 from rodjax.discretization.cell_derivatives import CellDerivatives
 from rodjax.discretization.cells import Cells
 from rodjax.discretization.form import Linearization
@@ -21,9 +19,11 @@ from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching import TouchingForm
-from rodjax.energy import axial_strain_under, density
-from rodjax.scene import Scene
-from rodjax.supports import Held
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.chain import ChainSystem
+from rodjax.mechanics.energy import axial_strain_under, density
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Held
 
 
 class TouchingTangents(TouchingForm, MixedForm):

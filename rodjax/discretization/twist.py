@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.joints import tangent_bases
-from rodjax.energy import twist_under
-from rodjax.scene import Scene, dead_end_moment
-from rodjax.strain import swept_angle
-from rodjax.supports import Free
-from rodjax.vectors import components, cross, dot
+from rodjax.geometry.vectors import components, cross, dot
+from rodjax.mechanics.energy import twist_under
+from rodjax.mechanics.strain import swept_angle
+from rodjax.model.scene import Scene, dead_end_moment
+from rodjax.model.supports import Free
 
 
 class FramedTangents(eqx.Module):

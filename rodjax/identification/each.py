@@ -13,8 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
 from rodjax.checks import leaf
-from rodjax.compilation import compiled, one_answer
-from rodjax.equilibrium import Discretization
 from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import Loss
@@ -34,7 +32,9 @@ from rodjax.identification.setup import (
 )
 from rodjax.identification.statistics import LARGEST_DEVIATION, inverse, rates
 from rodjax.identification.unknowns import Unknown
-from rodjax.result import Equilibrium
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.equilibrium import Discretization
+from rodjax.solving.result import Equilibrium
 
 
 @dataclasses.dataclass(frozen=True)

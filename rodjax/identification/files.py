@@ -66,17 +66,17 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
-from rodjax.clocking import check_clocked
-from rodjax.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 from rodjax.identification.loss import Loss
 from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
 from rodjax.identification.measured_table import UNITS as MEASURED
 from rodjax.identification.measurements import Centerline, EndForce, EndMoment, Experiment, Measurement, orthographic
 from rodjax.identification.unknowns import Per, Scale, Unknown, known_names, target
-from rodjax.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
-from rodjax.scene_file import SceneFile, read_text, toml_tables
-from rodjax.scene_keys import SceneVariations
-from rodjax.scene_keys import check_keys as check_scene_keys
+from rodjax.io.clocking import check_clocked
+from rodjax.io.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
+from rodjax.io.scene_file import SceneFile, read_text, toml_tables
+from rodjax.io.scene_keys import SceneVariations
+from rodjax.io.scene_keys import check_keys as check_scene_keys
+from rodjax.solving.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
 
 UNKNOWN_KEYS = ("name", "names", "scale", "per", "start", "bounds", "prior", "label")
 SETTINGS = ("loss", "threshold", "rtol", "segments", "discretization", "planar")

@@ -12,9 +12,6 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from rodjax.checks import leaf
-from rodjax.compilation import one_answer
-from rodjax.continuation import critical_point
-from rodjax.equilibrium import Discretization
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import Loss
 from rodjax.identification.measurements import CriticalValue, Experiment
@@ -34,7 +31,10 @@ from rodjax.identification.setup import (
     warn_of_lost,
 )
 from rodjax.identification.unknowns import Unknown, with_values
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.paths.continuation import critical_point
+from rodjax.programs.compilation import one_answer
+from rodjax.solving.equilibrium import Discretization
+from rodjax.solving.result import Equilibrium, NotConvergedWarning
 from rodjax.warn import warn
 
 # The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import line, shown
-from rodjax.quantities import SceneFileError, number_in, si_value
-from rodjax.scene_keys import cell, check_keys, si_number
+from rodjax.io.quantities import SceneFileError, number_in, si_value
+from rodjax.io.scene_keys import cell, check_keys, si_number
 
 AXES = "xyz"
 LOADS = {

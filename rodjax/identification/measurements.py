@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.checks import instance, is_known, leaf, number_array, number_list, one_of, positive, shown, vector
-from rodjax.guess import Guess
-from rodjax.path import stack_scenes
-from rodjax.result import Equilibrium
-from rodjax.scene import Scene
-from rodjax.supports import frame, rotate
+from rodjax.model.scene import Scene
+from rodjax.model.supports import frame, rotate
+from rodjax.paths.path import stack_scenes
+from rodjax.solving.guess import Guess
+from rodjax.solving.result import Equilibrium
 
 # Places on a rod among which the one nearest to a measured point is sought, for each segment of the mesh.
 PLACES = 8

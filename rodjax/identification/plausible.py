@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.identification.measurements import Centerline, Experiment
-from rodjax.scene import MAX_SPAN, Scene
-from rodjax.supports import Held
+from rodjax.model.scene import MAX_SPAN, Scene
+from rodjax.model.supports import Held
 
 # Extents by the rod's length that points in the wrong unit have, a thousand times too large.
 MILLIMETRES = 100.0, 2000.0

@@ -20,7 +20,7 @@ from rodjax.identification.refits import Profile
 from rodjax.identification.result import Fit
 from rodjax.identification.setup import name_of
 from rodjax.identification.unknowns import with_values
-from rodjax.status import CONVERGED
+from rodjax.solving.status import CONVERGED
 
 # Panels of shapes, and lines in a panel of residuals; of more centerlines those with the largest deviations.
 MOST_PANELS, MOST_LINES = 12, 60

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.compilation import compiled
-from rodjax.equilibrium import Discretization, solve
 from rodjax.identification.lanes import in_lanes
 from rodjax.identification.least_squares import Coordinates, NormalEquations, Residuals, least_squares
 from rodjax.identification.loss import Loss, influence, robust
 from rodjax.identification.measurements import Experiment
 from rodjax.identification.unknowns import Scale, inside, nominal, with_values
-from rodjax.result import Equilibrium
-from rodjax.scene import Scene
+from rodjax.model.scene import Scene
+from rodjax.programs.compilation import compiled
+from rodjax.solving.equilibrium import Discretization, solve
+from rodjax.solving.result import Equilibrium
 
 
 class Sought(NamedTuple):

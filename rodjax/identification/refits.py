@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import number_list, whole_number
-from rodjax.compilation import compiled
 from rodjax.identification.lanes import LANES
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment, Measurement
@@ -21,7 +20,8 @@ from rodjax.identification.problem import Found, Problem, Structure, looked_at, 
 from rodjax.identification.setup import Setup, beginnings, begun, clusters_of, prepared, stacked
 from rodjax.identification.statistics import Blocks, rates
 from rodjax.identification.unknowns import outside
-from rodjax.result import Equilibrium
+from rodjax.programs.compilation import compiled
+from rodjax.solving.result import Equilibrium
 
 Equilibria = tuple[Equilibrium, ...]
 

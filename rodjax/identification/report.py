@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.identification.setup import name_of
-from rodjax.result import DEFAULT_STRAIN_LIMIT
-from rodjax.status import CONVERGED, Status
-from rodjax.supports import Clamp
+from rodjax.model.supports import Clamp
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
+from rodjax.solving.status import CONVERGED, Status
 
 if TYPE_CHECKING:
     from rodjax.identification.result import Fit

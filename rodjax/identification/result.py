@@ -18,8 +18,8 @@ from rodjax.identification.problem import Found, Problem, Structure, values
 from rodjax.identification.setup import Setup, clusters_of
 from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, rates, undetermined
 from rodjax.identification.unknowns import Unknown
-from rodjax.result import Equilibrium
-from rodjax.status import Status
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.status import Status
 
 
 class NotIdentifiableError(ValueError):

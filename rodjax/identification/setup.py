@@ -13,19 +13,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, leaf, one_of, positive, sequence, whole_number
-from rodjax.compilation import compiled
-from rodjax.equilibrium import Discretization, checked_options, first_state, solve
-from rodjax.guess import Guess
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import THRESHOLDS, Loss
 from rodjax.identification.measurements import Centerline, CriticalValue, Experiment
 from rodjax.identification.plausible import check_points
 from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
-from rodjax.path import stack_scenes
-from rodjax.refinement import SAFETY, SIZES, next_size
-from rodjax.result import Equilibrium, NotConvergedWarning, estimated_errors
-from rodjax.scene import held_position
+from rodjax.model.scene import held_position
+from rodjax.paths.path import stack_scenes
+from rodjax.programs.compilation import compiled
+from rodjax.solving.equilibrium import Discretization, checked_options, first_state, solve
+from rodjax.solving.guess import Guess
+from rodjax.solving.refinement import SAFETY, SIZES, next_size
+from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.warn import warn
 
 DEFAULT_RTOL = 1e-4

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, leaf, namespace, number_array, one_of, positive, sequence, shown
 from rodjax.identification.measurements import Experiment
-from rodjax.scene import Scene
-from rodjax.sensitivity import named_numbers
-from rodjax.supports import rotate
+from rodjax.model.scene import Scene
+from rodjax.model.supports import rotate
 
 Scale = Literal["log", "linear"]
 Per = Literal["all", "experiment"]

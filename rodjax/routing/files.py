@@ -35,7 +35,7 @@ A complete example; quantities are as in scene files, a number and any unit of t
     energy = "1 J"
     stability = "0.1 N"            # least stiffness of the softest motion
 
-Obstacles are as in `rodjax.obstacle_tables`, with a name; here they push nothing: those of a scene file do.
+Obstacles are as in `rodjax.io.obstacle_tables`, with a name; here they push nothing: those of a scene file do.
 
 What `rodjax route` varies, and a report of the scene as it is leaves aside:
 
@@ -76,11 +76,10 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
-from rodjax.clocking import check_clocked
 from rodjax.identification.unknowns import unit_of
-from rodjax.obstacle_tables import kind_of, obstacle
-from rodjax.obstacles import Obstacle
-from rodjax.quantities import (
+from rodjax.io.clocking import check_clocked
+from rodjax.io.obstacle_tables import kind_of, obstacle
+from rodjax.io.quantities import (
     OF_TABLES,
     SceneFileError,
     check_keys,
@@ -90,11 +89,12 @@ from rodjax.quantities import (
     si_values,
     table_list,
 )
-from rodjax.result import DEFAULT_STRAIN_LIMIT
+from rodjax.io.scene_file import SCENE_TABLES, SceneFile, SceneReader, read_scene_file, read_text, toml_tables
+from rodjax.model.obstacles import Obstacle
 from rodjax.routing.limits import Limits
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned, Variable, checked_variables
-from rodjax.scene_file import SCENE_TABLES, SceneFile, SceneReader, read_scene_file, read_text, toml_tables
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
 # What makes a variable, and the keys that it must have.
 VARIABLES: dict[str, tuple[Callable[..., Variable], tuple[str, ...]]] = {

@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rodjax.modes import lowest_mode
-from rodjax.obstacles import Obstacle
-from rodjax.result import Equilibrium, describe
+from rodjax.model.obstacles import Obstacle
+from rodjax.model.scene import has_potential, slides
+from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, curvature_along, margins
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
-from rodjax.scene import has_potential, slides
+from rodjax.solving.result import Equilibrium, describe
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
 WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}

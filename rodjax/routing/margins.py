@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rodjax.along import Value, value_at
+from rodjax.analysis.clearance import POINTS, places, radius_at
 from rodjax.checks import instance, sequence
-from rodjax.clearance import POINTS, places, radius_at
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
-from rodjax.modes import lowest_mode
-from rodjax.obstacles import Obstacle, checked_obstacles
-from rodjax.result import Equilibrium, beside_nodes, over_leading_axes
+from rodjax.geometry.vectors import dot, root
+from rodjax.model.along import Value, value_at
+from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
-from rodjax.vectors import dot, root
+from rodjax.solving.result import Equilibrium, beside_nodes, over_leading_axes
 
 # Steps of the secant method towards the nearest place of a piece of the rod.
 NEARER = 6

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, not_negative, positive
-from rodjax.result import Equilibrium
-from rodjax.vectors import dot, root
+from rodjax.geometry.vectors import dot, root
+from rodjax.solving.result import Equilibrium
 
 # A clip counts half where it carries this part of the weight of the cable, where nothing else is said.
 CLIP_SHARE = 0.05

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from rodjax.atomic_write import replace_file
-from rodjax.files import save
+from rodjax.io.files import save
+from rodjax.io.scene_writing import write_scene
 from rodjax.routing.records import plain
 from rodjax.routing.route import Route
 from rodjax.routing.words import TOLD, table
-from rodjax.scene_writing import write_scene
 
 # Starts with a row in the table; of more the best.
 MOST_ROWS = 20

@@ -13,7 +13,7 @@ from matplotlib.ticker import PercentFormatter
 from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import line
-from rodjax.obstacles import Obstacle
+from rodjax.model.obstacles import Obstacle
 from rodjax.plot import ARROW_LENGTH, HALO, draw_arrows, draw_faces, seen_axes, set_view, tube_faces
 from rodjax.routing.sights import (
     CLIP_COLOR,

@@ -8,19 +8,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.along import Along
-from rodjax.compilation import compiled
-from rodjax.equilibrium import Solver
-from rodjax.implicit import differentiable
-from rodjax.obstacles import Obstacle
-from rodjax.result import Equilibrium
+from rodjax.geometry.vectors import dot, root
+from rodjax.model.along import Along
+from rodjax.model.obstacles import Obstacle
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clip, Held, Support
+from rodjax.programs.compilation import compiled
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Measured, measured
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Variable, leaf_names, with_numbers
-from rodjax.scene import Scene
-from rodjax.supports import Clip, Held, Support
-from rodjax.vectors import dot, root
+from rodjax.solving.equilibrium import Solver
+from rodjax.solving.implicit import differentiable
+from rodjax.solving.result import Equilibrium
 
 
 class Problem(eqx.Module):

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rodjax.result import Equilibrium
-from rodjax.scene import Scene
+from rodjax.model.scene import Scene
+from rodjax.solving.result import Equilibrium
 
 # Of a tangent that rises more steeply than this (sine of the angle to the vertical) the level normal is rounding.
 STEEP = 1e-6

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.routing.findings import Cable, Gradients
-from rodjax.status import Status
+from rodjax.solving.status import Status
 
 if TYPE_CHECKING:
     from rodjax.routing.report import Report

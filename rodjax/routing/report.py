@@ -13,14 +13,14 @@ import numpy as np
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
-from rodjax.compilation import one_answer
-from rodjax.obstacles import Obstacle, checked_obstacles
-from rodjax.result import Equilibrium
+from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.programs.compilation import one_answer
 from rodjax.routing import records, words
 from rodjax.routing.findings import Cable, Gradients, cable
 from rodjax.routing.limits import Limits
 from rodjax.routing.route import Route
-from rodjax.status import Status
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.status import Status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

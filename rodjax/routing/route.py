@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
-from rodjax.batch import solve_first, solve_stack
 from rodjax.checks import instance, positive, whole_number
-from rodjax.compilation import one_answer
-from rodjax.equilibrium import Options, Solver, checked_options, solve
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.model.scene import Scene, slides
+from rodjax.paths.batch import solve_first, solve_stack
+from rodjax.programs.compilation import one_answer
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, checked, margins, measured_margins
 from rodjax.routing.objective import Objective
@@ -35,8 +34,9 @@ from rodjax.routing.problem import (
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.search import KEPT, REGION, Asked, Numbers, Outcome, Search, Settings
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
-from rodjax.scene import Scene, slides
-from rodjax.solvers.newton import Newton
+from rodjax.solving.equilibrium import Options, Solver, checked_options, solve
+from rodjax.solving.newton import Newton
+from rodjax.solving.result import Equilibrium, NotConvergedWarning
 
 SEGMENTS = 48
 # Of each limit so much is kept in reserve, as a part of it, until the error of the mesh is known.

@@ -12,18 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.batch import CHUNKS, LANES, solve_stack
 from rodjax.checks import Numbers
-from rodjax.compilation import compiled
 from rodjax.identification.unknowns import nominal, with_values
-from rodjax.implicit import differentiable
-from rodjax.modes import lowest_mode
-from rodjax.obstacles import Obstacle
-from rodjax.result import Equilibrium, NotConvergedWarning
+from rodjax.model.obstacles import Obstacle
+from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.supports import Free
+from rodjax.paths.batch import CHUNKS, LANES, solve_stack
+from rodjax.paths.modes import lowest_mode
+from rodjax.programs.compilation import compiled
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
-from rodjax.scene import Scene, has_potential, slides
-from rodjax.supports import Free
+from rodjax.solving.implicit import differentiable
+from rodjax.solving.result import Equilibrium, NotConvergedWarning
 
 # Of the three-point rule of Gauss & Hermite, in standard deviations.
 STEP = math.sqrt(3.0)

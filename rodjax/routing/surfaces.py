@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.compilation import compiled
-from rodjax.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.triangle_mesh import Mesh
 from rodjax.plot import quads
-from rodjax.triangle_mesh import Mesh
+from rodjax.programs.compilation import compiled
 
 # Corners of faces; a triangle has its last one twice.
 Faces = Float[np.ndarray, "f 4 3"]

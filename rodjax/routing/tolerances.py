@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg, stats
 
+from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, is_known, leaf, number_array, positive, sequence, shown, whole_number
-from rodjax.compilation import one_answer
 from rodjax.identification.unknowns import Unknown, known_names, target
-from rodjax.result import Equilibrium
+from rodjax.model.scene import Scene
+from rodjax.programs.compilation import one_answer
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples
-from rodjax.scene import Scene
-from rodjax.sensitivity import named_numbers
-from rodjax.status import Status
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.status import Status
 
 # Standard deviations that differ by this part, and means by this part of a standard deviation, are flagged: in a tail
 # at two standard deviations the two weigh the same.

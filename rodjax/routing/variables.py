@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, leaf, number_array, positive, sequence, shown, vector
-from rodjax.scene import Scene
-from rodjax.sensitivity import named_numbers
-from rodjax.supports import rotate
-from rodjax.vectors import dot
+from rodjax.geometry.vectors import dot
+from rodjax.model.scene import Scene
+from rodjax.model.supports import rotate
 
 # Of a surface, nominal positions are found to this part of its parameters' range by looking at so many of each.
 GRID = 33

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rodjax.result import Equilibrium
 from rodjax.routing.findings import Cable, Fact, Gradients
 from rodjax.routing.reactions import Reaction
-from rodjax.status import Status
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.status import Status
 
 if TYPE_CHECKING:
     from rodjax.routing.report import Report

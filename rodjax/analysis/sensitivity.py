@@ -1,0 +1,150 @@
+"""How the results of a solve change with the numbers of its scene, as tables: no search is repeated for them."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, sequence
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Clamp, Free, Pin, rotate
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.equilibrium import solve
+from rodjax.solving.implicit import differentiable
+from rodjax.solving.result import Equilibrium
+
+FIELDS = (
+    "s",
+    "nodes",
+    "frames",
+    "tangents",
+    "curvature",
+    "twist",
+    "total_twist",
+    "tension",
+    "axial_strain",
+    "energy",
+    "elastic_energy",
+    "start_force",
+    "start_moment",
+    "end_force",
+    "end_moment",
+    "clip_forces",
+    "clip_moments",
+)
+
+
+@one_answer
+def sensitivities(
+    scene: Scene, *, of: Sequence[str], wrt: Sequence[str], **options: Any
+) -> dict[str, dict[str, Float[Array, "..."]]]:
+    """The derivatives of an equilibrium by numbers of its scene: `{of: {wrt: array}}`.
+
+    `sensitivities(scene, of=["end_force"], wrt=["rod.EI"])["end_force"]["rod.EI"]` are the three numbers dF/d(EI). One
+    solve and one compiled program give all, in forward mode where the inputs are fewer than the outputs, else in
+    reverse.
+
+    **Arguments:**
+
+    - `scene`: `Scene`.
+    - `of`: names of fields of `Equilibrium` that are real numbers, such as `"nodes"` or `"end_force"`.
+    - `wrt`: dotted names of numbers of the scene: `"rod.EI"`, `"end.position"`, `"point_forces.0.force"`,
+        `"clips.0.at"`, `"gravity"`. A frame changes by a rotation vector [rad] about global axes, as in
+        `rodjax.rotate`; of the tangent of a `Swivel` or `Clip` only changes across it matter. What is absent from a
+        scene, such as a gravity of `None`, has no derivative.
+    - `options`: of `rodjax.solve`. They choose the mesh, on which the derivatives are exact.
+
+    Each array has the shape of the field followed by that of the number, (3,) for a frame, in SI units of the one over
+    those of the other. Where the solve did not converge, or at a critical equilibrium, they are not numbers.
+    Raises `ValueError` or `TypeError` for names that are not among these, or options that `rodjax.solve` refuses.
+    """
+    instance(scene, "scene", Scene)
+    of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
+    wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
+    found = _derivatives(scene, solve(scene, **options), of, wrt)
+    return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names
+
+
+@one_answer
+def end_stiffness(scene: Scene, **options: Any) -> Float[Array, "k k"]:
+    """The stiffness that the support at s = L feels: second derivatives of the energy by its motion, global axes.
+
+    Of a `Clamp` (6, 6), rows and columns (ux, uy, uz, rx, ry, rz), displacement [m] and rotation vector [rad]: blocks
+    in N/m, N, N and N m. Of a `Pin` (3, 3), displacements alone [N/m]. `options`: of `rodjax.solve`.
+
+    Rows are the changes of `end_force` and `end_moment`, save that of the moment by a rotation: rotations do not
+    commute, so dM/dr is the symmetric second derivative of the energy less half of the matrix [M x] of the cross
+    product with `end_moment`, which is added here. The whole is symmetric unless a dead moment acts on the other end,
+    which has no energy. Not numbers where `sensitivities` are not.
+
+    Raises `ValueError` for an end that is `Free` or a `Swivel`.
+    """
+    instance(scene, "scene", Scene)
+    if isinstance(scene.end, Free):
+        raise ValueError("scene.end must hold a position to have a stiffness, got Free; make it a Clamp or Pin")
+    if not isinstance(scene.end, Clamp | Pin):
+        raise ValueError(f"scene.end must be a Clamp (6 x 6) or a Pin (3 x 3), got {type(scene.end).__name__}")
+    return _end_stiffness(scene, solve(scene, **options))
+
+
+@compiled
+def _end_stiffness(scene: Scene, result: Equilibrium) -> Float[Array, "k k"]:
+    if isinstance(scene.end, Pin):
+        return _derivatives(scene, result, ("end_force",), ("end.position",))["end_force"]["end.position"]
+    rows = _derivatives(scene, result, ("end_force", "end_moment"), ("end.position", "end.frame"))
+    force, moment = ([rows[of][wrt] for wrt in ("end.position", "end.frame")] for of in ("end_force", "end_moment"))
+    moment[1] += 0.5 * jnp.cross(result.end_moment[:, None], jnp.eye(3, dtype=moment[1].dtype), axis=0)
+    return jnp.block([force, moment])
+
+
+def moved(scene: Scene, changes: dict[str, Float[Array, "..."]]) -> Scene:
+    """The scene with changes added to the numbers of these names; frames are turned by rotation vectors (3,) [rad]."""
+    numbers = named_numbers(scene)
+    changed = [
+        rotate(numbers[name], change) if _is_frame(name) else numbers[name] + change for name, change in changes.items()
+    ]
+    return eqx.tree_at(lambda scene: [named_numbers(scene)[name] for name in changes], scene, changed)
+
+
+@functools.partial(compiled, static_argnames=("of", "wrt"))
+def _derivatives(
+    scene: Scene, result: Equilibrium, of: tuple[str, ...], wrt: tuple[str, ...]
+) -> dict[str, dict[str, Float[Array, "..."]]]:
+    """By the implicit function theorem at a result, whose mesh is kept."""
+
+    def fields(changes: dict[str, Float[Array, "..."]]) -> dict[str, Float[Array, "..."]]:
+        near = differentiable(moved(scene, changes), result)
+        return {name: getattr(near, name) for name in of}
+
+    numbers = named_numbers(scene)
+    nowhere = {name: jnp.zeros_like(numbers[name][0] if _is_frame(name) else numbers[name]) for name in wrt}
+    outputs = sum(getattr(result, name).size for name in of)
+    inputs = sum(change.size for change in nowhere.values())
+    return (jax.jacfwd if inputs <= outputs else jax.jacrev)(fields)(nowhere)
+
+
+def named_numbers(scene: Scene) -> dict[str, Float[Array, "..."]]:
+    """The numbers of a scene by their dotted names; turns are whole and have no derivative."""
+    leaves, _ = jax.tree.flatten_with_path(scene)
+    named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    return {name: leaf for name, leaf in named.items() if name != "turns"}
+
+
+def _is_frame(name: str) -> bool:
+    return name.endswith(".frame")
+
+
+def _checked_names(argument: str, names: Any, allowed: Sequence[str], kind: str) -> tuple[str, ...]:
+    if isinstance(names, str):
+        raise TypeError(f"{argument} must be a list of names, such as [{names!r}], got {names!r} alone")
+    names = sequence(names, argument, "names")
+    if not names:
+        raise ValueError(f"{argument} must hold at least one name, got none; allowed are {', '.join(allowed)}")
+    for name in names:
+        if name not in allowed:
+            raise ValueError(f"{argument} must be names of {kind}, got {name!r}; allowed are {', '.join(allowed)}")
+    return names

@@ -1,0 +1,44 @@
+"""Changes of an equilibrium, and the turn of a rod that needs no force."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
+
+
+class Motion(eqx.Module):
+    """A change of an equilibrium: rotations of its tangents, and multipliers."""
+
+    rotation: Float[Array, "b m"]
+    multipliers: Float[Array, "k"]
+
+    def without(self, other: "Motion") -> "Motion":
+        """The part at right angles to another motion, whose rotations are no larger than 1; all of it beside none."""
+        squared = jnp.sum(other.rotation**2)
+        share = jnp.sum(other.rotation * self.rotation) / jnp.where(squared > 0, squared, 1.0)
+        return Motion(self.rotation - share * other.rotation, self.multipliers - share * other.multipliers)
+
+
+def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
+    """The turn of the whole rod about an axis that leaves it in equilibrium, or no motion where there is none.
+
+    So turns a rod between coaxial clamps, or between pins without weight, about the line through its ends.
+    """
+
+    def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
+        rotation = form.turn(point, here.bases, axis)
+        motion = Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
+        return motion, *here.system.times(motion.rotation, motion.multipliers)
+
+    # One after another: XLA would otherwise compute the system again for each number made of it.
+    turns = jax.lax.map(turn, jnp.eye(3, dtype=point.tangents.dtype))
+    _, moments, gaps = turns
+    missing = jnp.concatenate([moments.reshape(3, -1), gaps], axis=1)
+    axis = jnp.linalg.eigh(missing @ missing.T)[1][:, 0]
+    motion, moments, gaps = jax.tree.map(lambda x: jnp.tensordot(axis, x, 1), turns)
+    size = jnp.max(jnp.abs(motion.rotation))
+    least = NEUTRAL * size / point.tangents.shape[1]
+    is_neutral = (size > jnp.sqrt(NEUTRAL)) & (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)
+    return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)

@@ -1,0 +1,1 @@
+"""Vectors, rotations and curves, of no rod in particular."""

@@ -1,0 +1,1 @@
+"""Files: scenes, quantities with units, results."""

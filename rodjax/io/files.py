@@ -1,0 +1,413 @@
+"""save() and load(): an `Equilibrium` in one VTKHDF file, which ParaView draws and rodjax reads back to the last bit.
+
+The file is HDF5 with two groups. `/VTKHDF` holds the picture: the centerline as one polyline, with the point data of
+`point_data`, over time steps for a path. `/rodjax` holds every field of `Equilibrium` under its own name, each with
+the attributes `units` and `description`, so that `load` needs no pickle and other programs need no rodjax. A hash
+follows after the end of the HDF5 file, by which `load` finds damage.
+"""
+
+import dataclasses
+import io
+import os
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.atomic_write import has_seal, replace_file, seal
+from rodjax.checks import file_path, instance, is_known, one_of, shown
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.framed_curve import FramedCurve
+from rodjax.discretization.hermite import Curve
+from rodjax.model.along import Smooth, Steps
+from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.supports import Clamp, Free, Pin, Swivel
+from rodjax.model.triangle_mesh import Mesh
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.status import Status
+from rodjax.version import __version__
+
+SUFFIX = ".vtkhdf"
+# Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
+# that this one reads where fields are asked for that the older ones lack.
+FORMAT = 9
+OLDEST_FORMAT = 7
+
+# Units and meaning of each field, by its place under /rodjax.
+FIELDS = {
+    "s": ("m", "arclength of the nodes"),
+    "nodes": ("m", "centerline"),
+    "frames": ("1", "material frames at the nodes, columns d1, d2, t"),
+    "curvature": ("1/m", "|t x t'| at the nodes"),
+    "twist": ("rad/m", "twist Omega at the nodes"),
+    "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
+    "tension": ("N", "tension at the nodes"),
+    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes"),
+    "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
+    "elastic_energy": ("J", "elastic energy"),
+    "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
+    "start_moment": ("N m", "moment of the rod beyond s = 0 on the support there, about the centerline, global axes"),
+    "end_force": ("N", "force of the support at s = L on the rod, global axes"),
+    "end_moment": ("N m", "moment of the support at s = L on the rod, about the centerline, global axes"),
+    "converged": ("1", "whether the solve converged"),
+    "stable": ("1", "whether the energy has no negative curvature there"),
+    "status": ("1", "how the solve ended: " + ", ".join(f"{status.value} {status.name}" for status in Status)),
+    "iterations": ("1", "iterations of the solver"),
+    "evaluations": ("1", "evaluations of the energy and its gradient"),
+    "substeps": ("1", "solves that a step of a path took"),
+    "residual": ("1", "largest component of the gradient, in EI/L^2"),
+    "state/shape/nodes": ("1", "nodes in which the solver works: in state/units/length from state/units/origin"),
+    "state/shape/edges": ("1", "finite differences: differences of these nodes, free of the rounding of the positions"),
+    "state/shape/tangents": ("1", "Hermite elements: unit tangents at nodes and middles of the elements in turn"),
+    "state/shape/quaternions": ("1", "frames of a general rod, at nodes and middles of the elements, or by joints"),
+    "state/shape/s": ("1", "Hermite elements and frames: arclength of the nodes as a part of the length"),
+    "state/end_force": (
+        "1",
+        "force at s = L as each span between held places sees it, with obstacles each element, solver's units",
+    ),
+    "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
+    "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
+    "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
+    "state/units/origin": ("m", "origin of the solver's coordinates"),
+    "state/units/length": ("m", "the solver's unit of length, L"),
+    "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
+    "scene/gravity": ("m/s^2", "gravity"),
+    "scene/turns": ("1", "whole turns of the end frame beyond the total twist of the initial shape"),
+    "scene/rod/length": ("m", "length of the rod"),
+    **{
+        f"scene/rod/{place}{leaf}": (leaf_unit or unit, description + what)
+        for place, unit, description in (
+            ("EI", "N m^2", "bending stiffness"),
+            ("EI/*", "N m^2", "bending stiffness about d1 and d2"),
+            ("GJ", "N m^2", "torsional stiffness"),
+            ("EA", "N", "axial stiffness"),
+            ("mass_per_length", "kg/m", "mass per length"),
+            ("radius", "m", "radius of the rod, for pictures"),
+            ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
+            ("rest_twist", "rad/m", "twist without stress"),
+        )
+        for leaf, leaf_unit, what in (
+            ("", "", ""),
+            ("/jumps", "m", ": arclengths at which it jumps"),
+            ("/s", "m", ": arclengths of the values of a cubic spline"),
+            ("/values", "", ": values between the jumps, or at the arclengths s"),
+        )
+    },
+    "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
+    "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
+    "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
+    "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
+    "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
+    "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
+    "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
+    "scene/clips/*/frame": ("1", "frame that a clip holds, columns d1, d2, t, global axes"),
+    **{
+        f"{where}/obstacles/*{part}/{name}": (unit, f"{description}, global axes")
+        for where in ("scene", "state/before")
+        for part in ("", "/obstacles/*", "/obstacles/*/obstacles/*")
+        for name, unit, description in (
+            ("point", "m", "point of the plane of a half space"),
+            ("normal", "1", "direction out of a half space"),
+            ("center", "m", "centre of a ball or box"),
+            ("radius", "m", "radius of a ball, capsule, pipe or cylinder"),
+            ("start", "m", "where the axis of a capsule or cylinder begins"),
+            ("end", "m", "where the axis of a capsule or cylinder ends"),
+            ("points", "m", "along the axis of a pipe"),
+            ("size", "m", "edges of a box"),
+            ("frame", "1", "directions of these edges, in columns"),
+            ("triangles", "m", "corners of the triangles of a body"),
+        )
+    },
+    "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
+    "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
+    **{
+        f"scene/{end}/{name}": (unit, f"{description} at s = {place}, {axes}")
+        for end, place in (("start", "0"), ("end", "L"))
+        for name, unit, description, axes in (
+            ("position", "m", "position that the support holds", "global axes"),
+            ("frame", "1", "frame that the support holds, columns d1, d2, t,", "global axes"),
+            ("tangent", "1", "tangent that the support holds", "global axes"),
+            ("force", "N", "force on the rod", "global axes or, of a follower, the frame there"),
+            ("moment", "N m", "moment on the rod", "global axes or, of a follower, the frame there"),
+        )
+    },
+}
+DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
+OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
+# How deep unions may lie in one another in a file.
+MOST_UNIONS = 2
+# What stands in the attribute `kind` of a group: which of several classes the values are of.
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        *(Clamp, Swivel, Pin, Free),
+        *(Polyline, Curve, FramedCurve),
+        *(Steps, Smooth),
+        *(DistributedForce, DistributedCouple),
+        *OBSTACLES,
+    )
+}
+
+
+def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
+    """Writes a result to a `.vtkhdf` file, which ParaView opens and `rodjax.load` reads back to the last bit.
+
+    A path becomes time steps, with the number of the step for the time. The file is replaced as a whole: whatever goes
+    wrong, `path` holds the old file or the new one.
+
+    Raises `ValueError` or `TypeError` for what cannot be saved, `OSError` where the file cannot be written.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    path = file_path(path, "path", SUFFIX)
+    if not is_known(equilibrium):
+        raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
+    if equilibrium.scene.rod.law is not None:
+        raise ValueError(
+            f"equilibrium.scene.rod.law must be None, got a {type(equilibrium.scene.rod.law).__name__}: "
+            "a law is code, which cannot be saved"
+        )
+    _check_obstacles(equilibrium.scene.obstacles, "equilibrium.scene.obstacles", MOST_UNIONS)
+    leading = equilibrium.s.shape[:-1]
+    if len(leading) > 1:
+        raise ValueError(
+            f"equilibrium must be a single one or a path with one leading axis, got leading axes {leading}: "
+            "save one path at a time, such as jax.tree.map(lambda leaf: leaf[0], equilibrium)"
+        )
+    equilibrium = jax.tree.map(np.asarray, equilibrium)
+    # Put together in memory: an error of the disk is then an ordinary one, and HDF5 never holds a half-written file.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        _write_vtk(file.create_group("VTKHDF"), equilibrium)
+        _write(file.create_group("rodjax"), equilibrium)
+        file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
+    seal(image)
+    replace_file(path, image.getvalue())
+
+
+def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) -> None:
+    for k, obstacle in enumerate(obstacles):
+        if type(obstacle) not in OBSTACLES:
+            raise ValueError(f"{name}[{k}] is a {type(obstacle).__name__}: code of one's own, which cannot be saved")
+        if isinstance(obstacle, Union):
+            if not unions:
+                raise ValueError(
+                    f"{name}[{k}] is a Union within {MOST_UNIONS} others, which cannot be saved: put them into one"
+                )
+            _check_obstacles(obstacle.obstacles, f"{name}[{k}].obstacles", unions - 1)
+
+
+def load(path: str | os.PathLike[str]) -> Equilibrium:
+    """Reads what `rodjax.save` wrote: the same `Equilibrium` to the last bit, which serves as a `guess` too.
+
+    Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
+    rodjax, and where it holds float64 while JAX is set to float32, which would round it.
+    """
+    path = file_path(path, "path", SUFFIX)
+    image = io.BytesIO(path.read_bytes())
+    try:
+        has_seal(image)
+    except ValueError as error:
+        raise ValueError(f"{path} is not a readable HDF5 file: {error}") from None
+    try:
+        with h5py.File(image, "r") as file:
+            _group(file, "VTKHDF", path)
+            group = _group(file, "rodjax", path)
+            _check_format(group, path)
+            points = group.get("s")
+            equilibrium = _read(group, (Equilibrium,), path, points.shape if isinstance(points, h5py.Dataset) else ())
+    # What h5py raises for a file that is not HDF5, is cut short or damaged.
+    except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
+        raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
+    forces = equilibrium.state.end_force
+    if forces.ndim == equilibrium.s.ndim:  # of a rod without clips, until format 8: of its one span
+        equilibrium = eqx.tree_at(lambda result: result.state.end_force, equilibrium, forces[..., None])
+    return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
+
+
+def point_data(equilibrium: Equilibrium) -> dict[str, Float[Array, "..."]]:
+    """What is drawn along the centerline, by the name that ParaView shows."""
+    return {
+        "Curvature": equilibrium.curvature,
+        "Twist": equilibrium.twist,
+        "Tension": equilibrium.tension,
+        "Frame d1": equilibrium.frames[..., 0],
+        "Frame d2": equilibrium.frames[..., 1],
+        "Tangent": equilibrium.tangents,
+    }
+
+
+def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
+        raise ValueError(f"{path} has no group /{name}: load reads files that rodjax.save wrote")
+    return group
+
+
+def _check_format(group: h5py.Group, path: Path) -> None:
+    written = group.attrs.get("format")
+    if not isinstance(written, np.integer):
+        raise ValueError(f"{path} lacks the attribute format of /rodjax: load reads files that rodjax.save wrote")
+    if written > FORMAT:
+        raise ValueError(
+            f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
+            f"this rodjax reads formats up to {FORMAT}: update it"
+        )
+    if written < OLDEST_FORMAT:
+        raise ValueError(
+            f"{path} has format {written}, written by rodjax {group.attrs.get('version')}, which lacks fields of "
+            f"format {OLDEST_FORMAT}: solve its scene again"
+        )
+
+
+def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
+    if type(module).__name__ in KINDS:
+        group.attrs["kind"] = type(module).__name__
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        if field.metadata.get("static"):
+            group.attrs[field.name] = value
+        else:
+            _write_value(group, field.name, value, f"{place}{field.name}")
+
+
+def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
+    if isinstance(value, eqx.Module):
+        _write(group.create_group(name), value, f"{place}/")
+    elif isinstance(value, tuple):
+        entries = group.create_group(name)
+        for k, entry in enumerate(value):
+            _write_value(entries, str(k), entry, f"{place}/*")
+    elif value is not None:
+        dataset = group.create_dataset(name, data=value)
+        dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place]
+
+
+def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[int, ...]) -> Any:
+    """A module of one of the classes, or of the one below them that the group names, with NumPy arrays for leaves.
+
+    `shape`: of the arclengths of the nodes.
+    """
+    allowed = [name for name, known in KINDS.items() if issubclass(known, classes)]
+    kind = classes[0]
+    if allowed:
+        name = group.attrs.get("kind")
+        if not isinstance(name, str) or name not in allowed:
+            raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(allowed)}")
+        kind = KINDS[name]
+    # As it was written, without the checks of its constructor, which take a single scene of sensible numbers.
+    module = object.__new__(kind)
+    for field in dataclasses.fields(kind):
+        if field.metadata.get("static"):
+            value = _static(group, field, path)
+        else:
+            value = _read_value(group, field.name, field.type, path, shape)
+        object.__setattr__(module, field.name, value)
+    return module
+
+
+def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
+    value = group.attrs[field.name]
+    if field.type is not bool:
+        one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
+        return value
+    if not isinstance(value, np.bool_):
+        raise ValueError(f"{path} is damaged: {field.name} of {group.name} must be true or false, got {shown(value)}")
+    return bool(value)
+
+
+def _read_value(group: h5py.Group, name: str, annotation: Any, path: Path, shape: tuple[int, ...]) -> Any:
+    """What a group has under a name: of one of the kinds that the annotation allows."""
+    is_union = typing.get_origin(annotation) in (types.UnionType, typing.Union)
+    kinds = typing.get_args(annotation) if is_union else (annotation,)
+    classes = tuple(kind for kind in kinds if dataclasses.is_dataclass(kind))
+    of_tuple = next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple), None)
+    of_arrays = [kind for kind in kinds if hasattr(kind, "dim_str")]
+    entry = group.get(name)
+    if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
+        items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
+        return tuple(_read_value(entry, str(k), item, path, shape) for k, item in enumerate(items))
+    if isinstance(entry, h5py.Group) and classes:
+        return _read(entry, classes, path, shape)
+    if isinstance(entry, h5py.Dataset) and of_arrays:
+        axes = len(entry.shape or ()) - max(len(shape) - 1, 0)
+        fitting = [kind for kind in of_arrays if len(kind.dim_str.replace("...", "").split()) == axes]
+        return _array(entry, [*fitting, *of_arrays][0], path, shape)
+    if entry is None and types.NoneType in kinds:
+        return None
+    raise ValueError(f"{path} lacks {group.name}/{name}: it is damaged, or rodjax.save did not write it")
+
+
+def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """The numbers of a dataset, which are of the kind and shape with which the field is annotated."""
+    *leading, nodes = shape or (0,)
+    # "m": nodes and middles of elements, or two ends and the middles between nodes; of other names any size.
+    sizes = {"n+1": (nodes,), "n": (nodes - 1,), "m": (2 * nodes - 1, nodes + 1), "3": (3,), "4": (4,)}
+    if str(dataset.name).startswith("/rodjax/scene/"):  # made without a mesh: its names are sizes of its own
+        sizes = {name: allowed for name, allowed in sizes.items() if name.isdigit()}
+    names = [name for name in kind.dim_str.split() if name != "..."]
+    wanted = [*((size,) for size in leading), *(sizes.get(name) for name in names)]
+    shape_there = dataset.shape or ()  # of an empty dataset None
+    fits = len(shape_there) == len(wanted)
+    fits &= all(not allowed or size in allowed for size, allowed in zip(shape_there, wanted, strict=False))
+    if not fits or dataset.shape is None or dataset.dtype.name not in kind.dtypes:
+        described = ", ".join(" or ".join(map(str, allowed)) if allowed else "any" for allowed in wanted)
+        raise ValueError(
+            f"{path} is damaged: {dataset.name} must be {kind.dtype.__name__} of shape ({described}), "
+            f"got {dataset.dtype.name} of shape {dataset.shape}"
+        )
+    return dataset[()]
+
+
+def _as_jax(values: Any, path: Path) -> Array:
+    array = jnp.asarray(values)
+    if array.dtype != values.dtype:
+        raise ValueError(
+            f"{path} holds {values.dtype} numbers, which JAX would make {array.dtype}: "
+            'call jax.config.update("jax_enable_x64", True) before anything else'
+        )
+    return array
+
+
+def _write_vtk(root: h5py.Group, equilibrium: Equilibrium) -> None:
+    """VTKHDF 2.0 PolyData, as in https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/."""
+    points = equilibrium.s.shape[-1]
+    root.attrs["Version"] = (2, 0)
+    root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads no string of variable length here
+    root["NumberOfPoints"] = [points]
+    root["Points"] = np.reshape(equilibrium.nodes, (-1, 3))
+    # VTK takes the file for empty where one of the four kinds of cells is missing.
+    for kind in ("Vertices", "Lines", "Polygons", "Strips"):
+        cells = root.create_group(kind)
+        ids = np.arange(points if kind == "Lines" else 0)
+        cells["NumberOfCells"] = [min(len(ids), 1)]
+        cells["NumberOfConnectivityIds"] = [len(ids)]
+        cells["Connectivity"] = ids
+        cells["Offsets"] = [0, len(ids)] if len(ids) else [0]
+    data = point_data(equilibrium)
+    for name, values in data.items():
+        root[f"PointData/{name}"] = np.reshape(values, (-1, *values.shape[equilibrium.s.ndim :]))
+    if equilibrium.s.ndim == 2:
+        _write_steps(root.create_group("Steps"), equilibrium.s.shape[0], points, list(data))
+
+
+def _write_steps(steps: h5py.Group, count: int, points: int, names: list[str]) -> None:
+    """Where each time step begins in the arrays: the points and their data move on, the polyline stays."""
+    offsets = np.arange(count) * points
+    steps.attrs["NSteps"] = count
+    steps["Values"] = np.arange(count, dtype=float)
+    steps["PartOffsets"] = np.zeros(count, int)
+    steps["NumberOfParts"] = np.ones(count, int)
+    steps["PointOffsets"] = offsets
+    steps["CellOffsets"] = np.zeros((count, 4), int)
+    steps["ConnectivityIdOffsets"] = np.zeros((count, 4), int)
+    for name in names:
+        steps[f"PointDataOffsets/{name}"] = offsets

@@ -1,0 +1,193 @@
+"""Values by key, such as `end.position.2`, beside a scene file, and the scenes that the file makes with them.
+
+Keys are those of the file with dots; one component of a vector goes by its number. Values are as the file has them, or
+plain numbers in SI units.
+"""
+
+import functools
+import json
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rodjax.checks import line, shown
+from rodjax.io.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, number_in, quantity, si_values
+from rodjax.io.scene_file import SceneFile, SceneReader
+
+Place = tuple[str | int, ...]
+
+
+class SceneVariations:
+    """The scenes of a file with other values in the places of some keys, by the ordinary reading of scene files.
+
+    `content`: the tables of the file; `keys`: those that may get other values. Errors are `SceneFileError`s without the
+    name of the file.
+    """
+
+    def __init__(self, content: dict[str, Any], keys: Sequence[str]):
+        self._places = {key: _target(key) for key in keys}
+        self._templates = {place: _template(content, key, place, of) for key, (place, of) in self._places.items()}
+        self._content, self._reader = content, SceneReader()
+
+    def in_si(self) -> None:
+        """Puts the tables into SI units, in which numbers are read much faster; where there are many scenes."""
+        self._content = {name: _in_si(table) for name, table in self._content.items()}
+
+    def read(self, values: Mapping[str, Float[np.ndarray, "..."]]) -> SceneFile:
+        """With these values in SI units; keys without one keep what the file has."""
+        numbers: dict[Place, np.ndarray] = {}
+        for key, value in values.items():
+            place, component = self._places[key]
+            numbers.setdefault(place, self._templates[place].copy())[component] = value
+        content = dict(self._content)
+        for place, number in numbers.items():
+            _put(content, place, _as_text(number, str(place[-1]), _dotted(place[:-1])))
+        return self._reader.read(content)
+
+
+# --- keys and values -------------------------------------------------------------------------------------------------
+
+
+def check_keys(keys: Sequence[str]) -> None:
+    """Raises `SceneFileError` for keys that cannot get values, or contradict each other."""
+    if not keys:
+        raise SceneFileError('holds no keys; give values to vary, such as "rod.EI" = [0.004, 0.005]')
+    components: dict[Place, list[tuple[int, ...]]] = {}
+    for key in keys:
+        place, component = _target(key)
+        before = components.setdefault(place, [])
+        # A component beside the whole is as contradictory as the same twice.
+        if before and (component in before or not component or () in before):
+            raise SceneFileError(f"{key} is given twice, or beside a component of it")
+        before.append(component)
+
+
+@functools.lru_cache  # of the bulk of a large table, whose keys are few
+def _target(key: str) -> tuple[Place, tuple[int, ...]]:
+    """Where a key is in the tables, and which component of its numbers is meant."""
+    names = key.split(".")
+    numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
+    end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
+    if names[0] not in ("rod", "start", "end", "loads", "clips") or names[end - 1] not in QUANTITIES:
+        raise SceneFileError(
+            f"{line(key)} cannot vary; allowed are the keys of rod, start, end, loads and clips that hold "
+            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position"
+        )
+    place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
+    component = tuple(number for number in numbers[end:] if number is not None)
+    shape = QUANTITIES[names[end - 1]][1]
+    is_within = len(component) == len(shape) and all(k < size for k, size in zip(component, shape, strict=True))
+    if component and not is_within:
+        kind = f"{' x '.join(map(str, shape))} numbers, which count from 0" if shape else "a single number"
+        raise SceneFileError(f"{key} is no component: {'.'.join(names[:end])} is {kind}")
+    return place, component
+
+
+def unit_of(key: str) -> str:
+    """SI unit of the numbers of a key; 1 where they have no dimension."""
+    place, _ = _target(key)
+    return quantity(str(place[-1]), _dotted(place[:-1]))[0] or "1"
+
+
+def si_number(value: Any, key: str) -> Float[np.ndarray, "..."]:
+    """In SI units, of a value as the scene file has it, or plain numbers in SI units."""
+    place, component = _target(key)
+    where, name = _dotted(place[:-1]), str(place[-1])
+    unit, shape = quantity(name, where)[0], QUANTITIES[name][1]
+    is_scalar = not shape or bool(component)
+    # The bulk of a large table, which must not wait for the parsing of text.
+    if is_scalar and type(value) in (int, float) and abs(value) <= sys.float_info.max:
+        return np.asarray(value, float)
+    if unit and not isinstance(value, str):
+        value = f"{value} {unit}"
+    if not component:
+        number = si_values({name: value}, where, (), (name,))[name]
+        # A direction is kept as it was given; scenes make its length 1.
+        return number if unit else np.asarray(value, float)
+    match = NUMBER_AND_UNIT.fullmatch(value) if unit else None
+    if match is None or match[1].startswith("["):
+        raise SceneFileError(
+            f"a component of {_dotted(place)} must be a number{' and a unit' if unit else ''}, got {shown(value)}"
+        )
+    same = np.full(shape, float(match[1])).tolist()
+    return si_values({name: f"{same} {match[2]}"}, where, (), (name,))[name][component]
+
+
+def cell(text: str) -> Any:
+    """A plain number or list as such, anything else as text with a unit."""
+    number = number_in(text)
+    if number is not None:
+        return number
+    try:
+        return json.loads(text, parse_int=float) if text.startswith("[") else text
+    except (ValueError, RecursionError):
+        return text
+
+
+# --- places ----------------------------------------------------------------------------------------------------------
+
+
+def _template(content: dict[str, Any], key: str, place: Place, component: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """The numbers in SI units into which the values of a key are put."""
+    if place[0] == "loads":
+        content.setdefault("loads", {})
+    table: Any = content
+    for depth in range(1, len(place)):
+        table = _entry(table, place[:depth], key)
+    if not isinstance(table, dict):
+        raise SceneFileError(f"{_dotted(place[:-1])} must be a table, got {shown(table)}")
+    name = str(place[-1])
+    if not component:
+        return np.zeros(QUANTITIES[name][1])
+    value = _entry(table, place, key)
+    numbers = si_values({name: value}, _dotted(place[:-1]), (), (name,))[name]
+    # A direction is kept as it was given; scenes make its length 1.
+    return numbers if QUANTITIES[name][0] else np.asarray(value, float)
+
+
+def _entry(table: Any, place: Place, key: str) -> Any:
+    """What a table, or list of tables, has at the end of a place."""
+    last: Any = place[-1]
+    is_there = last in table if isinstance(table, dict) else isinstance(table, list) and last in range(len(table))
+    if not is_there:
+        raise SceneFileError(f"{_dotted(place)} is not there, so that {key} cannot vary")
+    return table[last]
+
+
+def _dotted(place: Place) -> str:
+    return ".".join(map(str, place))
+
+
+def _put(content: dict[str, Any], place: Place, value: Any) -> None:
+    """Puts a value where it belongs; the tables on the way are copied, so that those of the file stay as they are."""
+    table: Any = content
+    for part in place[:-1]:
+        table[part] = table[part].copy()
+        table = table[part]
+    table[place[-1]] = value
+
+
+def _as_text(number: Float[np.ndarray, "..."], name: str, where: str) -> Any:
+    unit = quantity(name, where)[0]
+    return f"{number.tolist()} {unit}" if unit else number.tolist()
+
+
+def _in_si(table: Any, where: str = "") -> Any:
+    """A table with all quantities in SI units."""
+    if isinstance(table, list):
+        return [_in_si(entry, where) for entry in table]
+    if not isinstance(table, dict):
+        return table
+
+    def value(key: str, value: Any) -> Any:
+        if isinstance(value, str) and key in QUANTITIES:
+            with suppress(SceneFileError):  # each scene may have another value in its place
+                return _as_text(si_values({key: value}, where, (), (key,))[key], key, where)
+        return _in_si(value, f"{where}.{key}")
+
+    return {key: value(key, entry) for key, entry in table.items()}

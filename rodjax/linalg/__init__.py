@@ -1,0 +1,1 @@
+"""Linear systems of small blocks along the rod, with a border."""

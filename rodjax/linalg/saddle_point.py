@@ -1,0 +1,316 @@
+"""Saddle-point systems along a rod: a symmetric block-tridiagonal matrix with a border, by block cyclic reduction.
+
+    [ H    A ] [x]   [f]
+    [ A^T -C ] [y] = [c]
+
+H couples neighbours, n blocks of b x b; the k columns of A are few and full: what all of the rod has in common. H may
+be indefinite, and the number of negative eigenvalues of the whole follows from the factorisation (Haynsworth 1968).
+Loads without a potential have other rows than columns in the border.
+
+Every level eliminates every second block, all at once: log2(n) levels of a few loops each, where block Thomas
+elimination would take n steps one after another. The inverses of blocks are explicit, and arrays have the place along
+the rod as their last axis, (b, b, n): all loops are then vector loops along the rod, on a processor or an accelerator.
+Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tridiagonal linear systems" (1976).
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
+from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
+
+# Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
+# square of this, and what they differ by is about 10 times this.
+LEAST_PIVOT = 1e-7
+
+
+class SaddlePointSystem(eqx.Module):
+    """The matrix above: `diagonal[..., i]` is block (i, i) of H, `lower[..., i]` block (i + 1, i).
+
+    `border` holds A, `compliance` C, symmetric; `rows` stand in the place of A^T where they are given. Every second
+    block of H may also be coupled with the next but one: `across[..., i]` is block (2 i + 2, 2 i). Blocks of size 1
+    to 3.
+    """
+
+    diagonal: Float[Array, "b b n"]
+    lower: Float[Array, "b b n-1"]
+    border: Float[Array, "b k n"]
+    compliance: Float[Array, "k k"]
+    rows: Float[Array, "b k n"] | None = None
+    across: Float[Array, "b b (n-1)/2"] | None = None
+
+    def __check_init__(self):
+        b, k, n = self.border.shape
+        rows = self.border if self.rows is None else self.rows
+        given = [x.shape for x in (self.diagonal, self.lower, self.border, self.compliance, rows)]
+        if self.across is not None and (n % 2 == 0 or self.across.shape != (b, b, n // 2)):
+            raise ValueError(f"across must have the shape {(b, b, n // 2)} for odd n, got {self.across.shape}, n = {n}")
+        if b not in (1, 2, 3) or given != [(b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n)]:
+            raise ValueError(
+                "a saddle-point system needs arrays of shapes (b, b, n), (b, b, n - 1), (b, k, n), (k, k), (b, k, n) "
+                f"with b = 1 to 3, got {', '.join(map(str, given))}"
+            )
+
+    def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        """The matrix times (x, y): the right sides f and c."""
+        columns = x[:, None]
+        below = product(self.lower, columns[..., :-1])[:, 0]
+        above = transpose_product(self.lower, columns[..., 1:])[:, 0]
+        f = product(self.diagonal, columns)[:, 0] + jnp.sum(self.border * y[None, :, None], axis=1)
+        f = f.at[:, 1:].add(below).at[:, :-1].add(above)
+        if self.across is not None:
+            f = f.at[:, 2::2].add(product(self.across, columns[..., 0:-1:2])[:, 0])
+            f = f.at[:, 0:-1:2].add(transpose_product(self.across, columns[..., 2::2])[:, 0])
+        rows = self.border if self.rows is None else self.rows
+        return f, jnp.sum(rows * x[:, None], axis=(0, 2)) - self.compliance @ y
+
+    def shifted(self, shift: Float[Array, ""] | Float[Array, "n"]) -> "SaddlePointSystem":
+        """H + shift I in the place of H, with one shift or one for each block."""
+        identity = jnp.eye(self.diagonal.shape[0], dtype=shift.dtype)[..., None]
+        shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
+        return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
+
+
+class DenseSystem(eqx.Module):
+    """The same as one full matrix without symmetry, where each place of the rod is coupled with all others."""
+
+    matrix: Float[Array, "bn+k bn+k"]
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        return self._parted(self.matrix @ jnp.concatenate([x.reshape(-1), y]))
+
+    def _parted(self, all: Float[Array, "bn+k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        size = math.prod(self.shape)
+        return all[:size].reshape(self.shape), all[size:]
+
+    def shifted(self, shift: Float[Array, ""] | Float[Array, "n"]) -> "DenseSystem":
+        b, n = self.shape
+        by_rotation = jnp.broadcast_to(shift, (b, n)).reshape(-1)
+        k = len(self.matrix) - b * n
+        added = jnp.diag(jnp.concatenate([by_rotation, jnp.zeros(k, by_rotation.dtype)]))
+        return DenseSystem(self.matrix + added, self.shape)
+
+
+class DenseFactors(eqx.Module):
+    """The factorisation of a `DenseSystem`, which says nothing of minima."""
+
+    system: DenseSystem
+    lu: tuple[Array, Array]
+    negative: Int[Array, ""]
+
+    @property
+    def is_minimum(self) -> Bool[Array, ""]:
+        """Whether the factorisation has worked: there is no energy that could be minimal."""
+        return jnp.isfinite(jnp.sum(self.lu[0]))
+
+    def solve(self, f: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        right = jnp.concatenate([f.reshape(-1), c])
+        return self.system._parted(jax.scipy.linalg.lu_solve(self.lu, right))
+
+
+class Factors(eqx.Module):
+    """The factorisation of a `SaddlePointSystem`.
+
+    `negative`: the number of its negative eigenvalues beyond the k of the border. Where that is 0, H is positive
+    definite on the x with A^T x = 0, and a solution is the minimum under the constraints. 0 without symmetry.
+    """
+
+    elimination: "_Elimination"
+    rows: Float[Array, "b k n"]
+    border_solution: Float[Array, "b k n"]
+    complement: Float[Array, "k k"]
+    negative: Int[Array, ""]
+
+    @property
+    def is_minimum(self) -> Bool[Array, ""]:
+        """Whether H is positive definite under the constraints; not where the last block was singular."""
+        is_finite = jnp.isfinite(jnp.sum(self.elimination.last_inverse) + jnp.sum(self.complement))
+        return (self.negative == 0) & is_finite
+
+    def solve(self, f: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        return self._bordered(self.elimination.solve(f[:, None])[:, 0], c)
+
+    def _bordered(self, x: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
+        """The solution, from that without border."""
+        y = short_sum(self.complement * (c - _dots(self.rows, x))[None], axis=1)
+        return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
+
+
+AnyFactors = Factors | DenseFactors | ChainFactors
+AnySystem = SaddlePointSystem | DenseSystem | ChainSystem
+
+
+def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
+    """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
+
+    `is_regularized`: soft pivots of a `SaddlePointSystem` are made stiffer (see `blocks.inverse_of_blocks`), so that
+    the inertia is right where the rod may turn as a whole; a critical motion would be lost with that. Other systems
+    stay as they are.
+
+    Where the last block is singular there are infinities or NaN.
+    """
+    if isinstance(system, DenseSystem):
+        return DenseFactors(system, jax.scipy.linalg.lu_factor(system.matrix), jnp.zeros((), int))
+    if isinstance(system, ChainSystem):
+        return factor_chain(system)
+    return _factor(system, system.border, is_regularized)[0]
+
+
+def factor_and_solve(
+    system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"], *, is_regularized: bool = False
+) -> tuple["AnyFactors", Float[Array, "b n"], Float[Array, "k"]]:
+    """Factorisation and the solution for one right side, in one sweep."""
+    if isinstance(system, DenseSystem | ChainSystem):
+        factors = factor(system)
+        return factors, *factors.solve(f, c)
+    factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1), is_regularized)
+    return factors, *factors._bordered(x[:, -1], c)
+
+
+def _factor(
+    system: SaddlePointSystem, right_sides: Float[Array, "b j n"], is_regularized: bool
+) -> tuple[Factors, Float[Array, "b j n"]]:
+    b = len(system.diagonal)
+    least = LEAST_PIVOT / b * jnp.mean(jnp.abs(jnp.trace(system.diagonal))) if is_regularized else None
+    elimination, negative, x = _eliminate(system.diagonal, system.lower, system.across, right_sides, least)
+    k = system.border.shape[1]
+    solution = x[:, :k]
+    if system.rows is None:
+        rows = system.border
+        complement, below = _symmetric_inverse(-system.compliance - _dots(rows[:, :, None], solution))
+        negative += below - k
+    else:
+        rows = system.rows
+        complement = jnp.linalg.inv(-system.compliance - _dots(rows[:, :, None], solution))
+        negative = jnp.zeros_like(negative)
+    return Factors(elimination, rows, solution, complement, negative), x
+
+
+class _Level(eqx.Module):
+    """One level: the inverses of the blocks D that go, every second one from the number `first` on, and D^-1 times the
+    blocks that couple them to their neighbours before and after.
+    """
+
+    inverse: Float[Array, "b b m"]
+    before: Float[Array, "b b m"]
+    after: Float[Array, "b b m"]
+    first: int = eqx.field(static=True)
+
+    def parted(self, x: Float[Array, "*c n"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c k"]]:
+        """What goes, and what stays."""
+        return x[..., self.first :: 2], x[..., 1 - self.first :: 2]
+
+    def joined(self, goes: Float[Array, "*c m"], stays: Float[Array, "*c k"]) -> Float[Array, "*c n"]:
+        n = goes.shape[-1] + stays.shape[-1]
+        half = (n + 1) // 2
+        both = _padded(stays, half), _padded(goes, half)
+        pairs = jnp.stack(both if self.first else both[::-1], axis=-1)
+        return pairs.reshape(*goes.shape[:-1], 2 * half)[..., :n]
+
+    def around(self, stays: Float[Array, "*c k"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c m"]]:
+        """What stays before and after each that goes, zero where nothing does."""
+        m = self.inverse.shape[-1]
+        return _padded(_shifted(stays, 1 - self.first), m), _padded(_shifted(stays, -self.first), m)
+
+    def added(self, before: Float[Array, "*c m"], after: Float[Array, "*c m"], k: int) -> Float[Array, "*c k"]:
+        """Sums over those that go beside each of the k that stay: contributions to the one before and the one after."""
+        return _padded(_shifted(before, self.first - 1), k) + _padded(_shifted(after, self.first), k)
+
+
+class _Elimination(eqx.Module):
+    levels: tuple[_Level, ...]
+    last_inverse: Float[Array, "b b 1"]
+
+    def solve(self, f: Float[Array, "b j n"]) -> Float[Array, "b j n"]:
+        """H^-1 f for j right sides."""
+        eliminated = []
+        for level in self.levels:
+            goes, f = level.parted(f)
+            eliminated.append(product(level.inverse, goes))
+            beside = transpose_product(level.before, goes), transpose_product(level.after, goes)
+            f -= level.added(*beside, f.shape[-1])
+        return self.back_substituted(product(self.last_inverse, f), eliminated)
+
+    def back_substituted(self, x: Float[Array, "b j 1"], eliminated: list[Array]) -> Float[Array, "b j n"]:
+        for level, goes in zip(reversed(self.levels), reversed(eliminated), strict=True):
+            before, after = level.around(x)
+            x = level.joined(goes - product(level.before, before) - product(level.after, after), x)
+        return x
+
+
+def _eliminate(
+    diagonal: Float[Array, "b b n"],
+    lower: Float[Array, "b b n-1"],
+    across: Float[Array, "b b (n-1)/2"] | None,
+    right_sides: Float[Array, "b j n"],
+    least: Float[Array, ""] | None,
+) -> tuple[_Elimination, Int[Array, ""], Float[Array, "b j n"]]:
+    """The factorisation of H, how many negative eigenvalues it has, and H^-1 right_sides, in one sweep.
+
+    Diagonal and right sides stand side by side in `rows`, so that a level is few and large loops. After the middles of
+    elements the first, third, ... go: were it the others, the middle of the rod would be one of the last, and of a
+    symmetric rod that can turn as a whole both halves be singular.
+    """
+    b = len(diagonal)
+    rows = jnp.concatenate([diagonal, right_sides], axis=1)
+    levels, eliminated = [], []
+    negative = jnp.zeros((), int)
+    while rows.shape[-1] > 1:
+        first = 0 if across is None else 1
+        goes, stays = rows[..., first::2], rows[..., 1 - first :: 2]
+        m, k = goes.shape[-1], stays.shape[-1]
+        # Blocks (goes, the one before) and (goes, the one after), none beyond the ends.
+        before = _padded(_shifted(lower[..., 1 - first :: 2], 1 - first), m)
+        after = _padded(jnp.swapaxes(lower[..., first::2], 0, 1), m)
+        inverse, below = inverse_of_blocks(goes[:, :b], least)
+        scaled = product(inverse, jnp.concatenate([before, after, goes[:, b:]], axis=1))
+        level = _Level(inverse, scaled[:, :b], scaled[:, b : 2 * b], first)
+        levels.append(level)
+        eliminated.append(scaled[:, 2 * b :])
+        negative += below
+        to_before = transpose_product(before, jnp.concatenate([level.before, eliminated[-1]], axis=1))
+        to_after = transpose_product(after, scaled[:, b:])
+        rows = stays - level.added(to_before, to_after, k)
+        lower = -_shifted(transpose_product(after, level.before), first - 1)[..., : k - 1]
+        if across is not None:
+            lower, across = lower + across, None
+    last_inverse, below = inverse_of_blocks(rows[:, :b])
+    elimination = _Elimination(tuple(levels), last_inverse)
+    x = elimination.back_substituted(product(last_inverse, rows[:, b:]), eliminated)
+    return elimination, negative + below, x
+
+
+def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:
+    """Inverse of a small symmetric matrix by sweeps, and the number of its negative eigenvalues."""
+    negative = jnp.zeros((), int)
+    for j in range(len(matrix)):
+        pivot, row = matrix[j, j], matrix[j]
+        negative += jnp.where(pivot < 0, 1, 0)
+        swept = matrix - row[:, None] * (row / pivot)[None, :]
+        matrix = swept.at[j, :].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1 / pivot)
+    return -matrix, negative
+
+
+def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:
+    """A^T x."""
+    return jnp.sum(border * x[:, None], axis=(0, -1))
+
+
+def _shifted(x: Array, by: int) -> Array:
+    """One place later with a zero before, or one earlier, or as it is."""
+    if by < 0:
+        return x[..., 1:]
+    return jnp.concatenate([jnp.zeros_like(x[..., :1]), x], axis=-1) if by else x
+
+
+def _padded(x: Array, length: int) -> Array:
+    """Of this length, with zeros at the end where it is shorter."""
+    missing = length - x.shape[-1]
+    return (
+        x[..., :length] if missing <= 0 else jnp.concatenate([x, jnp.zeros((*x.shape[:-1], missing), x.dtype)], axis=-1)
+    )

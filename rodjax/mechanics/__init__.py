@@ -1,0 +1,1 @@
+"""Strains, energy and contact at a place of the rod, on no mesh."""

@@ -1,0 +1,366 @@
+"""The scene: a rod, what holds its ends and what loads it, in SI units or in the units of the rod."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
+from rodjax.model.rod import Rod
+from rodjax.model.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
+from rodjax.units import Units
+
+# Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
+# by half of its length.
+MAX_SPAN = 1.5
+# Positions nearer to one another than this part of the length are one place.
+ONE_PLACE = 1e-6
+
+
+class Scene(eqx.Module):
+    """A rod with its supports and loads.
+
+    What is present is static structure; the numbers are differentiable leaves.
+
+    **Arguments:**
+
+    - `rod`: `Rod`.
+    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
+    - `gravity`: (3,) [m/s^2], or `None` for no weight.
+    - `point_forces`: `PointForce`s along the rod.
+    - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an
+        earlier equilibrium whose scene states its turns too, beyond those. `None`: the turns of an earlier equilibrium,
+        whose frames turn by less than pi to those of this scene, so that turns are carried along a path; else the total
+        twist nearest to that of the initial shape. Two clamps only, and no clip with a frame between them: there an
+        earlier equilibrium as a guess carries the turns of each span.
+    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
+    - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
+    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
+        the nodes of the mesh. There all loads together press it in by 3e-5 of its radius. A mesh that is chosen for a
+        tolerance is one whose elements lie no deeper than 1e-4 of the radius between their nodes either. Where the rod
+        is jammed, or bent over an edge, it may lie deeper, as on a mesh that is given: `rodjax.describe` says so, and
+        `rodjax.clearance` tells where. A rod that came through an obstacle since its guess or the last step of its
+        path, or whose centerline lies within one, is not converged. Where no obstacle touches the rod they only cost
+        time: to see how far it is from what it stays away from, `rodjax.clearance` needs none in the scene. Double
+        precision only.
+
+    Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
+    beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
+    than 1.5 lengths of the rod between them.
+    """
+
+    rod: Rod
+    start: Support
+    end: Support
+    gravity: Float[Array, "3"] | None
+    point_forces: tuple[PointForce, ...]
+    turns: Float[Array, ""] | None
+    distributed: tuple[DistributedForce | DistributedCouple, ...]
+    clips: tuple[Clip, ...]
+    obstacles: tuple[Obstacle, ...]
+
+    def __init__(
+        self,
+        rod: Rod,
+        start: Support,
+        end: Support,
+        gravity: Any = None,
+        point_forces: Sequence[PointForce] = (),
+        turns: Any = None,
+        distributed: Sequence[DistributedForce | DistributedCouple] = (),
+        clips: Sequence[Clip] = (),
+        obstacles: Sequence[Obstacle] = (),
+    ):
+        instance(rod, "rod", Rod)
+        instance(start, "start", Support)
+        instance(end, "end", Support)
+        point_forces = sequence(point_forces, "point_forces", "PointForce")
+        for k, force in enumerate(point_forces):
+            instance(force, f"point_forces[{k}]", PointForce)
+        gravity = None if gravity is None else leaf(vector(gravity, "gravity"))
+        turns = None if turns is None else leaf(number_array(turns, "turns"))
+        distributed = sequence(distributed, "distributed", "DistributedForce or DistributedCouple")
+        for k, load in enumerate(distributed):
+            instance(load, f"distributed[{k}]", (DistributedForce, DistributedCouple))
+        clips = sequence(clips, "clips", "Clip")
+        for k, clip in enumerate(clips):
+            instance(clip, f"clips[{k}]", Clip)
+        obstacles = checked_obstacles(obstacles, least=0)
+        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles))
+        self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
+        self.distributed, self.clips, self.obstacles = rest
+        _check_supports(self)
+        _check_obstacles(self)
+        _check_numbers(self)
+
+
+def _of_one_precision(parts: Any) -> Any:
+    """With all numbers of the highest precision among them: a compiled program takes no mixture."""
+    dtypes = {leaf.dtype for leaf in jax.tree.leaves(parts)}
+    if len(dtypes) == 1:
+        return parts
+    return jax.tree.map(lambda leaf: leaf.astype(max(dtypes, key=lambda dtype: dtype.itemsize)), parts)
+
+
+def _check_supports(scene: Scene) -> None:
+    ends = (scene.start, scene.end)
+    pair = f"{type(scene.start).__name__} at the start and {type(scene.end).__name__} at the end"
+    if not any(isinstance(end, Held) for end in ends):
+        raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
+    for end, other in (ends, ends[::-1]):
+        if not isinstance(end, Free):
+            continue
+        along = [load for load in scene.distributed if isinstance(load, DistributedForce)]
+        loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
+        if isinstance(other, Pin) and not loaded and not scene.clips:
+            raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
+        if end.moment is not None and not isinstance(other, Clamp):
+            raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
+    if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
+        raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
+    if scene.turns is not None and any(clip.frame is not None for clip in scene.clips):
+        raise ValueError(
+            "turns must be None where a clip has a frame: each span between held frames has turns of its own, which an "
+            "earlier equilibrium as a guess carries"
+        )
+
+
+def _check_obstacles(scene: Scene) -> None:
+    if not scene.obstacles:
+        return
+    if scene.rod.radius is None:
+        raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
+    if not has_potential(scene):
+        raise ValueError(
+            "obstacles must be () under loads without a potential: a moment on a free end, couples along the rod, and "
+            "forces that follow it"
+        )
+    if scene.rod.length.dtype != jnp.float64:
+        raise ValueError(
+            "obstacles must be () in single precision, in which contacts have no digits: "
+            "jax.config.update('jax_enable_x64', True) before making the scene"
+        )
+
+
+def _check_numbers(scene: Scene) -> None:
+    if not is_known(scene):
+        return
+    if scene.turns is not None and float(scene.turns) != np.round(float(scene.turns)):
+        raise ValueError(f"turns must be a whole number, got {float(scene.turns):g}")
+    length = float(scene.rod.length)
+    for k, force in enumerate(scene.point_forces):
+        if float(force.at) > length:
+            raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
+    start, end = scene.start, scene.end
+    if isinstance(start, Held) and isinstance(end, Held):
+        with np.errstate(over="ignore"):
+            span = float(np.linalg.norm(np.subtract(end.position, start.position)))
+        if span > MAX_SPAN * length:
+            raise ValueError(
+                f"the ends are {span:g} m apart, but a rod of length {length:g} m "
+                f"reaches at most {MAX_SPAN * length:g} m"
+            )
+    _check_clips(scene, length)
+    _check_turning(scene, length)
+
+
+def _check_turning(scene: Scene, length: float) -> None:
+    """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
+    if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
+        return
+    loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
+    loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
+    if loaded or any(clip.direction is not None for clip in scene.clips):
+        return
+    held = [
+        np.asarray(held.position) for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Pin | Clip)
+    ]
+    if max(float(np.max(np.abs(position - held[0]))) for position in held) <= ONE_PLACE * length:
+        raise ValueError(
+            f"all pins and clips are at one place, {held[0].tolist()} m: without gravity or a force the rod can turn "
+            "freely about it; move one of them or make one hold the tangent"
+        )
+
+
+def _check_clips(scene: Scene, length: float) -> None:
+    for k, clip in enumerate(scene.clips):
+        at = float(clip.at)
+        if not at < length:
+            raise ValueError(f"clips[{k}].at must lie between 0 and {length:g} m, got {at:g} m")
+        before = float(scene.clips[k - 1].at) if k else 0.0
+        if not at > before:
+            raise ValueError(f"clips[{k}].at must be larger than clips[{k - 1}].at = {before:g} m, got {at:g} m")
+    held = [(f"clips[{k}]", float(clip.at), clip.position) for k, clip in enumerate(scene.clips)]
+    if isinstance(scene.start, Held):
+        held = [("the start", 0.0, scene.start.position), *held]
+    if isinstance(scene.end, Held):
+        held = [*held, ("the end", length, scene.end.position)]
+    for (name, s, position), (other_name, other_s, other_position) in itertools.pairwise(held if scene.clips else []):
+        with np.errstate(over="ignore"):
+            span = float(np.linalg.norm(np.subtract(other_position, position)))
+        if span > MAX_SPAN * (other_s - s):
+            raise ValueError(
+                f"{name} and {other_name} are {span:g} m apart, but the {other_s - s:g} m of rod between them "
+                f"reach at most {MAX_SPAN * (other_s - s):g} m"
+            )
+
+
+def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
+    """A scene on the way from one to another: numbers linear, frames by the smallest rotation, as `fraction` of it."""
+
+    def support(end: Support, other: Support) -> Support:
+        mixed = jax.tree.map(number, end, other)
+        if isinstance(end, Clamp) and isinstance(other, Clamp):
+            return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(end.frame, other.frame))
+        if isinstance(end, Swivel):
+            return Swivel(mixed.position, mixed.tangent)
+        return mixed
+
+    def turned(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        turn = Rotation.from_matrix(frame.T @ other).as_rotvec()
+        return frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
+
+    def clip(mixed: Clip, first: Clip, other: Clip) -> Clip:
+        if first.frame is None or other.frame is None:
+            return Clip(mixed.at, mixed.position, mixed.tangent, mixed.sliding)
+        return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(first.frame, other.frame))
+
+    def number(a, b):
+        return a + fraction * (b - a)
+
+    ends = support(scene.start, other.start), support(scene.end, other.end)
+    mixed = jax.tree.map(number, scene, other)
+    mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
+    if not scene.clips:
+        return mixed
+    clips = tuple(clip(*of_three) for of_three in zip(mixed.clips, scene.clips, other.clips, strict=True))
+    return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
+
+
+def held_position(scene: Scene) -> Float[Array, "3"]:
+    """The position of the start where it is held, else of the end."""
+    held = scene.start if isinstance(scene.start, Held) else scene.end
+    assert isinstance(held, Held), "a scene holds at least one position"
+    return held.position
+
+
+def scene_axes(scene: Scene) -> Float[Array, "3 3"]:
+    """Three unit vectors, the columns, that turn with the scene: where a search has to choose a direction and none is
+    better than the others, its choice is one of these.
+
+    A held frame; else by the first two directions that the scene has, of gravity, held tangents, ways between
+    positions, and loads. In a scene that has no two, all across the one are alike.
+    """
+    start, end = scene.start, scene.end
+    frames = [held.frame for held in (start, end, *scene.clips) if isinstance(held, Clamp | Clip)]
+    for frame in frames:
+        if frame is not None:
+            return frame
+    directions = [] if scene.gravity is None else [scene.gravity]
+    directions += [end.tangent for end in (start, end) if isinstance(end, Swivel)]
+    directions += [clip.tangent for clip in scene.clips if clip.tangent is not None]
+    positions = [held.position for held in (start, *scene.clips, end) if isinstance(held, Held | Clip)]
+    directions += [position - positions[0] for position in positions[1:]]
+    directions += [load.force for load in scene.point_forces]
+    ends = [end for end in (start, end) if isinstance(end, Free) and not end.follower]
+    directions += [load for end in ends for load in (end.force, end.moment) if load is not None]
+    for load in scene.distributed:
+        if not load.follower:
+            directions.append(load.force if isinstance(load, DistributedForce) else load.couple)
+    identity = jnp.eye(3, dtype=scene.rod.length.dtype)
+    # Of none of these the last axis, and of one another one that is not along it.
+    along = _first_of(jnp.stack([*directions, identity[2]]))
+    others = jnp.stack([*directions, identity[0], identity[1]])
+    sizes = jnp.sqrt(jnp.sum(others**2, axis=1))
+    others /= jnp.where(sizes > LEAST_DIRECTION, sizes, 1.0)[:, None]
+    across = others - (others @ along)[:, None] * along[None]
+    d1 = _first_of(jnp.where(jnp.sum(across**2, axis=1) > LEAST_ANGLE**2, across.T, 0.0).T)
+    return jnp.stack([d1, jnp.cross(along, d1), along], axis=1)
+
+
+# Vectors in the units of the rod, and parts of unit vectors across others, that are taken for none: roundings are less.
+LEAST_DIRECTION = 1e-9
+LEAST_ANGLE = 1e-3
+
+
+def _first_of(vectors: Float[Array, "k 3"]) -> Float[Array, "3"]:
+    """The first that is not zero, at the length 1."""
+    sizes = jnp.sqrt(jnp.sum(vectors**2, axis=1))
+    k = jnp.argmax(sizes > LEAST_DIRECTION)
+    return vectors[k] / sizes[k]
+
+
+def held_at_both_ends(scene: Scene) -> bool:
+    """Whether the positions of both ends are given."""
+    return isinstance(scene.start, Held) and isinstance(scene.end, Held)
+
+
+def slides(scene: Scene) -> bool:
+    """Whether the rod slides through a clip."""
+    return any(clip.sliding for clip in scene.clips)
+
+
+def sliding_places(scene: Scene) -> Float[Array, "slides"] | None:
+    """The arclengths of the sliding clips; `None` where there are none."""
+    return jnp.stack([clip.at for clip in scene.clips if clip.sliding]) if slides(scene) else None
+
+
+def slid(scene: Scene, places: Float[Array, "slides"]) -> Scene:
+    """The scene with its sliding clips at other arclengths."""
+    return eqx.tree_at(lambda scene: [clip.at for clip in scene.clips if clip.sliding], scene, list(places))
+
+
+def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
+    """The dead moment on a free end, if there is one."""
+    for end in (scene.start, scene.end):
+        if isinstance(end, Free) and end.moment is not None:
+            return end.moment
+    return None
+
+
+def needs_frames(scene: Scene) -> bool:
+    """Whether the rod, its loads or clips ask for the angle of the sections about the tangent, all along the rod."""
+    holds_frames = any(clip.frame is not None for clip in scene.clips)
+    follows = _follows(scene.start) or _follows(scene.end)
+    return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames
+
+
+def _follows(end: Support) -> bool:
+    return type(end) is Free and end.follower
+
+
+def has_potential(scene: Scene) -> bool:
+    """Whether all loads have one: a dead moment, a couple along the rod and a load that follows the rod have none."""
+    follows = _follows(scene.start) or _follows(scene.end)
+    follows |= any(isinstance(load, DistributedCouple) or load.follower for load in scene.distributed)
+    return dead_end_moment(scene) is None and not follows
+
+
+def nondimensional(scene: Scene) -> tuple[Scene, Units]:
+    """The same scene with L = 1, EI = 1, weight per length = gravity and a held end at the origin, and the way back.
+
+    Tolerances then mean the same for a hair and a hawser, and a scene far from the origin loses no digits.
+    """
+    rod = scene.rod
+    units = Units(origin=held_position(scene), length=rod.length, energy=rod.bending_scale / rod.length)
+    gravity = None if scene.gravity is None else scene.gravity * (rod.mean_mass_per_length * rod.length / units.force)
+    scaled = Scene(
+        rod.in_units(units),
+        scene.start.in_units(units),
+        scene.end.in_units(units),
+        gravity,
+        [force.in_units(units) for force in scene.point_forces],
+        scene.turns,
+        [load.in_units(units) for load in scene.distributed],
+        [clip.in_units(units) for clip in scene.clips],
+        [InUnits(obstacle, units.origin, units.length) for obstacle in scene.obstacles],
+    )
+    return scaled, units

@@ -1,0 +1,1 @@
+"""Many equilibria: paths and batches of scenes, branches, critical points and modes."""

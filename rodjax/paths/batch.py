@@ -1,0 +1,316 @@
+"""Batches: many independent scenes of one structure, each solved from its own start.
+
+`jax.vmap` of a solve runs every rod until the slowest has converged. Here so many rods as are quick to compute side by
+side, the lanes, make their turns of Newton's method together, and a lane whose rod is done takes the next scene: one
+compiled loop without idle work, until there are no more scenes.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+from tqdm import tqdm
+
+from rodjax.checks import instance, is_known, sequence
+from rodjax.discretization.first_twist import FirstTwist
+from rodjax.discretization.mixed import MixedForm
+from rodjax.model.scene import Scene, slides
+from rodjax.paths.path import path_from, stack_scenes
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.equilibrium import (
+    Discretization,
+    Options,
+    Search,
+    Solver,
+    checked_options,
+    checked_strain_limit,
+    first_state,
+    in_units_of,
+    is_here,
+    refined_together,
+    solve_from,
+)
+from rodjax.solving.guess import Guess
+from rodjax.solving.implicit import differentiable, not_differentiated
+from rodjax.solving.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
+from rodjax.solving.ranges import check_ranges, with_ranges
+from rodjax.solving.result import (
+    DEFAULT_STRAIN_LIMIT,
+    Equilibrium,
+    Found,
+    SolverState,
+    equilibrium,
+    warn_of_outcome,
+)
+
+# Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
+LANES = 8
+# Scenes in one call of a compiled program: the least of these that holds all, or as many calls of the last as it takes.
+# What is prepared for a scene takes some 20 kB at 50 segments.
+CHUNKS = (16, 128, 1024)
+
+
+@one_answer
+def solve_batch(
+    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+) -> Equilibrium:
+    """The equilibria of independent scenes of one structure, or of independent paths.
+
+    **Arguments:**
+
+    - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
+        one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps.
+    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each.
+    - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
+        several processes every one of them passes the same scenes, as many as the devices or a multiple.
+    - `progress`: show a progress bar.
+    - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
+        scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
+
+    Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
+    is marked, and all others are not affected.
+    """
+    stacked = _stacked(scenes)
+    check_ranges(*not_differentiated(stacked))
+    return solve_stack(
+        stacked,
+        guess,
+        segments=segments,
+        rtol=rtol,
+        discretization=discretization,
+        solver=solver,
+        planar=planar,
+        find=find,
+        strain_limit=strain_limit,
+        mesh=mesh,
+        progress=progress,
+    )
+
+
+def solve_stack(
+    stacked: Scene,
+    guess: Guess | Equilibrium | None = None,
+    *,
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+    **settings: Any,
+) -> Equilibrium:
+    """The same of stacked scenes of which some may have supports that are too far apart, as in a search.
+
+    `settings`: the other arguments of `solve_batch`.
+    """
+    instance(progress, "progress", bool)
+    if mesh is not None:
+        instance(mesh, "mesh", Mesh)
+        if len(mesh.axis_names) != 1:
+            raise ValueError(f"mesh must have one axis, got {mesh.axis_names}")
+    given, guess = not_differentiated(stacked, guess)
+    count = given.rod.length.shape[0]
+    if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
+        raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
+    options, rtol = checked_options(given, guess=guess, **settings)
+    strain_limit = checked_strain_limit(strain_limit)
+
+    def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
+        # A path has one guess, for its first scene.
+        begin = guess if last is None or last.s.ndim > 2 else last
+        return _in_chunks(given, begin, strain_limit, options, mesh, progress)
+
+    result = with_ranges(given, refined_together(solve, options, rtol))
+    if is_here(result):
+        warn_of_outcome(result, strain_limit)
+    return differentiable(stacked, result)
+
+
+def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Scene:
+    if isinstance(scenes, Scene):
+        return scenes if scenes.rod.length.ndim == 2 else stack_scenes(scenes)
+    rows = sequence(scenes, "scenes", "Scene, or of lists of them")
+    for k, row in enumerate(rows):
+        instance(row, f"scenes[{k}]", (Scene, Sequence))
+    rows = [row if isinstance(row, Scene) else stack_scenes(row) for row in rows]
+    lengths = {row.rod.length.shape for row in rows}
+    if len(lengths) > 1:
+        raise ValueError(f"scenes must be single scenes or paths of one length, got shapes {sorted(lengths)}")
+    return stack_scenes(rows)
+
+
+def _in_chunks(
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+    mesh: Mesh | None,
+    progress: bool,
+) -> Equilibrium:
+    count = scenes.rod.length.shape[0]
+    each = _is_stack(guess)
+    devices = 1 if mesh is None else mesh.size
+    share = -(-count // devices)
+    chunk = next((size for size in CHUNKS if share <= size), CHUNKS[-1])
+    is_traced = not is_known(scenes, guess)
+    if mesh is not None and (is_traced or jax.process_count() > 1):
+        if count % devices:
+            raise ValueError(
+                f"scenes must be a multiple of the {devices} devices of mesh, inside jit or over several processes; "
+                f"got {count}"
+            )
+        chunk = share
+    if is_traced:
+        return _solve_many(scenes, guess, jnp.full(devices, share), strain_limit, options, mesh)
+    parts = []
+    for first in tqdm(range(0, count, chunk * devices), disable=not progress, unit="chunk"):
+        last = min(first + chunk * devices, count)
+        part = functools.partial(_part, first=first, last=last, size=chunk * devices)
+        counts = np.clip(last - first - chunk * np.arange(devices), 0, chunk)
+        inputs = jax.tree.map(part, scenes), jax.tree.map(part, guess) if each else guess, counts
+        if mesh is not None:
+            sharding = jax.sharding.NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
+            whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
+            places = (sharding, sharding if each else whole, sharding)
+            inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, places, strict=True))
+        parts.append(_solve_many(*inputs, strain_limit, options, mesh))
+    if count == chunk * devices:
+        return parts[0]
+    return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *parts)
+
+
+def _is_stack(guess: Guess | Equilibrium | None) -> bool:
+    return isinstance(guess, Equilibrium) and guess.s.ndim > 1
+
+
+def _part(x: Array, first: int, last: int, size: int) -> Any:
+    """Entries `first` to `last`, and the last of them again up to `size`."""
+    if last - first == size == len(x):
+        return x
+    return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
+
+
+def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
+    """The first `count` of stacked scenes, each from its guess, without derivatives; of the others nothing of use."""
+    return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None)
+
+
+@functools.partial(compiled, static_argnames=("mesh",))
+def _solve_many(
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    counts: Int[Array, "devices"],
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+    mesh: Mesh | None,
+) -> Equilibrium:
+    """The first of the scenes, as many as `counts` tells each device; of the rest something without meaning."""
+    if mesh is None:
+        return _solve_here(scenes, guess, counts, strain_limit, options)
+    # Not `jit` with sharded inputs, which would ask all devices in each turn whether all are done.
+    shared = PartitionSpec(mesh.axis_names[0])
+    whole = PartitionSpec()
+    specs = (shared, shared if _is_stack(guess) else whole, shared, whole, whole)
+    many = jax.shard_map(_solve_here, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
+    return many(scenes, guess, counts, *jax.tree.map(jnp.asarray, (strain_limit, options)))
+
+
+def _solve_here(
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    counts: Int[Array, "1"],
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+) -> Equilibrium:
+    in_axes = (0, 0 if _is_stack(guess) else None)
+    if scenes.rod.length.ndim == 2:
+        path = functools.partial(path_from, strain_limit=strain_limit, options=options)
+        return jax.vmap(path, in_axes)(scenes, guess)
+
+    def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, FirstTwist]:
+        return first_state(scene, guess, options)
+
+    def search(scene: Scene, start: tuple[SolverState, FirstTwist]) -> Search:
+        return Search.of(*in_units_of(scene, start[0]), start[1], options)
+
+    def result(scene: Scene, found: Found) -> Equilibrium:
+        return equilibrium(scene, found, jnp.ones((), int), strain_limit)
+
+    starts = jax.vmap(state, in_axes)(scenes, guess)
+    if not isinstance(options.solver, Newton) or slides(scenes) or scenes.obstacles:
+        return jax.vmap(lambda scene, start: result(scene, solve_from(scene, start[0], start[1], options)))(
+            scenes, starts
+        )
+    searches = _mapped(search, scenes, starts)
+    ends = _ends(searches, counts[0], options.solver, options.find)
+    return _mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)
+
+
+def _mapped(function: Callable, *stacks: Any) -> Any:
+    """`function` of each entry of the stacks, so many at a time as fit into a processor's cache."""
+    return jax.lax.map(lambda entries: function(*entries), stacks, batch_size=LANES)
+
+
+class _Lanes(eqx.Module):
+    """The lanes: which search each is at, one past the last where none is left; and what has been found."""
+
+    search: Int[Array, "lanes"]
+    forms: MixedForm
+    states: NewtonState
+    following: Int[Array, ""]
+    ends: NewtonEnd
+
+
+def _ends(searches: Search, count: Int[Array, ""], solver: Newton, find: Find) -> NewtonEnd:
+    """Where the first `count` of the searches end."""
+    total = searches.point.total_twist.shape[0]
+    lanes = min(LANES, total)
+
+    def started(search: Int[Array, "lanes"]) -> tuple[MixedForm, NewtonState]:
+        at = jnp.minimum(search, total - 1)
+        forms, points = jax.tree.map(lambda leaf: leaf[at], (searches.form, searches.point))
+        return forms, jax.vmap(begin)(forms, points)
+
+    def advanced(lanes: _Lanes) -> _Lanes:
+        going = is_running(lanes.states)
+        states = jax.vmap(functools.partial(turn, solver=solver, find=find))(lanes.forms, lanes.states)
+        states = _chosen(going, states, lanes.states)
+        lanes = eqx.tree_at(lambda lanes: lanes.states, lanes, states)
+        done = ~is_running(states) & (lanes.search < count)
+        # Handing over takes longer than a turn of one rod, and so waits for a few.
+        enough = jnp.where(lanes.following < count, len(done) // 4, jnp.sum(lanes.search < count))
+        return jax.lax.cond(jnp.sum(done) >= jnp.maximum(enough, 1), handed_over, lambda lanes, _: lanes, lanes, done)
+
+    def handed_over(lanes: _Lanes, done: Bool[Array, "lanes"]) -> _Lanes:
+        ends = jax.vmap(ended)(lanes.forms, lanes.states)
+        to = jnp.where(done, lanes.search, total)
+        ends = jax.tree.map(lambda all, new: all.at[to].set(new, mode="drop"), lanes.ends, ends)
+        following = lanes.following + jnp.cumsum(done)
+        search = jnp.where(done, jnp.minimum(following - 1, count), lanes.search)
+        forms, states = _chosen(done, started(search), (lanes.forms, lanes.states))
+        return _Lanes(search, forms, states, following[-1], ends)
+
+    first = jnp.minimum(jnp.arange(lanes), count)
+    forms, states = started(first)
+    nothing = jax.eval_shape(jax.vmap(ended), searches.form, jax.vmap(begin)(searches.form, searches.point))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), nothing)
+    start = _Lanes(first, forms, states, jnp.minimum(jnp.full_like(count, lanes), count), nothing)
+    return jax.lax.while_loop(lambda lanes: jnp.any(lanes.search < count), advanced, start).ends
+
+
+def _chosen(which: Bool[Array, "lanes"], new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -1,0 +1,367 @@
+"""One branch of equilibria through a sequence of scenes, stable or not, and the points on it where a motion goes soft.
+
+The parameter of a sequence of m scenes runs from 0 to m - 1 and names the scene between two of them. Along the branch
+the residual (gradient by rotations, closure) of the mixed form stays zero. A step goes along the tangent of the branch
+and comes back to it at right angles (Keller 1977), in the metric of `stability.softest` for rotations beside the
+parameter: a linearised system with a border, solved for two right sides with the factors of Newton's method, O(n).
+At a fold the system itself is singular, with its border it is not.
+
+Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977); Seydel, "Practical bifurcation and
+stability analysis" (2010).
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.joints import generic_field
+from rodjax.discretization.motion import Motion, neutral_turn
+from rodjax.geometry.vectors import components
+from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.saddle_point import AnyFactors, SaddlePointSystem, factor
+from rodjax.model.scene import Scene, between, nondimensional
+from rodjax.model.supports import Clamp, rotate
+from rodjax.paths.modes import Mode, mode_of
+from rodjax.programs.compilation import compiled
+from rodjax.solving.newton import STAGNATION
+from rodjax.solving.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
+from rodjax.solving.stability import carried_to
+from rodjax.solving.status import Outcome, Status
+
+# A point lies on the branch when no force larger than this is left on a node [EI/L^2], or rounding allows no less.
+TOLERANCE = 1e-9
+MAX_ITERATIONS = 12
+# The most by which a correction turns a tangent [rad].
+MAX_ROTATION = 1.0
+# Stiffness of the spring against a neutral turn [EI/L], that of a softly held rod.
+SPRING = 10.0
+# Stiffness of the springs that hold a rod while its system is factorised [EI/L], and the parts it is held in.
+HOLD = 100.0
+PARTS = 4
+# Inverse iterations for the motion whose stiffness is nearest to zero: where it is near, one gains six digits.
+INVERSE_ITERATIONS = 4
+
+
+class Along(eqx.Module):
+    """A direction in which equilibria change: a motion, and the change of the parameter that goes with it."""
+
+    motion: Motion
+    rate: Float[Array, ""]
+
+
+class Station(eqx.Module):
+    """A point of a branch.
+
+    - `along`: the tangent of the branch, of length 1
+    - `alignment`: cosine of the angle to the direction in which the step went
+    - `stiffness`, `motion`: the eigenvalue [EI/L^2] of the Hessian nearest to zero, neutral turns apart, and its motion
+    - `slope`: the work of the residual that a change of the parameter makes in this motion, as a part of the most that
+      it could be
+    """
+
+    parameter: Float[Array, ""]
+    equilibrium: Equilibrium
+    along: Along
+    alignment: Float[Array, ""]
+    index: Int[Array, ""]
+    stiffness: Float[Array, ""]
+    motion: Motion
+    slope: Float[Array, ""]
+
+
+def scene_at(scenes: Scene, segment: Int[Array, ""], parameter: Float[Array, ""]) -> Scene:
+    """The scene of a parameter between the scenes number `segment` and the next one; beyond them on in a line."""
+    scene, other = (jax.tree.map(lambda leaf, k=k: leaf[segment + k], scenes) for k in (0, 1))
+    fraction = parameter - segment.astype(parameter.dtype)
+    mixed = between(scene, other, fraction)
+    # As `between` has them, but smooth where the frames are the same.
+    ends = [name for name in ("start", "end") if isinstance(getattr(scene, name), Clamp)]
+    clips = [k for k, clip in enumerate(scene.clips) if clip.frame is not None]
+
+    def held(scene: Scene) -> list[Float[Array, "3 3"]]:
+        return [getattr(scene, name).frame for name in ends] + [scene.clips[k].frame for k in clips]
+
+    pairs = zip(held(scene), held(other), strict=True)
+    frames = [rotate(frame, fraction * rotation_vector(frame, next_frame)) for frame, next_frame in pairs]
+    return eqx.tree_at(held, mixed, frames) if frames else mixed
+
+
+def rotation_vector(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The smallest rotation from one frame to another as a vector [rad], by less than pi, global axes."""
+    turn = other @ frame.T
+    sines = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    squared, cosine = jnp.sum(sines**2), (jnp.trace(turn) - 1) / 2
+    # Series of the arcsine near zero, where the derivatives of the length are infinite.
+    is_small = (squared < 1e-4) & (cosine > 0)
+    sine = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    series = 1 + squared / 6 + squared**2 * (3 / 40) + squared**3 * (5 / 112)
+    return jnp.where(is_small, series, jnp.arctan2(sine, cosine) / sine) * sines
+
+
+class Problem(eqx.Module):
+    """The scenes about an equilibrium, and what they make of it under other parameters."""
+
+    scenes: Scene
+    segment: Int[Array, ""]
+    equilibrium: Equilibrium
+
+    @property
+    def point(self) -> Point:
+        return form_and_point(self.equilibrium)[1]
+
+    @property
+    def scale(self) -> float:
+        """The change of the parameter that counts as much as one radian all along the rod."""
+        return float(self.scenes.rod.length.shape[0] - 1)
+
+    def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
+        scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
+        return carried_to(scaled, self.equilibrium.state.shape, point, motion)
+
+    def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
+        """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
+
+        def residual(parameter):
+            form, there = self.at(parameter, point)
+            here = form.linearized(there)
+            return Motion(here.gradient, here.closure), (form, there, here)
+
+        _, change, found = jax.jvp(residual, (parameter,), (jnp.ones_like(parameter),), has_aux=True)
+        return *found, change
+
+
+def no_motion(result: Equilibrium) -> Motion:
+    """A motion of an equilibrium that leaves it where it is."""
+
+    def unbalanced(result: Equilibrium) -> Motion:
+        form, point = form_and_point(result)
+        here = form.linearized(point)
+        return Motion(here.gradient, here.closure)
+
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(unbalanced, result))
+
+
+def mass(form: Form, here: Linearization) -> Float[Array, "m"]:
+    """The length of rod that each tangent stands for; none where a support holds it."""
+    return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+
+
+def inner(mass: Float[Array, "m"], motion: Motion, other: Motion) -> Float[Array, ""]:
+    return jnp.sum(mass[None] * motion.rotation * other.rotation)
+
+
+def times(motion: Motion, other: Motion) -> Float[Array, ""]:
+    """The work of one in the other."""
+    return jnp.sum(motion.rotation * other.rotation) + jnp.sum(motion.multipliers * other.multipliers)
+
+
+def less(motion: Motion, other: Motion, mass: Float[Array, "m"]) -> Motion:
+    """The part at right angles to another motion of length 1, or to none."""
+    return added(motion, other, -inner(mass, motion, other))
+
+
+def added(motion: Motion, other: Motion, share: Float[Array, ""]) -> Motion:
+    return jax.tree.map(lambda x, y: x + share * y, motion, other)
+
+
+class Firm(eqx.Module):
+    """The factors of a linearisation that has its springs."""
+
+    factors: AnyFactors
+    holds: int = eqx.field(static=True)
+
+    @property
+    def negative(self) -> Int[Array, ""]:
+        """The number of negative eigenvalues under the constraints: a hold is none of these."""
+        return self.factors.negative + self.holds
+
+    def solve(self, motion: Motion) -> Motion:
+        rotation, multipliers = self.factors.solve(motion.rotation, jnp.pad(motion.multipliers, (0, self.holds)))
+        return Motion(rotation, multipliers[: len(motion.multipliers)])
+
+
+def firm(form: Form, here: Linearization, neutral: Motion) -> Firm:
+    """The factors of a linearisation with a spring against its neutral turn, where this turns a tangent most.
+
+    What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
+
+    A loop that slides along its rod, or a rod that is free but for its closure, makes the part without border nearly
+    singular where the whole is not, and pivots are not exchanged. So springs hold the rod at a few places that are
+    eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly.
+    """
+    place = jnp.argmax(jnp.sum(neutral.rotation**2, axis=0))
+    turn = neutral.rotation[:, place]
+    squared = jnp.sum(turn**2)
+    spring = SPRING * turn[:, None] * turn[None] / jnp.where(squared > 0, squared, 1.0)
+    system = form.regular(here.system)
+    b, m = here.gradient.shape
+    stride = 2 ** math.ceil(math.log2(max(m - 1, 1) / PARTS)) if m > PARTS else 1
+    places = np.arange(stride, m - 1, stride)
+    holds = b * len(places)
+    border = np.zeros((b, b, len(places), m))
+    for component in range(b):
+        border[component, component, np.arange(len(places)), places] = 1.0
+    border = jnp.asarray(border.reshape(b, holds, m), system.border.dtype)
+    held = jnp.sum(border, axis=1)
+    identity = jnp.eye(b, dtype=held.dtype)[..., None]
+    diagonal = system.diagonal.at[:, :, place].add(spring) + HOLD * identity * held[None]
+    k = len(system.compliance)
+    compliance = jnp.zeros((k + holds, k + holds), held.dtype).at[:k, :k].set(system.compliance)
+    compliance = compliance.at[k:, k:].set(-jnp.eye(holds, dtype=held.dtype) / HOLD)
+    system = SaddlePointSystem(
+        diagonal, system.lower, jnp.concatenate([system.border, border], axis=1), compliance, across=system.across
+    )
+    return Firm(factor(system), holds)
+
+
+def nearest_to_zero(
+    form: Form, point: Point, here: Linearization, neutral: Motion, others: tuple[Motion, ...] = ()
+) -> tuple[Float[Array, ""], Motion]:
+    """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
+    weights = mass(form, here)
+    nothing = jnp.zeros_like(here.closure)
+    factors = firm(form, here, neutral)
+
+    def unit(motion: Motion) -> Motion:
+        for other in (neutral, *others):
+            motion = less(motion, other, weights)
+        size = jnp.sqrt(inner(weights, motion, motion))
+        return jax.tree.map(lambda x: x / size, motion)
+
+    def closer(_, motion: Motion) -> Motion:
+        return unit(factors.solve(Motion(weights[None] * motion.rotation, nothing)))
+
+    first = unit(Motion(components(here.bases, generic_field(point.tangents)), nothing))
+    motion = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
+    return times(motion, Motion(*here.system.times(motion.rotation, motion.multipliers))), motion
+
+
+def neutral_motion(form: Form, point: Point, here: Linearization) -> Motion:
+    """The turn of the whole rod that leaves it in equilibrium, of length 1, or no motion."""
+    turn, weights = neutral_turn(form, point, here), mass(form, here)
+    squared = inner(weights, turn, turn)
+    return jax.tree.map(lambda x: x / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), turn)
+
+
+class _Correction(eqx.Module):
+    """Where a correction is: what was found at the point, and the point to look at next."""
+
+    parameter: Float[Array, ""]
+    point: Point
+    here: Linearization
+    change: Motion  # of the residual with the parameter
+    follows: Motion  # how the equilibrium follows the parameter
+    index: Int[Array, ""]
+    is_converged: Bool[Array, ""]
+    iterations: Int[Array, ""]
+
+
+@compiled
+def stepped(
+    scenes: Scene,
+    segment: Int[Array, ""],
+    parameter: Float[Array, ""],
+    result: Equilibrium,
+    along: Along,
+    distance: Float[Array, ""],
+    target: Float[Array, ""],
+) -> Station:
+    """The equilibrium at a distance along a direction, at right angles to it; or under the parameter `target`.
+
+    `target`: not a number where the parameter is free.
+    """
+    problem = Problem(scenes, segment, result)
+    is_given = ~jnp.isnan(target)
+    far = jax.tree.map(lambda x: distance * x, along)
+    first = jnp.where(is_given, target, parameter + far.rate)
+    form, begin = problem.at(parameter, problem.point)
+    normal = short_sum(form.bases_at(begin) * along.motion.rotation[None], axis=1)
+    _, predicted = problem.at(first, problem.point, far.motion)
+
+    def corrected(state: _Correction) -> _Correction:
+        form, point, here, change = problem.linearized(state.parameter, state.point)
+        weights = mass(form, here)
+        neutral = neutral_motion(form, point, here)
+        factors = firm(form, here, neutral)
+        back = less(factors.solve(Motion(-here.gradient, -here.closure)), neutral, weights)
+        follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, weights)
+        across = Motion(components(here.bases, normal), here.closure)
+        squared = jnp.where(is_given, 1.0, inner(weights, across, follows) + along.rate / problem.scale**2)
+        share = jnp.where(is_given, 0.0, -inner(weights, across, back)) / squared
+        motion = added(back, follows, share)
+        part = jnp.minimum(1.0, MAX_ROTATION / jnp.max(jnp.abs(motion.rotation)))
+        force_change = form.layout.forces(form.closure(part * motion.multipliers))
+        moved = form.moved(point, here.bases, part * motion.rotation, force_change)
+        least = jnp.maximum(TOLERANCE, STAGNATION * form.rounding_floor(point))
+        is_there = (here.residual <= least) & form.is_closed(here.closure, 0.0)
+        return _Correction(
+            parameter=jnp.where(is_there, state.parameter, state.parameter + part * share),
+            point=jax.tree.map(lambda here, there: jnp.where(is_there, here, there), point, moved),
+            here=here,
+            change=change,
+            follows=follows,
+            index=factors.negative,
+            is_converged=is_there,
+            iterations=state.iterations + 1,
+        )
+
+    def is_running(state: _Correction) -> Bool[Array, ""]:
+        return ~state.is_converged & (state.iterations < MAX_ITERATIONS) & jnp.isfinite(state.parameter)
+
+    nothing = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda: problem.linearized(first, predicted)[2:]),
+    )
+    here, change = nothing
+    count = jnp.zeros((), int)
+    state = _Correction(first, predicted, here, change, change, count, jnp.array(False), count)
+    state = jax.lax.while_loop(is_running, corrected, state)
+
+    here, point, change = state.here, state.point, state.change
+    form, point = problem.at(state.parameter, point)
+    weights = mass(form, here)
+    # The tangent, on in the direction in which the step went.
+    before = Motion(components(here.bases, normal), here.closure)
+    size = jnp.sqrt(inner(weights, state.follows, state.follows) + 1 / problem.scale**2)
+    cosine = (inner(weights, before, state.follows) + along.rate / problem.scale**2) / size
+    sign = jnp.where(cosine < 0, -1.0, 1.0).astype(size.dtype) / size
+    tangent = Along(jax.tree.map(lambda x: sign * x, state.follows), sign)
+    stiffness, motion = nearest_to_zero(form, point, here, neutral_motion(form, point, here))
+
+    scene = scene_at(scenes, segment, state.parameter)
+    units = nondimensional(scene)[1]
+    status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
+    outcome = Outcome(here.residual, state.iterations, state.iterations, status.astype(int))
+    shape = result.state.shape.reached(form, point)
+    found = Found(SolverState(shape, point.end_force, units), point, outcome, state.index == 0)
+    return Station(
+        parameter=state.parameter,
+        equilibrium=equilibrium(scene, found, jnp.ones((), int)),
+        along=tangent,
+        alignment=jnp.abs(cosine),
+        index=state.index,
+        stiffness=stiffness,
+        motion=motion,
+        slope=work(motion, change, weights),
+    )
+
+
+def work(motion: Motion, change: Motion, mass: Float[Array, "m"]) -> Float[Array, ""]:
+    """What a change of the residual does in a motion of length 1, as a part of the most that one of its size could."""
+    is_free = mass > 0
+    forces = jnp.where(is_free, 1 / jnp.where(is_free, mass, 1.0), 0.0)[None] * change.rotation**2
+    gaps, pulls = (jnp.sqrt(jnp.sum(x**2)) for x in (change.multipliers, motion.multipliers))
+    most = jnp.sqrt(jnp.sum(forces)) + gaps * (1 + pulls)
+    return times(motion, change) / jnp.where(most > 0, most, 1.0)
+
+
+@compiled
+def mode_at(result: Equilibrium, stiffness: Float[Array, ""], motion: Motion) -> Mode:
+    """A motion of an equilibrium in SI units."""
+    form, point = form_and_point(result)
+    return mode_of(form, point, form.linearized(point), stiffness, motion, nondimensional(result.scene)[1])

@@ -1,0 +1,313 @@
+"""Paths through critical points: a branch of equilibria followed through folds, and the points where it turns or parts.
+
+A sequence of m scenes is a path: its parameter runs from 0 to m - 1, and a fraction names the scene on the way from one
+to the next (numbers linear, frames by the smallest rotation).
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rodjax.checks import instance, is_known, number_array, positive, whole_number
+from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.paths.branch import Along, mode_at, scene_at
+from rodjax.paths.critical import differentiable_parameter
+from rodjax.paths.modes import Mode
+from rodjax.paths.path import stack_scenes
+from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.equilibrium import Discretization, Solver, solve
+from rodjax.solving.guess import Guess
+from rodjax.solving.implicit import not_differentiated
+from rodjax.solving.result import Equilibrium
+
+# Where the parameter turns round at a fold, a change of the scene does work in the critical motion: more than this part
+# of what it could do. Where another branch crosses it does none.
+FOLD = 1e-5
+# How far from a critical point a new branch is entered: root mean square of the turn of the tangents [rad].
+SWITCH = 0.1
+
+Kind = Literal["fold", "branch"]
+
+
+class CriticalPoint(eqx.Module):
+    """An equilibrium in which a motion has no stiffness left.
+
+    - `parameter`: where in the sequence of scenes, from 0 to m - 1
+    - `kind`: `"fold"`, where the branch turns round in the parameter, so that a path beyond it jumps; or `"branch"`,
+      where another branch of equilibria crosses, as where a straight strut buckles
+    - `equilibrium`: there; its scene is that of the parameter
+    - `mode`: the critical motion, whose stiffness [N] is what is left of zero. Where a rod may buckle in all directions
+      at once, one of them
+    - `index_before`, `index_after`: the number of motions along which the energy falls, on both sides along the branch
+    """
+
+    parameter: Float[Array, ""]
+    equilibrium: Equilibrium
+    mode: Mode
+    kind: Kind = eqx.field(static=True)
+    index_before: int = eqx.field(static=True)
+    index_after: int = eqx.field(static=True)
+
+
+class Branch(eqx.Module):
+    """Equilibria in a row on one branch, k of them.
+
+    - `parameter` [k]: where in the sequence of scenes, from 0 to m - 1; `equilibria`: with a leading axis of k
+    - `index` [k]: the number of motions along which the energy falls; 0 where stable
+    - `critical_points`: those between the equilibria, in their order
+    - `ended`: why it goes no further
+    """
+
+    parameter: Float[Array, "k"]
+    equilibria: Equilibrium
+    index: Int[Array, "k"]
+    critical_points: tuple[CriticalPoint, ...]
+    ended: BranchEnd = eqx.field(static=True)
+
+
+@one_answer
+def follow(
+    scenes: Sequence[Scene] | Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    start: float = 0.0,
+    direction: int = 1,
+    step: float = DEFAULT_STEPS.first,
+    max_step: float = DEFAULT_STEPS.longest,
+    max_points: int = DEFAULT_STEPS.most,
+) -> Branch:
+    """One branch of equilibria through a sequence of scenes, stable or not, and through folds: pseudo-arclength.
+
+    Scenes may come again, as the branch turns back at folds. It ends where it reaches the first or the last scene.
+
+    **Arguments:**
+
+    - `scenes`: at least two `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames
+        may turn by less than pi from one to the next.
+    - `segments`, `rtol`, `discretization`, `solver`, `guess`: as for `rodjax.solve`, which finds the first equilibrium,
+        a minimum, and its mesh. A guess that is an `Equilibrium` is taken for that itself, whatever its stability.
+    - `start`: the parameter to begin with, from 0 to m - 1; `direction`: 1 where it is to grow from there, -1 to fall.
+    - `step`, `max_step`: the first and the longest step along the branch: root mean square of the turn of the tangents
+        [rad], and of the change of the parameter as a part of m - 1. Two critical points within a step are found where
+        they change the index, or the direction of the parameter.
+    - `max_points`: the most equilibria.
+
+    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential.
+    Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).
+    """
+    stacked = _checked(scenes, "follow")
+    steps = _checked_steps(step, max_step, max_points)
+    start, way = _checked_start(stacked, start, direction)
+    first = _first(stacked, start, segments, rtol, discretization, solver, guess)
+    found = trace(stacked, start, first, way, steps)
+    return Branch(
+        parameter=jnp.stack([station.parameter for station in found.stations]),
+        equilibria=_stacked([station.equilibrium for station in found.stations]),
+        index=jnp.stack([station.index for station in found.stations]),
+        critical_points=tuple(map(_critical_point, found.crossings)),
+        ended=found.ended,
+    )
+
+
+@one_answer
+def critical_points(
+    scenes: Sequence[Scene] | Scene,
+    path: Equilibrium,
+    *,
+    step: float = DEFAULT_STEPS.first,
+    max_step: float = DEFAULT_STEPS.longest,
+) -> tuple[CriticalPoint, ...]:
+    """The critical points that a path of `rodjax.solve_path` passed, at each of which it may have jumped.
+
+    The branch of the first equilibrium is followed to its first critical point, and then the one on which the path
+    went on at the next scene, to the last of them.
+
+    **Arguments:** `scenes`: those of the path; `path`: what `solve_path` found; `step`, `max_step`: as for `follow`.
+
+    Raises as `follow` does.
+    """
+    stacked = _checked(scenes, "critical_points")
+    instance(path, "path", Equilibrium)
+    if path.s.shape[:-1] != stacked.rod.length.shape:
+        raise ValueError(
+            f"path must have one equilibrium a scene, {stacked.rod.length.shape[0]}, got {path.s.shape[:-1]}"
+        )
+    steps = _checked_steps(step, max_step, DEFAULT_STEPS.most)
+    last = stacked.rod.length.shape[0] - 1
+    found: list[Crossing] = []
+    k = 0
+    while k < last:
+        here = trace(stacked, float(k), jax.tree.map(lambda leaf, k=k: leaf[k], path), 1.0, steps, only_first=True)
+        if not here.crossings:
+            break
+        found += here.crossings
+        k = max(k, int(np.floor(here.crossings[0].station.parameter))) + 1
+    return tuple(map(_critical_point, found))
+
+
+@one_answer
+def critical_point(
+    scenes: Sequence[Scene] | Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    start: float = 0.0,
+    direction: int = 1,
+    step: float = DEFAULT_STEPS.first,
+    max_step: float = DEFAULT_STEPS.longest,
+) -> CriticalPoint:
+    """The first critical point of a branch through a sequence of scenes; its parameter has derivatives by the scenes.
+
+    `jax.grad`, `jacfwd` and `jacrev` of `.parameter` work for every number of the scenes, by the implicit function
+    theorem, first derivatives only: at a fold by the change of the residual in the critical motion, at a branch point
+    by that of the critical eigenvalue along the branch. What is left of symmetry is taken for kept: an imperfection,
+    which makes two branches of those that cross, adds nothing. Other fields have no derivatives.
+
+    **Arguments:** as for `follow`.
+
+    Eager only, but for derivatives. Raises as `follow` does, and `ValueError` where there is no critical point.
+    Werner & Spence, "The computation of symmetry-breaking bifurcation points" (1984); Seydel, "Practical bifurcation
+    and stability analysis" (2010).
+    """
+    stacked = stack_scenes(scenes)
+    (fixed,) = not_differentiated(stacked)
+    fixed = _checked(fixed, "critical_point")
+    (guess,) = not_differentiated(guess)
+    steps = _checked_steps(step, max_step, DEFAULT_STEPS.most)
+    start, way = _checked_start(fixed, start, direction)
+    first = _first(fixed, start, segments, rtol, discretization, solver, guess)
+    found = trace(fixed, start, first, way, steps, only_first=True)
+    if not found.crossings:
+        parameter = float(found.stations[-1].parameter)
+        raise ValueError(
+            f"scenes have no critical point on this branch, followed from parameter {start:g} to {parameter:g}: "
+            f"{found.ended.value}"
+        )
+    point = _critical_point(found.crossings[0])
+    parameter = differentiable_parameter(stacked, point.parameter, point.equilibrium, point.kind == "fold")
+    return eqx.tree_at(lambda point: point.parameter, point, parameter)
+
+
+@one_answer
+def switch_branch(
+    scenes: Sequence[Scene] | Scene, point: CriticalPoint, *, side: int = 1, distance: float = SWITCH
+) -> tuple[Float[Array, ""], Equilibrium]:
+    """The parameter and the equilibrium beside a critical point on the branch that crosses there, to `follow` it.
+
+    **Arguments:**
+
+    - `scenes`: those in which the point was found.
+    - `point`: of kind `"branch"`; at a fold, the two sides of the same branch.
+    - `side`: 1 or -1, along the critical motion or against it.
+    - `distance`: root mean square of the turn of the tangents from there [rad].
+
+    The parameter is larger than that of the point where the new branch goes forward, else smaller: to follow it away
+    from the point give `follow` this `direction`. Where the equilibrium is not found it is flagged as not converged.
+    Raises as `follow` does.
+    """
+    stacked = _checked(scenes, "switch_branch")
+    instance(point, "point", CriticalPoint)
+    distance = float(positive(distance, "distance"))
+    if side not in (1, -1):
+        raise ValueError(f"side must be 1 or -1, got {side!r}")
+    segment, station = begun(stacked, float(point.parameter), point.equilibrium, 1.0)
+    along = Along(station.motion, jnp.zeros_like(station.parameter))
+    there = towards(stacked, segment, station.parameter, station.equilibrium, along, side * distance)
+    return there.parameter, there.equilibrium
+
+
+def _critical_point(crossing: Crossing) -> CriticalPoint:
+    station = crossing.station
+    return CriticalPoint(
+        parameter=station.parameter,
+        equilibrium=station.equilibrium,
+        mode=mode_at(station.equilibrium, station.stiffness, station.motion),
+        kind="fold" if crossing.turns and abs(float(station.slope)) > FOLD else "branch",
+        index_before=crossing.index_before,
+        index_after=crossing.index_after,
+    )
+
+
+@compiled
+def _stacked(results: list[Equilibrium]) -> Equilibrium:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+
+
+_scene_at = compiled(scene_at)
+
+
+def _first(
+    scenes: Scene,
+    start: float,
+    segments: int | None,
+    rtol: float | None,
+    discretization: Discretization | None,
+    solver: Solver | None,
+    guess: Guess | Equilibrium | None,
+) -> Equilibrium:
+    """The equilibrium to begin with."""
+    if isinstance(guess, Equilibrium) and segments is None and rtol is None and discretization is None:
+        return guess
+    segment = min(int(start), scenes.rod.length.shape[0] - 2)
+    scene = _scene_at(scenes, jnp.asarray(segment, int), jnp.asarray(start, scenes.rod.length.dtype))
+    return solve(
+        scene,
+        segments=segments,
+        rtol=rtol,
+        discretization=discretization,
+        solver=solver,
+        guess=guess,
+        find="equilibrium" if isinstance(guess, Equilibrium) else "minimum",
+    )
+
+
+# --- checks ----------------------------------------------------------------------------------------------------------
+
+
+def _checked(scenes: Any, name: str) -> Scene:
+    stacked = stack_scenes(scenes)
+    if not is_known(stacked):
+        raise ValueError(f"{name} needs scenes of known numbers: call it outside jax.jit and jax.vmap")
+    count = stacked.rod.length.shape[0]
+    if count < 2:
+        raise ValueError(f"scenes must be at least two, between which the parameter runs, got {count}")
+    if not has_potential(stacked):
+        raise ValueError(
+            "scenes must have a potential: dead moments on a free end, couples along the rod and follower loads "
+            "have none"
+        )
+    if slides(stacked):
+        raise ValueError(f"{name} needs scenes without sliding clips")
+    if stacked.obstacles:
+        raise ValueError(f"{name} needs scenes without obstacles")
+    return stacked
+
+
+def _checked_steps(step: Any, max_step: Any, max_points: Any) -> Steps:
+    step, max_step = float(positive(step, "step")), float(positive(max_step, "max_step"))
+    if step > max_step:
+        raise ValueError(f"step must be at most max_step = {max_step:g}, got {step:g}")
+    return Steps(step, max_step, whole_number(max_points, "max_points", 1, 10**6))
+
+
+def _checked_start(scenes: Scene, start: Any, direction: Any) -> tuple[float, float]:
+    last = scenes.rod.length.shape[0] - 1
+    start = float(number_array(start, "start"))
+    if not 0 <= start <= last:
+        raise ValueError(f"start must lie in 0 to {last}, the parameters of these scenes, got {start:g}")
+    if direction not in (1, -1):
+        raise ValueError(f"direction must be 1 or -1, got {direction!r}")
+    return start, float(direction)

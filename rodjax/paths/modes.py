@@ -1,0 +1,138 @@
+"""The softest motion of an equilibrium."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known, whole_number
+from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.framed import FrameForm
+from rodjax.discretization.framed_curve import FramedCurve
+from rodjax.discretization.motion import Motion
+from rodjax.linalg.saddle_point import DenseSystem
+from rodjax.model.along import Along
+from rodjax.model.scene import nondimensional, slides
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.result import Equilibrium, form_and_point, over_leading_axes
+from rodjax.solving.stability import softest
+from rodjax.solving.status import Status
+from rodjax.units import Units
+
+
+class Mode(eqx.Module):
+    """The motion in which an equilibrium is softest; of several ones along a leading axis `...`.
+
+    - `stiffness` [...] N: the second variation of the energy in this motion, by the integral along the rod of the
+      squared change of the tangent. Negative where the energy falls, zero for a neutral motion. A straight strut
+      loses as much of it as it is pressed. Derivatives by the scene are exact, of two motions equally soft those of one
+    - `displacement` [..., n+1, 3] of the nodes, the largest 1; taken as fixed by derivatives
+    """
+
+    stiffness: Float[Array, "..."]
+    displacement: Float[Array, "... n+1 3"]
+
+
+@one_answer
+def lowest_mode(equilibrium: Equilibrium) -> Mode:
+    """The lowest eigenvalue of the energy's second variation at an equilibrium under its supports, and its motion.
+
+    Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
+    where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n).
+
+    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum, of a rod that slides
+    through clips or under loads without a potential.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    if equilibrium.discretization == "continuum":
+        raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
+    if slides(equilibrium.scene):
+        raise ValueError("equilibrium must be of a scene without sliding clips")
+    return _lowest_mode(equilibrium)
+
+
+@one_answer
+def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
+    """Squares of the lowest angular frequencies of small vibrations [1/s^2], (count,) complex, by their size.
+
+    All real and positive: the equilibrium is stable. A negative one: it is left without vibration (divergence); a
+    complex pair: by vibrations that grow (flutter). Under follower loads and couples, which have no potential, this is
+    what tells stability. The inertia of the sections against turning is left out. O(n^3), eager only.
+
+    Raises `ValueError` where the solve did not converge or the rod has no mass, or where its tangents suffice (see
+    `rodjax.Rod`): its loads have a potential or are dead moments, and `Equilibrium.index` and `stable` tell.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    if not is_known(equilibrium):
+        raise ValueError("equilibrium must hold numbers, got a traced one: call squared_frequencies outside jax.jit")
+    if equilibrium.s.ndim > 1:
+        raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.s.shape[:-1]}")
+    if not isinstance(equilibrium.state.shape, FramedCurve):
+        raise ValueError("equilibrium must be of a rod or loads that need frames along the rod")
+    rod = equilibrium.scene.rod
+    mass = float(rod.mean_mass_per_length)
+    if not mass > 0:
+        raise ValueError(f"equilibrium must be of a rod with a mass_per_length, got {mass:g} kg/m")
+    if not bool(equilibrium.converged):
+        raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
+    flexibility, weights = _flexibility(equilibrium)
+    values = np.linalg.eigvals(np.asarray(flexibility) * np.repeat(np.asarray(weights), 3)[None])
+    values = values[np.argsort(-np.abs(values))][: whole_number(count, "count", 1, len(values))]
+    return float(rod.bending_scale) / (mass * float(rod.length) ** 4) / values.astype(complex)
+
+
+@compiled
+def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float[Array, "n"]]:
+    """The displacements of the nodes under forces on them, nondimensional, and the mass that each node stands for."""
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, FrameForm)
+    here = form.with_all(point)
+    # A rod that can spin, or turn as a whole, is held softly.
+    system = form.regular(here.system)
+    assert isinstance(system, DenseSystem)
+    bases, free = here.bases, here.gradient  # of the shape of the rotations
+
+    def nodes(rotation: Float[Array, "3 m"], closure: Float[Array, "c"]) -> Float[Array, "3n"]:
+        moved = form.moved(point, bases, rotation * form.is_free, form.layout.forces(closure))
+        return form.nodes(form.edges(moved)).reshape(-1)
+
+    by_rotation, by_force = jax.jacfwd(nodes, argnums=(0, 1))(jnp.zeros_like(free), jnp.zeros_like(here.closure))
+    by_all = jnp.concatenate([by_rotation.reshape(len(by_rotation), -1), by_force], axis=1)
+    forces = by_all.at[:, free.size :].set(0.0)
+    s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
+    mass = form.scene.rod.mass_per_length
+    before = mass.integral(s) if isinstance(mass, Along) else s
+    return by_all @ jnp.linalg.solve(system.matrix, forces.T), jnp.diff(before)
+
+
+@over_leading_axes
+def _lowest_mode(equilibrium: Equilibrium) -> Mode:
+    form, point = form_and_point(equilibrium)
+    if not form.has_potential:
+        raise ValueError(
+            "equilibrium must have a potential: dead moments on a free end, couples along the rod and follower loads "
+            "have none"
+        )
+    here = form.linearized(point)
+    mode = mode_of(form, point, here, *softest(form, point, here), nondimensional(equilibrium.scene)[1])
+    return eqx.tree_at(lambda mode: mode.displacement, mode, replace_fn=jax.lax.stop_gradient)
+
+
+def mode_of(
+    form: Form,
+    point: Point,
+    here: Linearization,
+    stiffness: Float[Array, ""],
+    motion: Motion,
+    units: Units,
+) -> Mode:
+    """A motion of an equilibrium and its nondimensional stiffness, as a `Mode`."""
+    force_change = form.layout.forces(form.closure(motion.multipliers))
+
+    def nodes(amount: Float[Array, ""]) -> Float[Array, "n+1 3"]:
+        return form.nodes(form.edges(form.moved(point, here.bases, amount * motion.rotation, amount * force_change)))
+
+    _, displacement = jax.jvp(nodes, (jnp.zeros_like(stiffness),), (jnp.ones_like(stiffness),))
+    largest = jnp.sqrt(jnp.max(jnp.sum(displacement**2, axis=1)))
+    return Mode(stiffness * units.force, displacement / largest)

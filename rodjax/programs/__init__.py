@@ -1,0 +1,1 @@
+"""Programs compiled by JAX: how they are made, and kept on disk."""

@@ -1,0 +1,600 @@
+"""A program of JAX's as Python code that calls NumPy.
+
+XLA takes seconds to compile a solve, which then runs in a fraction of a millisecond. The same program as NumPy code is
+there as soon as it is traced, and takes some ten milliseconds: what a first answer needs. It is written down from the
+program itself (a jaxpr), so that the two agree to rounding. It can be kept on disk: another process then need not even
+trace the program.
+
+Each equation becomes one line, an inner program one function. What a name holds is given up at its last use, as names
+are used again. An array that is only broadcast stays as it is until an operation needs it whole, as NumPy broadcasts.
+"""
+
+import marshal
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from rodjax.programs import numpy_operations
+
+Values = tuple[Any, ...]
+# The names of results, one for each result of an equation.
+Names = list[str]
+
+
+class NotInNumpyError(Exception):
+    """An operation for which there is no NumPy code; the message is its name."""
+
+
+class AnswerCode:
+    """A program as NumPy code: called with the leaves of its arguments it gives what the program gives.
+
+    `kinds`: types of the leaves; `out_tree`: structure of the result; `code` and `constants` are all that it runs.
+    """
+
+    def __init__(self, code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out_tree: Any):
+        self.code, self.constants, self.kinds, self.out_tree = code, constants, kinds, out_tree
+        space = {"np": np, "op": numpy_operations, **{f"k{index}": value for index, value in enumerate(constants)}}
+        exec(marshal.loads(code), space)
+        self._run: Callable[..., Values] = space["main"]
+
+    @staticmethod
+    def of(traced: Any) -> "AnswerCode":
+        """Of what `jax.jit(...).trace(...)` gives. Raises `NotInNumpyError`."""
+        program = traced.jaxpr
+        if any(kind.weak_type for kind in program.out_avals):
+            raise NotInNumpyError("a result of a weak type")
+        writer = _Writer()
+        writer.function(program, "main")
+        code = compile("\n".join(writer.lines), "<rodjax program>", "exec")
+        kinds = [np.dtype(kind.dtype) for kind in program.in_avals]
+        return AnswerCode(marshal.dumps(code), writer.constants, kinds, jax.tree.structure(traced.out_info))
+
+    def __call__(self, leaves: Sequence[Any], seconds: float) -> Any:
+        """Raises `TookTooLong` where loops take more than so many seconds."""
+        given = [np.asarray(leaf, kind)[()] for leaf, kind in zip(leaves, self.kinds, strict=True)]
+        with np.errstate(all="ignore"), numpy_operations.limited(seconds):
+            results = self._run(*given)
+        return jax.tree.unflatten(self.out_tree, jax.device_put(list(results)))
+
+    def packed(self) -> tuple[Any, ...]:
+        """To be written to a file."""
+        return self.code, self.constants, self.kinds, skeleton(self.out_tree)
+
+    @staticmethod
+    def unpacked(code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out: Any) -> "AnswerCode":
+        return AnswerCode(code, constants, kinds, jax.tree.structure(out))
+
+
+def skeleton(tree: Any) -> Any:
+    """What has a structure, which itself cannot be written to a file."""
+    return jax.tree.unflatten(tree, range(tree.num_leaves))
+
+
+class _Writer:
+    """Collects the functions of a program and its constants."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.constants: list[Any] = []
+        self._names_of_constants: dict[Any, str] = {}
+        self._functions: dict[int, tuple[str, Any]] = {}
+
+    def constant(self, value: Any) -> str:
+        """The name of a value that is fixed when the program is written."""
+        if isinstance(value, bool | int | str | type(None)):
+            return repr(value)
+        key: Any = value
+        if isinstance(value, np.ndarray | np.generic):
+            value = np.asarray(value)
+            if not value.ndim:
+                value = value[()]
+            key = value.dtype.str, value.shape, value.tobytes()
+        if key not in self._names_of_constants:
+            self._names_of_constants[key] = f"k{len(self.constants)}"
+            self.constants.append(value)
+        return self._names_of_constants[key]
+
+    def function(self, program: ClosedJaxpr | Jaxpr, name: str | None = None) -> str:
+        """The name of the function that an inner program becomes."""
+        key = id(program)
+        if key not in self._functions:
+            name = name or f"f{len(self._functions)}"
+            self._functions[key] = name, program  # kept alive, as the key is its address
+            self.lines += _Body(self, program, name).lines
+        return self._functions[key][0]
+
+
+class _Body:
+    """One function: a program without inner ones."""
+
+    def __init__(self, writer: _Writer, program: ClosedJaxpr | Jaxpr, name: str):
+        self.writer = writer
+        self.names: dict[Any, str] = {}
+        self.partial: set[Any] = set()  # variables whose array only broadcasts to their shape
+        self.free: list[str] = []
+        self.count = 0
+        jaxpr = program.jaxpr if isinstance(program, ClosedJaxpr) else program
+        constants = program.consts if isinstance(program, ClosedJaxpr) else []
+        self.lines = [f"def {name}({', '.join(self.new(v) for v in jaxpr.invars)}):"]
+        for variable, value in zip(jaxpr.constvars, constants, strict=True):
+            self.names[variable] = writer.constant(np.asarray(value))
+        last_use = {v: k for k, e in enumerate(jaxpr.eqns) for v in e.invars if not isinstance(v, Literal)}
+        kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+        for k, equation in enumerate(jaxpr.eqns):
+            self.equation(equation)
+            done = {v for v in equation.invars if not isinstance(v, Literal) and last_use[v] == k and v not in kept}
+            unused = {v for v in equation.outvars if v not in last_use and v not in kept}
+            for variable in done | unused:
+                self.release(variable)
+        results = "".join(f"{self.full(v)}, " for v in jaxpr.outvars)
+        self.lines.append(f" return ({results})")
+
+    def new(self, variable: Any) -> str:
+        if self.free:
+            name = self.free.pop()
+        else:
+            name, self.count = f"v{self.count}", self.count + 1
+        self.names[variable] = name
+        return name
+
+    def release(self, variable: Any) -> None:
+        name = self.names.pop(variable)
+        if name.startswith("v"):  # not a constant
+            self.free.append(name)
+
+    def any(self, variable: Any) -> str:
+        """An array that broadcasts to the variable's shape."""
+        if isinstance(variable, Literal):
+            return self.writer.constant(np.asarray(variable.val, variable.aval.dtype))
+        return self.names[variable]
+
+    def full(self, variable: Any) -> str:
+        """An array of the variable's shape."""
+        if variable in self.partial if not isinstance(variable, Literal) else variable.aval.shape:
+            name = self.any(variable)
+            shape = self.writer.constant(variable.aval.shape)
+            if isinstance(variable, Literal):
+                return f"op.filled({name}, {shape})"
+            self.partial.discard(variable)
+            self.lines.append(f" {name} = op.filled({name}, {shape})")
+        return self.any(variable)
+
+    def is_partial(self, variable: Any) -> bool:
+        return bool(variable.aval.shape) if isinstance(variable, Literal) else variable in self.partial
+
+    def equation(self, equation: Any) -> None:
+        primitive = equation.primitive.name
+        results = equation.outvars
+        if primitive in ELEMENTWISE:
+            given = [self.any(v) for v in equation.invars]
+            expression = ELEMENTWISE[primitive](self, equation, *given)
+            shape = results[0].aval.shape
+            if shape and not any(v.aval.shape == shape and not self.is_partial(v) for v in equation.invars):
+                self.partial.add(results[0])
+            self.lines.append(f" {self.new(results[0])} = {expression}")
+            return
+        if primitive == "broadcast_in_dim":
+            return self.broadcast(equation)
+        if primitive not in OTHERS:
+            raise NotInNumpyError(primitive)
+        given = [self.full(v) for v in equation.invars]
+        expression = OTHERS[primitive](self, equation, *given)
+        targets = ", ".join(self.new(v) for v in results)
+        if isinstance(expression, str):
+            if equation.primitive.multiple_results:
+                targets += ","
+            self.lines.append(f" {targets} = {expression}" if results else f" {expression}")
+        else:
+            # Line by line where a name would be given away before it is used.
+            self.lines.append(f" {targets}, = {', '.join(expression)}," if results else " pass")
+
+    def broadcast(self, equation: Any) -> None:
+        (given, *_) = equation.invars
+        (result,) = equation.outvars
+        shape, dims = equation.params["shape"], equation.params["broadcast_dimensions"]
+        name = self.any(given)
+        old = given.aval.shape
+        is_partial = self.is_partial(given)
+        if not old:
+            expression = name
+        else:
+            if is_partial:
+                name = self.full(given)
+                is_partial = False
+            axes = [1] * len(shape)
+            for axis, size in zip(dims, old, strict=True):
+                axes[axis] = size
+            expression = name if tuple(axes) == tuple(old) else f"{name}.reshape({self.writer.constant(tuple(axes))})"
+            if tuple(axes) == tuple(shape):
+                self.lines.append(f" {self.new(result)} = {expression}")
+                return
+        if shape:
+            self.partial.add(result)
+        self.lines.append(f" {self.new(result)} = {expression}")
+
+
+Rule = Callable[..., Any]
+
+
+def _call(function: str) -> Rule:
+    return lambda body, equation, *given: f"{function}({', '.join(given)})"
+
+
+def _infix(sign: str) -> Rule:
+    return lambda body, equation, a, b: f"{a} {sign} {b}"
+
+
+def _prefix(text: str) -> Rule:
+    return lambda body, equation, a: text.replace("x", a)
+
+
+def _operation(name: str, *params: str) -> Rule:
+    """A function of `numpy_operations`, of the arrays and of parameters of the equation."""
+
+    def rule(body: _Body, equation: Any, *given: str) -> str:
+        fixed = [body.writer.constant(equation.params[param]) for param in params]
+        return f"op.{name}({', '.join([*given, *fixed])})"
+
+    return rule
+
+
+def _divide(body: _Body, equation: Any, a: str, b: str) -> str:
+    if np.issubdtype(equation.outvars[0].aval.dtype, np.floating):
+        return f"{a} / {b}"
+    return f"np.trunc({a} / {b}).astype({_dtype(body, equation)})"
+
+
+def _dtype(body: _Body, equation: Any) -> str:
+    return body.writer.constant(np.dtype(equation.outvars[0].aval.dtype))
+
+
+def _integer_power(body: _Body, equation: Any, x: str) -> str:
+    power = equation.params["y"]
+    if 1 <= abs(power) <= 4:
+        product = " * ".join([x] * abs(power))
+        return product if power > 0 else f"1 / ({product})"
+    return f"np.power({x}, {float(power)})" if power < 0 else f"np.power({x}, {power})"
+
+
+def _convert(body: _Body, equation: Any, x: str) -> str:
+    old, new = equation.invars[0].aval.dtype, equation.params["new_dtype"]
+    return x if old == new else f"{x}.astype({body.writer.constant(np.dtype(new))})"
+
+
+def _select(body: _Body, equation: Any, which: str, *cases: str) -> str:
+    condition = equation.invars[0].aval
+    if condition.dtype == bool and len(cases) == 2:
+        if condition.shape:
+            return f"np.where({which}, {cases[1]}, {cases[0]})"
+        otherwise, case = (body.full(v) for v in equation.invars[1:])
+        return f"{case} if {which} else {otherwise}"
+    return f"np.choose({which}, ({', '.join(cases)},))"
+
+
+def _round(body: _Body, equation: Any, x: str) -> str:
+    is_to_even = int(equation.params["rounding_method"]) == 1
+    return f"np.rint({x})" if is_to_even else f"np.trunc({x} + np.copysign(0.5, {x}))"
+
+
+def _reduce(ufunc: str) -> Rule:
+    def rule(body: _Body, equation: Any, x: str) -> str:
+        axes = body.writer.constant(tuple(equation.params["axes"]))
+        # NumPy adds whole numbers up as longer ones.
+        is_whole = equation.outvars[0].aval.dtype.kind in "iu"
+        return f"{ufunc}.reduce({x}, {axes}, {_dtype(body, equation)})" if is_whole else f"{ufunc}.reduce({x}, {axes})"
+
+    return rule
+
+
+def _extreme(function: str) -> Rule:
+    def rule(body: _Body, equation: Any, x: str) -> str:
+        (axis,) = equation.params["axes"]
+        return f"np.{function}({x}, {axis}).astype({_dtype(body, equation)})"
+
+    return rule
+
+
+def _reshape(body: _Body, equation: Any, x: str, *_: str) -> str:
+    shape = equation.outvars[0].aval.shape
+    return x if shape == equation.invars[0].aval.shape else f"{x}.reshape({body.writer.constant(shape)})"
+
+
+def _slice(body: _Body, equation: Any, x: str) -> str:
+    params = equation.params
+    steps = params["strides"] or [1] * len(params["start_indices"])
+    parts = []
+    for first, last, step, n in zip(
+        params["start_indices"], params["limit_indices"], steps, equation.invars[0].aval.shape, strict=True
+    ):
+        whole = first == 0 and last == n and step == 1
+        parts.append(":" if whole else f"{first}:{last}" + (f":{step}" if step != 1 else ""))
+    while parts and parts[-1] == ":":
+        parts.pop()
+    return f"{x}[{', '.join(parts)}]" if parts else x
+
+
+def _reverse(body: _Body, equation: Any, x: str) -> str:
+    dimensions = equation.params["dimensions"]
+    return f"{x}[{', '.join('::-1' if k in dimensions else ':' for k in range(max(dimensions) + 1))}]"
+
+
+def _transpose(body: _Body, equation: Any, x: str) -> str:
+    return f"{x}.transpose({body.writer.constant(tuple(equation.params['permutation']))})"
+
+
+def _concatenate(body: _Body, equation: Any, *arrays: str) -> str:
+    return f"np.concatenate(({', '.join(arrays)},), {equation.params['dimension']})"
+
+
+def _stack(body: _Body, equation: Any, *arrays: str) -> str:
+    return f"op.stack(({', '.join(arrays)},), {equation.params['axis']})"
+
+
+def _iota(body: _Body, equation: Any) -> str:
+    shape, dtype, axis = (equation.params[name] for name in ("shape", "dtype", "dimension"))
+    line = np.arange(shape[axis], dtype=dtype).reshape([-1 if k == axis else 1 for k in range(len(shape))])
+    return body.writer.constant(np.broadcast_to(line, shape).copy())
+
+
+def _pad(body: _Body, equation: Any, x: str, value: str) -> str:
+    return f"op.pad({x}, {value}, {body.writer.constant(tuple(equation.params['padding_config']))})"
+
+
+def _dynamic_slice(body: _Body, equation: Any, x: str, *starts: str) -> str:
+    return f"op.dynamic_slice({x}, ({', '.join(starts)},), {body.writer.constant(equation.params['slice_sizes'])})"
+
+
+def _dynamic_update_slice(body: _Body, equation: Any, x: str, update: str, *starts: str) -> str:
+    return f"op.dynamic_update_slice({x}, {update}, ({', '.join(starts)},))"
+
+
+MOVES = (jax.lax.GatherScatterMode.CLIP, jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+
+
+def _gather(body: _Body, equation: Any, x: str, starts: str) -> str:
+    params, dims = equation.params, equation.params["dimension_numbers"]
+    dtype = np.dtype(equation.outvars[0].aval.dtype)
+    missing = None
+    if params["mode"] not in MOVES:
+        missing = params["fill_value"]
+        if missing is None:
+            missing = np.nan if dtype.kind == "f" else True if dtype.kind == "b" else _unlikely(dtype)
+        missing = dtype.type(missing)
+    fixed = [
+        equation.outvars[0].aval.shape,
+        tuple(params["slice_sizes"]),
+        dims.offset_dims,
+        dims.collapsed_slice_dims,
+        dims.start_index_map,
+        dims.operand_batching_dims,
+        dims.start_indices_batching_dims,
+        missing,
+    ]
+    return f"op.gather({', '.join([x, starts, *map(body.writer.constant, fixed)])})"
+
+
+def _unlikely(dtype: np.dtype) -> int:
+    """The whole number that JAX takes where there is none."""
+    limits = np.iinfo(dtype)
+    return limits.max if dtype.kind == "u" else limits.min
+
+
+def _scatter(combine: str) -> Rule:
+    def rule(body: _Body, equation: Any, x: str, starts: str, updates: str) -> str:
+        params, dims = equation.params, equation.params["dimension_numbers"]
+        fixed = [
+            dims.update_window_dims,
+            dims.inserted_window_dims,
+            dims.scatter_dims_to_operand_dims,
+            dims.operand_batching_dims,
+            dims.scatter_indices_batching_dims,
+            params["mode"] in MOVES,
+        ]
+        return f"op.scatter({', '.join([x, starts, updates, combine, *map(body.writer.constant, fixed)])})"
+
+    return rule
+
+
+def _dot_general(body: _Body, equation: Any, a: str, b: str) -> str:
+    (contracted, batched) = equation.params["dimension_numbers"]
+    fixed = [tuple(map(tuple, contracted)), tuple(map(tuple, batched))]
+    product = f"op.dot_general({', '.join([a, b, *map(body.writer.constant, fixed)])})"
+    new = equation.params["preferred_element_type"]
+    if new is None or new == equation.invars[0].aval.dtype:
+        return product
+    return f"{product}.astype({_dtype(body, equation)})"
+
+
+def _accumulate(ufunc: str) -> Rule:
+    def rule(body: _Body, equation: Any, x: str) -> str:
+        sums = f"op.accumulate({x}, {ufunc}, {equation.params['axis']}, {equation.params['reverse']})"
+        return f"{sums}.astype({_dtype(body, equation)})" if equation.outvars[0].aval.dtype.kind in "iu" else sums
+
+    return rule
+
+
+def _sort(body: _Body, equation: Any, *arrays: str) -> str:
+    return f"op.sort(({', '.join(arrays)},), {equation.params['dimension']}, {equation.params['num_keys']})"
+
+
+def _top_k(body: _Body, equation: Any, x: str) -> str:
+    axis = equation.params.get("axis", equation.invars[0].aval.ndim - 1)
+    return f"op.top_k({x}, {equation.params['k']}, {axis})"
+
+
+def _triangular_solve(body: _Body, equation: Any, a: str, b: str) -> str:
+    names = ("left_side", "lower", "transpose_a", "unit_diagonal")
+    return f"op.triangular_solve({', '.join([a, b, *(repr(bool(equation.params[name])) for name in names)])})"
+
+
+def _tile(body: _Body, equation: Any, x: str) -> str:
+    return f"np.tile({x}, {body.writer.constant(tuple(equation.params['reps']))})"
+
+
+# --- inner programs --------------------------------------------------------------------------------------------------
+
+
+def _inner(param: str) -> Rule:
+    def rule(body: _Body, equation: Any, *given: str) -> str:
+        return f"{body.writer.function(equation.params[param])}({', '.join(given)})"
+
+    return rule
+
+
+def _bound(function: str, constants: Iterable[str]) -> str:
+    """The function with its first arguments given."""
+    constants = list(constants)
+    return f"lambda *c: {function}({', '.join([*constants, '*c'])})" if constants else function
+
+
+def _tuple(names: Iterable[str]) -> str:
+    return "(" + "".join(f"{name}, " for name in names) + ")"
+
+
+def _while(body: _Body, equation: Any, *given: str) -> str:
+    params = equation.params
+    of_condition, of_body = params["cond_nconsts"], params["body_nconsts"]
+    condition, step = body.writer.function(params["cond_jaxpr"]), body.writer.function(params["body_jaxpr"])
+    condition = _bound(condition, given[:of_condition])
+    step = _bound(step, given[of_condition : of_condition + of_body])
+    return f"op.loop({condition}, {step}, {_tuple(given[of_condition + of_body :])})"
+
+
+def _scan(body: _Body, equation: Any, *given: str) -> str:
+    params = equation.params
+    constants, carry = params["num_consts"], params["num_carry"]
+    step = params["jaxpr"]
+    kinds = tuple((v.shape, np.dtype(v.dtype)) for v in step.out_avals[carry:])
+    return "op.scan({}, {}, {}, {}, {}, {}, {})".format(
+        body.writer.function(step),
+        _tuple(given[:constants]),
+        _tuple(given[constants : constants + carry]),
+        _tuple(given[constants + carry :]),
+        params["length"],
+        params["reverse"],
+        body.writer.constant(kinds),
+    )
+
+
+def _cond(body: _Body, equation: Any, index: str, *given: str) -> str:
+    branches = [body.writer.function(branch) for branch in equation.params["branches"]]
+    most = len(branches) - 1
+    return f"({', '.join(branches)},)[min(max(int({index}), 0), {most})]({', '.join(given)})"
+
+
+def _platform_index(body: _Body, equation: Any) -> str:
+    """Which branch of `jax.lax.platform_dependent` is for a processor."""
+    platforms = equation.params["platforms"]
+    return str(next(k for k, names in enumerate(platforms) if names is None or "cpu" in names))
+
+
+def _linear_solve(body: _Body, equation: Any, *given: str) -> str:
+    lengths, programs = equation.params["const_lengths"], equation.params["jaxprs"]
+    before = lengths.matvec + lengths.vecmat
+    constants = given[before : before + lengths.solve]
+    right = given[before + lengths.solve + lengths.transpose_solve :]
+    return f"{body.writer.function(programs.solve)}({', '.join([*constants, *right])})"
+
+
+def _same(body: _Body, equation: Any, *given: str) -> Any:
+    return list(given) if equation.primitive.multiple_results else given[0]
+
+
+ELEMENTWISE: dict[str, Rule] = {
+    **{name: _infix(sign) for name, sign in (("add", "+"), ("add_any", "+"), ("sub", "-"), ("mul", "*"))},
+    **{name: _infix(sign) for name, sign in (("and", "&"), ("or", "|"), ("xor", "^"))},
+    **{
+        name: _infix(sign)
+        for name, sign in (("eq", "=="), ("ne", "!="), ("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">="))
+    },
+    **{
+        name: _call(f"np.{name}")
+        for name in ("sqrt", "cbrt", "square", "exp", "exp2", "log", "log1p", "expm1", "floor", "ceil", "sign")
+    },
+    **{name: _call(f"np.{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "nextafter")},
+    **{f"a{name}": _call(f"np.arc{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    "atan2": _call("np.arctan2"),
+    "abs": _call("np.abs"),
+    "max": _call("np.maximum"),
+    "min": _call("np.minimum"),
+    "rem": _call("np.fmod"),
+    "pow": _call("np.power"),
+    "is_finite": _call("np.isfinite"),
+    "div": _divide,
+    "neg": _prefix("-x"),
+    "not": _prefix("~x"),
+    "rsqrt": _prefix("1 / np.sqrt(x)"),
+    "logistic": _prefix("1 / (1 + np.exp(-x))"),
+    "integer_pow": _integer_power,
+    "convert_element_type": _convert,
+    "select_n": _select,
+    "clamp": lambda body, equation, low, x, high: f"np.minimum(np.maximum({x}, {low}), {high})",
+    "round": _round,
+    "lt_to": lambda body, equation, a, b: f"op.before_in_order({a}, {b}, False)",
+    "le_to": lambda body, equation, a, b: f"op.before_in_order({a}, {b}, True)",
+    "stop_gradient": lambda body, equation, x: x,
+    "copy": lambda body, equation, x: x,
+    "copy_p": lambda body, equation, x: x,
+    "reduce_precision": lambda body, equation, x: x,
+}
+
+OTHERS: dict[str, Rule] = {
+    "reduce_sum": _reduce("np.add"),
+    "reduce_prod": _reduce("np.multiply"),
+    "reduce_max": _reduce("np.maximum"),
+    "reduce_min": _reduce("np.minimum"),
+    "reduce_and": _reduce("np.logical_and"),
+    "reduce_or": _reduce("np.logical_or"),
+    "argmax": _extreme("argmax"),
+    "argmin": _extreme("argmin"),
+    "cumsum": _accumulate("np.add"),
+    "cumprod": _accumulate("np.multiply"),
+    "cummax": _accumulate("np.maximum"),
+    "cummin": _accumulate("np.minimum"),
+    "reshape": _reshape,
+    "squeeze": _reshape,
+    "expand_dims": _reshape,
+    "slice": _slice,
+    "rev": _reverse,
+    "transpose": _transpose,
+    "concatenate": _concatenate,
+    "stack": _stack,
+    "unstack": _operation("unstack", "axis"),
+    "split": _operation("split", "sizes", "axis"),
+    "tile": _tile,
+    "pad": _pad,
+    "iota": _iota,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter": _scatter("None"),
+    "scatter-add": _scatter("np.add"),
+    "scatter-mul": _scatter("np.multiply"),
+    "scatter-min": _scatter("np.minimum"),
+    "scatter-max": _scatter("np.maximum"),
+    "sort": _sort,
+    "top_k": _top_k,
+    "dot_general": _dot_general,
+    "cholesky": lambda body, equation, x: f"op.cholesky({x})",
+    "lu": lambda body, equation, x: f"op.lu({x})",
+    "lu_pivots_to_permutation": _operation("permutation", "permutation_size"),
+    "triangular_solve": _triangular_solve,
+    "eigh": lambda body, equation, x: f"op.eigh({x}, {equation.params['lower']})",
+    "jit": _inner("jaxpr"),
+    "pjit": _inner("jaxpr"),
+    "closed_call": _inner("call_jaxpr"),
+    "core_call": _inner("call_jaxpr"),
+    "custom_jvp_call": _inner("call_jaxpr"),
+    "custom_vjp_call": _inner("call_jaxpr"),
+    "checkpoint": _inner("jaxpr"),
+    "while": _while,
+    "scan": _scan,
+    "cond": _cond,
+    "platform_index": _platform_index,
+    "custom_linear_solve": _linear_solve,
+    "optimization_barrier": _same,
+    "device_put": _same,
+}

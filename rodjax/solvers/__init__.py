@@ -1,1 +1,0 @@
-"""Minimisers of a discretized energy."""

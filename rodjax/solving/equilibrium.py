@@ -1,0 +1,732 @@
+"""solve(): the equilibrium of a scene."""
+
+import dataclasses
+import functools
+import math
+import typing
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
+from rodjax.discretization.cells import segments_for_jumps
+from rodjax.discretization.finite_difference import FiniteDifference, Polyline
+from rodjax.discretization.first_shape import first_shape
+from rodjax.discretization.first_twist import FirstTwist, last_of
+from rodjax.discretization.form import Form, Point
+from rodjax.discretization.forms import field_of, form_of
+from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
+from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.layout import force_parts, in_parts
+from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodes import LEAST_ELEMENT
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.touching import TouchingForm
+from rodjax.geometry.interpolation import resampled
+from rodjax.mechanics.passage import PLACES, Before
+from rodjax.model.plane import check_planar, is_planar, plane
+from rodjax.model.scene import (
+    Scene,
+    dead_end_moment,
+    needs_frames,
+    nondimensional,
+    slid,
+    slides,
+    sliding_places,
+)
+from rodjax.model.supports import Clamp
+from rodjax.programs.compilation import compiled, one_answer
+from rodjax.solving.contact_search import find_touching
+from rodjax.solving.guess import Guess
+from rodjax.solving.implicit import differentiable, not_differentiated
+from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
+from rodjax.solving.nonlinear_cg import NonlinearCG, minimize
+from rodjax.solving.ranges import check_ranges, with_ranges
+from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, first_size, graded, next_size, shares
+from rodjax.solving.result import (
+    DEFAULT_STRAIN_LIMIT,
+    Equilibrium,
+    Found,
+    NotConvergedWarning,
+    SolverState,
+    equilibrium,
+    estimated_errors,
+    passage_to,
+    warn_if_coarse,
+    warn_of_outcome,
+    warn_of_unknown_mesh,
+)
+from rodjax.solving.sliding_search import INNER_TOLERANCE, slid_free
+from rodjax.solving.status import Outcome, Status, is_converged
+from rodjax.units import Units
+from rodjax.warn import warn
+
+Solver = Newton | NonlinearCG
+Discretization = Literal["finite_difference", "hermite"]
+
+# Shapes that differ by so many roundings are the same.
+SAME_SHAPE = 64
+
+DEFAULT_SOLVER = Newton()
+DEFAULT_RTOL = 1e-3
+# A smaller error than this drowns in the residual of 1e-8 EI/L^2 at which a solve stops.
+LEAST_RTOL = 1e-10
+LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
+# At least so many in the span between two clips, on average, of the first mesh.
+SPAN_SEGMENTS = 10
+# The same beside obstacles: on fewer a rod that touches takes many iterations, and then finer meshes.
+CONTACT_SEGMENTS = 32
+# Of the only mesh inside jit, where no error can be looked at.
+TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
+# A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
+MOST_FAILURES = 3
+# Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
+MAX_SEGMENTS = 100_000
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["solver"],
+    meta_fields=["segments", "discretization", "planar", "find"],
+)
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How a scene is solved, and on what mesh: all that a compiled program depends on besides the scene's structure,
+    but for the numbers of the solver, which it is given.
+    """
+
+    segments: int
+    discretization: Discretization
+    solver: Solver
+    planar: bool = False
+    find: Find = "minimum"
+
+
+@one_answer
+def solve(
+    scene: Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+) -> Equilibrium:
+    """The equilibrium of a scene.
+
+    Compiled once for each structure of scene, solver and mesh; works inside `jax.jit` and `jax.vmap`.
+
+    **Arguments:**
+
+    - `scene`: `Scene`.
+    - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs. The
+        errors on a given mesh are not estimated unless asked for (`error_estimate`, `describe`); outside `jit` a
+        `MeshWarning` is given where a segment turns by so much that it is far too long.
+    - `rtol`: the relative error of the shape that is wanted; `None` for 1e-3. Segments are added, elements where they
+        are needed, until the estimated `error_estimate` is below it and `force_error`, `moment_error` and
+        `curvature_error` below ten times it: by default 0.1 % of the length, and 1 % of the largest force, moment and
+        curvature. The mesh of a guess that is an `Equilibrium` comes first. Where the numbers of the scene are not
+        known, as inside `jit`, `vmap` and `grad`, it is that of the guess or one of 32 elements whatever `rtol`, of
+        which a `MeshWarning` tells once; `error_estimate` says what that gives.
+    - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order.
+        `None`: that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
+    - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
+    - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
+        supports and gravity.
+    - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
+        motions out of the plane too.
+    - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that would
+        rather leave its plane, is left along it, always to the same side. `"equilibrium"`: what the steps of Newton's
+        method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there.
+    - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
+        beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
+
+    Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
+    Raises `ValueError` or `TypeError` for arguments that make no sense.
+    """
+    instance(scene, "scene", Scene)
+    if scene.rod.length.ndim:
+        raise ValueError(
+            f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}; "
+            "solve_path takes scenes one after another, jax.vmap(solve) independent ones"
+        )
+    fixed_scene, guess = not_differentiated(scene, guess)
+    if fixed_scene is not scene:  # it was made of numbers that nobody knew
+        check_ranges(fixed_scene)
+    check_single(guess)
+    options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
+    strain_limit = checked_strain_limit(strain_limit)
+    result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
+    if is_known(result.status):
+        result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
+    if fixed_scene is not scene:
+        result = with_ranges(fixed_scene, result)
+    warn_of_outcome(result, strain_limit)
+    return result if fixed_scene is scene else differentiable(scene, result)
+
+
+def _looked_at(result: Equilibrium) -> Equilibrium:
+    """On a mesh that was given."""
+    warn_if_coarse(result)
+    return result
+
+
+def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: Float[Array, ""] | float) -> Equilibrium:
+    """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`, and
+    contacts press the rod in between its nodes no deeper than at them.
+    """
+    failures, depth = 0, Depth()
+    while True:
+        failures = 0 if result.converged else failures + 1
+        errors = estimated_errors(result)
+        error = float(error_by_rtol(errors))
+        sinks = depth.lacking(errors, options.segments)
+        is_fine = bool(result.converged) and max(SAFETY * error / rtol, sinks) <= 1
+        if is_fine or _is_finest(options) or failures == MOST_FAILURES:
+            break
+        defects = errors.defects
+        if sinks and defects is not None and errors.depths is not None:
+            defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
+        lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
+        options = dataclasses.replace(
+            options, segments=next_size(options.segments, lacking, rtol, options.discretization)
+        )
+        finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
+        result = eqx.tree_at(
+            lambda result: (result.iterations, result.evaluations),
+            finer,
+            (_sum(finer.iterations, result.iterations), _sum(finer.evaluations, result.evaluations)),
+        )
+    if result.converged:
+        _warn_if_inaccurate(error, rtol, options)
+    return result
+
+
+def _sum(a: Int[Array, ""], b: Int[Array, ""]) -> Int[Array, ""]:
+    """Of counts that are known; JAX would compile a program."""
+    return leaf(np.asarray(a) + np.asarray(b))
+
+
+def refined_together(
+    solve: Callable[[Options, Equilibrium | None], Equilibrium], options: Options, rtol: float | None
+) -> Equilibrium:
+    """Many equilibria on one mesh: all solved again until the estimated error of those that converged is below `rtol`,
+    and contacts press them in no deeper between nodes than at them.
+
+    `solve` is given the options and what it found with the last ones.
+    """
+    result, depth = solve(options, None), Depth()
+    if rtol is None and is_here(result):
+        return _looked_at(result)
+    while rtol is not None and is_here(result):
+        errors, converged = estimated_errors(result), np.asarray(result.converged)
+        sizes = error_by_rtol(errors)
+        error = float(np.max(sizes[converged], initial=0.0))
+        sinks = depth.lacking(errors, options.segments, converged)
+        if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
+            missed = int(np.sum(converged & ~(sizes <= rtol)))
+            _warn_if_inaccurate(error, rtol, options, f" in {missed} of {sizes.size} cases")
+            break
+        lacking = max(error, sinks * rtol / SAFETY)
+        options = dataclasses.replace(
+            options, segments=next_size(options.segments, lacking, rtol, options.discretization)
+        )
+        result = solve(options, result)
+    return result
+
+
+def is_here(result: Equilibrium) -> bool:
+    """Whether its numbers are known, and this process holds all of them."""
+    return is_known(result) and result.s.is_fully_addressable
+
+
+def _is_finest(options: Options) -> bool:
+    return options.segments >= SIZES[options.discretization][-1]
+
+
+def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
+    if not error <= rtol:
+        warn(
+            f"the estimated error {error:.1e} (of the shape, or a tenth of that of forces, moments or curvature) is "
+            f"above rtol = {rtol:g}{where} on the finest mesh, of {options.segments} segments",
+            NotConvergedWarning,
+        )
+
+
+@compiled
+def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Options) -> SolverState:
+    """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
+    state = coarse.state
+    shape = state.shape
+    if isinstance(shape, FramedCurve):
+        s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=shape.s.dtype)
+        if defects is not None:
+            is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
+            s = graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments)
+        shape = shape.on(s, shape.is_of_joints)
+    elif isinstance(shape, Curve) and defects is not None:
+        is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
+        shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
+    else:
+        shape = Polyline.through(shape.points(options.segments))
+    end_force = state.end_force
+    if coarse.scene.obstacles:
+        assert isinstance(state.shape, Curve | FramedCurve)
+        assert isinstance(shape, Curve | FramedCurve)
+        end_force = _of_elements(end_force, state.shape.s, shape.s)
+    shape, end_force = _on_its_side(coarse.scene, coarse, shape, end_force)
+    return SolverState(shape, end_force, state.units, state.places, before=state.before)
+
+
+def _on_its_side(
+    scene: Scene, last: Equilibrium, shape: Shape, end_force: Float[Array, "3 parts"]
+) -> tuple[Shape, Float[Array, "3 parts"]]:
+    """What a solve on another mesh begins from: where the last one came through an obstacle, what that began from."""
+    state = last.state
+    if state.before is None or not isinstance(shape, Curve | FramedCurve):
+        return shape, end_force
+    points = (state.before.points - state.units.origin[None]) / state.units.length
+    points = resampled(points, 2 * (len(shape.s) - 1))
+    if isinstance(shape, Curve):
+        begin = Curve.through(points).on(shape.s)
+    else:
+        begin = framed_through(nondimensional(scene)[0], points, of_joints=False).on(shape.s, of_joints=False)
+    is_lost = last.status == Status.PASSED_THROUGH
+    return (
+        jax.tree.map(lambda old, new: jnp.where(is_lost, old, new), begin, shape),
+        jnp.where(is_lost, 0.0, end_force),
+    )
+
+
+def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
+    """Where the rod was when it last was sound; not a number where that is to be the first shape of the search."""
+    if not scene.obstacles:
+        return None
+    last = guess.state.before if isinstance(guess, Equilibrium) else None
+    if last is None:
+        return Before(jnp.full((PLACES, 3), jnp.nan, scene.rod.length.dtype), scene.obstacles)
+    shapes = [jax.tree.map(jnp.shape, obstacles) for obstacles in (last.obstacles, scene.obstacles)]
+    return last if eqx.tree_equal(*shapes) else Before(last.points, scene.obstacles)
+
+
+def _of_elements(
+    forces: Float[Array, "3 k"], s: Float[Array, "k+1"], others: Float[Array, "n+1"]
+) -> Float[Array, "3 n"]:
+    """The forces in elements, in other elements: as in the middle of each."""
+    middles = (others[:-1] + others[1:]) / 2
+    return forces[:, jnp.clip(jnp.searchsorted(s, middles, side="right") - 1, 0, forces.shape[1] - 1)]
+
+
+def checked_options(
+    scene: Scene,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+) -> tuple[Options, float | None]:
+    """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
+    if guess is not None:
+        instance(guess, "guess", (Guess, Equilibrium))
+    if solver is None:
+        solver = DEFAULT_SOLVER
+    instance(solver, "solver", typing.get_args(Solver))
+    if discretization is None:
+        discretization = _discretization(scene, guess, segments, solver)
+    one_of(discretization, "discretization", typing.get_args(Discretization))
+    if discretization == "hermite" and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton where discretization is 'hermite'")
+    of_frames = needs_frames(scene)
+    if of_frames and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton for a rod, loads or clips that need frames along the rod")
+    if scene.clips:
+        if of_frames and discretization == "finite_difference":
+            raise ValueError(
+                "discretization must be 'hermite' for clips on a rod, or with loads or clips, that need frames along "
+                "the rod"
+            )
+        if isinstance(solver, NonlinearCG):
+            raise ValueError("solver must be a Newton for a scene with clips")
+    if scene.obstacles and discretization == "finite_difference":
+        raise ValueError("discretization must be 'hermite' for a scene with obstacles")
+    if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
+    if rtol is not None:
+        if segments is not None:
+            raise ValueError(f"segments must be None where rtol is given, got segments={segments!r} and rtol={rtol!r}")
+        rtol = checked_rtol(rtol)
+    elif segments is None:
+        rtol = DEFAULT_RTOL
+    # A node for each clip, and where the mesh is chosen a few of them in each span.
+    least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
+    if of_frames and discretization == "hermite":
+        least = _least_for_jumps(scene, segments, least)
+    if segments is not None:
+        segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
+    elif isinstance(guess, Equilibrium):
+        segments = max(guess.s.shape[-1] - 1, least)
+    elif rtol is not None and is_known(scene, guess):
+        wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
+        if scene.obstacles:
+            wanted = max(wanted, CONTACT_SEGMENTS)
+        segments = first_size(rtol, discretization, max(wanted, least))
+    else:
+        segments = TRACED_SEGMENTS[discretization]
+        warn_of_unknown_mesh(segments)
+    one_of(find, "find", typing.get_args(Find))
+    if find == "equilibrium" and isinstance(solver, NonlinearCG):
+        raise ValueError("solver must be a Newton where find is 'equilibrium': NonlinearCG only goes down")
+    instance(planar, "planar", bool)
+    if planar:
+        if isinstance(solver, NonlinearCG):
+            raise ValueError("solver must be a Newton where planar is True")
+        check_planar(scene, 0.0 if guess is None else guess.total_twist)
+    return Options(segments, discretization, solver, planar, find), rtol
+
+
+def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
+    """The fewest elements, or more where a rod whose numbers are known has `Steps` near to one another."""
+    needed = segments_for_jumps(scene) if is_known(scene) else None
+    if needed is None or needed[0] <= (SIZES["hermite"][-1] if segments is None else segments):
+        return least if needed is None else max(least, needed[0])
+    count, gap = needed
+    where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
+    given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
+    raise ValueError(
+        f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "
+        f"needs segments = {count} or more, and {given}"
+    )
+
+
+def check_single(guess: Guess | Equilibrium | None) -> None:
+    if isinstance(guess, Equilibrium) and guess.s.ndim > 1:
+        raise ValueError(
+            f"guess must be a single equilibrium, got a stack of shape {guess.s.shape[:-1]}; take one of it, such as "
+            "jax.tree.map(lambda leaf: leaf[-1], guess)"
+        )
+
+
+def checked_rtol(rtol: Any) -> float:
+    value = float(positive(rtol, "rtol"))
+    if not LEAST_RTOL <= value <= 1.0:
+        raise ValueError(f"rtol must lie in {LEAST_RTOL:g} to 1, got {rtol!r}")
+    return value
+
+
+def checked_strain_limit(strain_limit: Any) -> Float[Array, ""] | float:
+    """The largest |axial strain| that is allowed: infinite for `None`."""
+    if strain_limit is None:
+        return math.inf
+    if isinstance(strain_limit, float) and strain_limit > 0:
+        return float(strain_limit)
+    value = positive(strain_limit, "strain_limit")
+    return float(value) if is_known(value) else jax.lax.stop_gradient(leaf(value))
+
+
+def _discretization(
+    scene: Scene, guess: Guess | Equilibrium | None, segments: int | None, solver: Solver
+) -> Discretization:
+    """The one to take where none is asked for."""
+    if isinstance(solver, NonlinearCG):
+        return "finite_difference"
+    if scene.clips and needs_frames(scene):
+        return "hermite"
+    if segments is None and isinstance(guess, Equilibrium) and _is_by_differences(guess.state.shape):
+        return "finite_difference"
+    return "hermite"
+
+
+def _is_by_differences(shape: Shape) -> bool:
+    return isinstance(shape, Polyline) or (isinstance(shape, FramedCurve) and shape.is_of_joints)
+
+
+def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Where to begin, and with which total twist: as the guess has it, where its mesh is kept."""
+    if isinstance(guess, Equilibrium) and guess.s.shape[-1] - 1 == options.segments and _fits(scene, guess, options):
+        state = guess.state
+        first = last_twist(guess)
+        if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
+            before = _before(scene, guess)
+            return SolverState(state.shape, state.end_force, state.units, state.places, before=before), first
+    return _first_state(scene, guess, options)
+
+
+def last_twist(result: Equilibrium) -> FirstTwist:
+    """The total twist of an equilibrium, to be carried to the next one."""
+    return FirstTwist(result.total_twist, last_of(result.scene))
+
+
+def settled_state(scene: Scene, state: SolverState, first: FirstTwist) -> tuple[SolverState, Float[Array, ""]]:
+    """The same beginning with the tangents and frames that the scene holds, and the total twist there [rad]."""
+    if not needs_frames(scene) and not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
+        return state, first.total_twist
+    scaled, scaled_state = in_units_of(scene, state)
+    if slides(scene):
+        assert state.places is not None
+        scaled = slid(scaled, state.places)
+    form = form_of(scaled, scaled_state.shape)
+    begin, point = _first_point(form, scaled_state, first)
+    shape = begin.with_unknowns(point)
+    total_twist = form.settled(point).total_twist
+    return dataclasses.replace(scaled_state, shape=shape), total_twist
+
+
+def _sliding(scene: Scene) -> tuple[bool, ...]:
+    return tuple(clip.sliding for clip in scene.clips)
+
+
+def _kind(options: Options) -> type[Polyline] | type[Curve]:
+    return Polyline if options.discretization == "finite_difference" else Curve
+
+
+def _fits(scene: Scene, guess: Equilibrium, options: Options) -> bool:
+    """Whether a guess has the unknowns of a scene on a mesh of as many segments."""
+    shape = guess.state.shape
+    parts = force_parts(scene, options.segments)
+    if guess.state.end_force.shape[1] != parts or _sliding(guess.scene) != _sliding(scene):
+        return False
+    if needs_frames(scene):
+        return isinstance(shape, FramedCurve) and shape.is_of_joints == (options.discretization == "finite_difference")
+    return isinstance(shape, _kind(options))
+
+
+@compiled
+def _first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """Cold starts look like warm ones, so that both have one program."""
+    state, first = _unsettled_state(scene, guess, options)
+    here = last_of(scene)
+    if first.last is not None and jax.tree.structure(first.last) == jax.tree.structure(here):
+        return state, first
+    if options.planar:
+        return state, FirstTwist(first.total_twist, here)
+    state, total_twist = settled_state(scene, state, first)
+    return state, FirstTwist(total_twist, here)
+
+
+def _unsettled_state(
+    scene: Scene, guess: Guess | Equilibrium | None, options: Options
+) -> tuple[SolverState, FirstTwist]:
+    if needs_frames(scene):
+        return _first_frames(scene, guess, options)
+    scaled, units = nondimensional(scene)
+    kind = _kind(options)
+    pieces = options.segments if kind is Polyline else 2 * options.segments
+    parts = force_parts(scene, options.segments)
+    no_force = jnp.zeros((3, parts), scene.rod.length.dtype)
+    before = _before(scene, guess)
+    if guess is None:
+        no_twist = jnp.zeros((), no_force.dtype)
+        shape = kind.through(first_shape(scaled, pieces))
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), FirstTwist(no_twist)
+    if isinstance(guess, Guess):
+        shape = kind.through(guess.nodes(scaled, units, pieces))
+        twist = FirstTwist(guess.total_twist)
+        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), twist
+    state = guess.state
+    if isinstance(state.shape, FramedCurve):
+        shape = kind.through(state.shape.points(pieces))
+    elif isinstance(state.shape, Curve) and kind is Curve:
+        shape = state.shape.on(jnp.linspace(0.0, 1.0, options.segments + 1, dtype=no_force.dtype))
+    else:
+        shape = kind.through(state.shape.points(pieces))
+    end_force = in_parts(state.end_force, parts)
+    places = sliding_places(scaled)
+    if _sliding(guess.scene) == _sliding(scene):
+        places = state.places
+    if scene.obstacles:
+        shape, end_force = _on_its_side(scene, guess, shape, end_force)
+    return SolverState(shape, end_force, state.units, places, before=before), last_twist(guess)
+
+
+def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
+    """The same for a scene that needs frames."""
+    scene, units = nondimensional(given)
+    of_joints = options.discretization == "finite_difference"
+    pieces = options.segments if of_joints else 2 * options.segments
+    s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
+    parts = force_parts(scene, options.segments)
+    no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
+    before = _before(given, guess)
+
+    def state(shape: FramedCurve) -> SolverState:
+        return SolverState(shape, no_force, units, places, before=before)
+
+    if guess is None:
+        return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
+    if isinstance(guess, Guess):
+        shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
+        return state(shape), FirstTwist(guess.total_twist)
+    shape, first = guess.state.shape, last_twist(guess)
+    if _sliding(guess.scene) == _sliding(scene):
+        places = guess.state.places
+    if isinstance(shape, FramedCurve):
+        end_force = in_parts(guess.state.end_force, parts)
+        shape = shape.on(s, of_joints)
+        if scene.obstacles:
+            shape, end_force = _on_its_side(given, guess, shape, end_force)
+        return SolverState(shape, end_force, guess.state.units, places, before=before), first
+    points = _in_units(guess.state, units).shape.points(pieces)
+    start = guess.scene.start
+    if isinstance(start, Clamp):
+        return state(framed_through(scene, points, of_joints, (start.frame, guess.total_twist))), first
+    return state(framed_through(scene, points, of_joints)), FirstTwist(guess.total_twist)
+
+
+def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:
+    """The one code path of every solve: from a state to where the solver stops."""
+    # To the same bits, whatever is made of it in the same program.
+    find = _slid if slides(scene) else _found
+    return jax.lax.optimization_barrier(find(*in_units_of(scene, state), first, options))
+
+
+def in_units_of(scene: Scene, state: SolverState) -> tuple[Scene, SolverState]:
+    """The scene, nondimensional, and a state in its units."""
+    scaled, units = nondimensional(scene)
+    return scaled, _in_units(state, units)
+
+
+class Search(eqx.Module):
+    """Where Newton's method begins: the form it makes stationary, the first point, and the shape that belongs to it.
+
+    `normal`: of the plane in which it stays, if it does.
+    """
+
+    form: Form
+    point: Point
+    shape: Shape
+    units: Units
+    is_within_plane: Bool[Array, ""] | None
+    normal: Float[Array, "3"] | None
+
+    @staticmethod
+    def of(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> "Search":
+        form = form_of(scene, guess.shape)
+        shape, point = _first_point(form, guess, first)
+        if not options.planar:
+            return Search(form, point, shape, guess.units, None, None)
+        normal, axes = plane(scene, point.tangents)
+        within = is_planar(scene, first.total_twist)
+        return Search(*form.in_plane(point, normal, axes), shape, guess.units, within, normal)
+
+    def found(self, end: NewtonEnd) -> Found:
+        point, outcome, stable = self.form.settled(end.point), end.outcome, end.is_stable
+        start, reached = self.shape, self.shape.reached(self.form, point)
+        # An unchanged scene gives back the same bits. (A straight rod under another pull takes no iteration either.)
+        is_same = start.change_to(reached) <= SAME_SHAPE * jnp.finfo(reached.nodes.dtype).eps
+        is_start = (outcome.iterations == 0) & is_same
+        shape = jax.tree.map(lambda old, new: jnp.where(is_start, old, new), start, reached)
+        if self.normal is not None and self.is_within_plane is not None:
+            stable &= is_stable(self.form.out_of_plane(self.normal), point)
+            # Inside a user's own jit the scene could not be checked before.
+            within = self.is_within_plane & (self.form.stays_in_plane(point) | ~is_converged(outcome.status))
+            status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
+            outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
+        places = sliding_places(self.form.scene)
+        return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
+
+
+def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
+    solver = options.solver
+    if isinstance(solver, Newton):
+        search = Search.of(scene, guess, first, options)
+        if isinstance(search.form, TouchingForm):
+            end = find_touching(search.form, search.point, solver, options.find)
+            return _on_one_side(search, search.found(end), guess)
+        return search.found(find_equilibrium(search.form, search.point, solver, options.find))
+    assert isinstance(guess.shape, Polyline)
+    problem, start = FiniteDifference.begin(scene, guess.shape, first)
+    minimum = minimize(problem, start, solver)
+    point = minimum.problem.mixed_point(minimum.point)
+    stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
+    return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
+
+
+def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
+    """Not converged where the rod came through an obstacle on the way, or lies within one."""
+    form, before = search.form, guess.before
+    assert isinstance(form, TouchingForm)
+    assert before is not None
+    nodes = form.nodes(form.edges(search.point))
+    begin, _, _ = form.places(nodes, search.point)
+    begin = guess.units.origin[None] + guess.units.length * begin
+    before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
+    passed, now = passage_to(form, found.point, found.state.shape.nodes, guess.units, before)
+    converged = is_converged(found.outcome.status)
+    status = jnp.where(converged & ~passed.is_sound, Status.PASSED_THROUGH, found.outcome.status)
+    kept = jax.tree.map(lambda new, old: jnp.where(converged & passed.is_sound, new, old), now, before)
+    return eqx.tree_at(
+        lambda found: (found.outcome.status, found.state.before),
+        found,
+        (status, kept),
+        is_leaf=lambda value: value is None,
+    )
+
+
+def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
+    """The same where the rod slides through clips."""
+    assert guess.places is not None
+    assert isinstance(options.solver, Newton)
+    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
+    if scene.turns is not None:
+        # They are those of the first shape.
+        scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
+
+    tolerance = options.solver.tolerance
+    inner = eqx.tree_at(lambda options: options.solver.tolerance, options, INNER_TOLERANCE * tolerance)
+
+    def find_at(scene: Scene, last: Found) -> Found:
+        return _found(scene, last.state, FirstTwist(last.point.total_twist), inner)
+
+    count = jnp.zeros((), int)
+    begin = Found(guess, point, Outcome(jnp.zeros_like(point.total_twist), count, count, count), jnp.array(False))
+    return slid_free(scene, find_at, begin, tolerance, options.find)
+
+
+def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:
+    """The shape from which to seek the solution, and the same as the unknowns of its form."""
+    scene, shape, field = form.scene, guess.shape, form.field
+    end_force = form.layout.forces(form.layout.components(guess.end_force))
+    if isinstance(form, FrameForm):
+        assert isinstance(shape, FramedCurve)
+        return shape, form.holding(FramePoint(shape.turned_to_ends(form, first), end_force, first.total_twist))
+    assert isinstance(form, MixedForm)
+    if isinstance(shape, Curve):
+        assert isinstance(field, HermiteElements)
+        tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
+    else:
+        assert isinstance(shape, Polyline)
+        if not scene.clips:
+            problem, start = FiniteDifference.begin(scene, shape, first)
+            return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
+        tangents = shape.tangents
+    return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
+
+
+# Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
+@compiled
+def _solve(
+    scene: Scene,
+    state: SolverState,
+    first: FirstTwist,
+    strain_limit: Float[Array, ""] | float,
+    options: Options,
+) -> Equilibrium:
+    return equilibrium(scene, solve_from(scene, state, first, options), jnp.ones((), int), strain_limit)
+
+
+def _in_units(state: SolverState, units: Units) -> SolverState:
+    """The unknowns in other units; unchanged to the last bit where the units are the same."""
+    shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
+    force = state.end_force * (state.units.force / units.force)
+    return SolverState(shape, force, units, state.places, before=state.before)

@@ -1,0 +1,619 @@
+"""What a solve gives: the equilibrium of a scene, and how far it is to be believed."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import instance, is_known, leaf, number_list
+from rodjax.discretization.cells import ElementCells
+from rodjax.discretization.contact_error import depths_of_elements, with_contacts
+from rodjax.discretization.dead_loads import energy_of_origin
+from rodjax.discretization.error import (
+    Errors,
+    Sizes,
+    errors_of_differences,
+    errors_of_elements,
+    longest,
+)
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.form import NEUTRAL, Form, Point
+from rodjax.discretization.form_results import clip_moments_of, positions_between_nodes, resultants_of
+from rodjax.discretization.forms import form_of
+from rodjax.discretization.framed import FrameForm
+from rodjax.discretization.framed_results import (
+    errors_of_frames,
+    strains_beside_nodes,
+)
+from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.touching import TouchingForm
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.vectors import dot, root
+from rodjax.linalg.saddle_point import factor
+from rodjax.mechanics.passage import Before, Passage, passage
+from rodjax.model.obstacles import InUnits
+from rodjax.model.scene import Scene, has_potential, nondimensional, slid, slides
+from rodjax.programs.compilation import compiled
+from rodjax.solving.sliding import slide
+from rodjax.solving.stability import examined
+from rodjax.solving.status import Outcome, Status, is_converged, with_strain
+from rodjax.units import Units
+from rodjax.warn import warn
+
+# A rod deeper within an obstacle than this part of its radius is so by forces beyond all loads on it, as in a jam.
+MOST_PENETRATION = 1e-4
+# Beyond this |axial strain| a cable or hose is damaged, and stiffnesses that are constant are no longer those it has.
+DEFAULT_STRAIN_LIMIT = 0.05
+# Of several rods that came through obstacles, so many are named.
+MOST_NAMED = 3
+
+
+# An element, or an edge of finite differences, along which the rod turns by more than this [rad] is too coarse for any
+# figure: in 64 random scenes the shape was then off by 0.2 to 40 % of the length on elements, by 2 to 8 % on edges.
+MOST_TURN = {"hermite": 3.0, "finite_difference": math.pi / 2}
+
+
+class NotConvergedWarning(UserWarning):
+    """A solve ended without an equilibrium; the message says why."""
+
+
+class OverstretchedWarning(UserWarning):
+    """An equilibrium is strained by more than `strain_limit`; the message says by how much, and where."""
+
+
+class MeshWarning(UserWarning):
+    """A mesh on which nobody looked at the errors: one far too coarse, or of a size that nobody chose."""
+
+
+class SolverState(eqx.Module):
+    """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
+
+    `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
+    are unknown; `end_force`: the forces of the layout (`discretization.layout`): the force at s = L as each span sees
+    it, with the forces of the clips beyond, zero where that ends freely; with obstacles as each segment sees it, with
+    those of clips and contacts;
+    `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
+    `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
+    was when it last was sound: a solve that begins here is judged by it.
+    """
+
+    shape: Shape
+    end_force: Float[Array, "... 3 parts"] | Float[Array, "... 3"]  # the second only in files, until format 8
+    units: Units
+    places: Float[Array, "... slides"] | None = None
+    clip_moments: Float[Array, "... clips 3"] | None = None
+    before: Before | None = None
+
+
+class Equilibrium(eqx.Module):
+    """The equilibrium of a scene, or several of them along a leading axis `...` of every field.
+
+    Forces and moments are what the part of the rod beyond s exerts on the part before it, global axes, moments about
+    the centerline: at s = L what the support applies to the rod, at s = 0 the reverse of it.
+
+    - `s` [..., n+1] arclength of the nodes, m
+    - `nodes` [..., n+1, 3] centerline, m
+    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
+    - `curvature` [..., n+1] |t x t'|, 1/m
+    - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
+    - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
+      without a potential depends on the way and is left out; `elastic_energy` [...] J
+    - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
+    - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
+      position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
+      when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
+      just beyond it, and tension the mean of both sides
+    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node
+    - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
+      whose largest |axial_strain| is above the `strain_limit` of the solve
+    - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
+      (dead moments, couples along the rod, follower loads) this is not examined and False, and
+      `rodjax.squared_frequencies` tells
+    - `iterations` [...] of the solver; `evaluations` [...] of the energy and its gradient; `substeps` [...] solves that
+      a step of a path took: 1, or more where it was split
+    - `residual` [...] largest component of the gradient, in EI/L^2
+    - `error_estimate` [...] of the mesh: largest distance of a node from the continuum, relative to L; computed when it
+      is asked for. With it `force_error`, `moment_error`, `curvature_error` [...]: estimated errors of the mesh in the
+      forces and moments of the rod, its ends and clips, relative to the largest force (at least EI/L^2) and the largest
+      moment (at least 0.1 EI/L) in the rod, and in the curvature at a node, relative to the largest at any (at least
+      0.1/L). Between the nodes the rod may be bent more than at them. `moment_error` counts that obstacles touch at
+      nodes only
+    - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
+      are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
+    - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
+      examined, under loads without a potential and in the continuum. Computed when asked for
+    - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
+      line. Computed when asked for
+    - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
+    - `discretization`: `"finite_difference"`, `"hermite"` or `"continuum"`
+    - `state`: what a solve that begins from here takes over
+    """
+
+    s: Float[Array, "... n+1"]
+    nodes: Float[Array, "... n+1 3"]
+    frames: Float[Array, "... n+1 3 3"]
+    curvature: Float[Array, "... n+1"]
+    twist: Float[Array, "... n+1"]
+    total_twist: Float[Array, "..."]
+    tension: Float[Array, "... n+1"]
+    axial_strain: Float[Array, "... n+1"]
+    energy: Float[Array, "..."]
+    elastic_energy: Float[Array, "..."]
+    start_force: Float[Array, "... 3"]
+    start_moment: Float[Array, "... 3"]
+    end_force: Float[Array, "... 3"]
+    end_moment: Float[Array, "... 3"]
+    converged: Bool[Array, "..."]
+    stable: Bool[Array, "..."]
+    status: Int[Array, "..."]
+    iterations: Int[Array, "..."]
+    evaluations: Int[Array, "..."]
+    substeps: Int[Array, "..."]
+    residual: Float[Array, "..."]
+    scene: Scene
+    state: SolverState
+    discretization: str = eqx.field(static=True)
+
+    @property
+    def tangents(self) -> Float[Array, "... n+1 3"]:
+        return self.frames[..., 2]
+
+    @property
+    def clip_forces(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        if self.scene.obstacles:
+            return _node_forces(self)[0]
+        seen = self.state.end_force * self.state.units.force[..., None, None]
+        return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
+
+    @property
+    def contact_forces(self) -> Float[Array, "... n+1 3"]:
+        if not self.scene.obstacles:
+            return jnp.zeros_like(self.nodes)
+        return _node_forces(self)[1]
+
+    @property
+    def clip_moments(self) -> Float[Array, "... clips 3"]:
+        if not self.scene.clips:
+            return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
+        if self.state.clip_moments is not None:
+            return self.state.clip_moments * self.state.units.energy[..., None, None]
+        return _clip_moments(self)
+
+    @property
+    def error_estimate(self) -> Float[Array, "..."]:
+        errors = estimated_errors(self).nodes
+        return jnp.sqrt(jnp.max(jnp.sum(errors**2, axis=-1), axis=-1))
+
+    @property
+    def force_error(self) -> Float[Array, "..."]:
+        return estimated_errors(self).force
+
+    @property
+    def moment_error(self) -> Float[Array, "..."]:
+        return _moment_error(estimated_errors(self))
+
+    @property
+    def curvature_error(self) -> Float[Array, "..."]:
+        return estimated_errors(self).curvature
+
+    @property
+    def critical(self) -> Bool[Array, "..."]:
+        return _examination(self).critical
+
+    @property
+    def index(self) -> Int[Array, "..."]:
+        return _examination(self).index
+
+    @property
+    def neutral(self) -> Bool[Array, "..."]:
+        return _examination(self).neutral
+
+    def position_at(self, s: Any) -> Float[Array, "... k 3"]:
+        """Centerline at arclengths `s` (k,) [m] from 0 to L, [..., k, 3].
+
+        Between the nodes of elements a polynomial of fifth degree by position, tangent and curvature, as accurate as
+        the nodes; between those of finite differences a cubic.
+
+        Raises `ValueError` where an arclength lies beyond the rod.
+        """
+        s = leaf(number_list(s, "s")).astype(self.s.dtype)
+        if is_known(s, self.s):
+            numbers, length = np.asarray(s), float(np.min(np.asarray(self.s)[..., -1]))
+            if np.any(numbers < 0) or np.any(numbers > length):
+                raise ValueError(f"s must lie in 0 to {length:g} m, got {np.min(numbers):g} to {np.max(numbers):g} m")
+        return positions_at(self, s)
+
+
+class Found(eqx.Module):
+    """Where a solver stopped, nondimensional."""
+
+    state: SolverState
+    point: Any
+    outcome: Outcome
+    is_stable: Bool[Array, ""]
+
+
+def equilibrium(
+    scene: Scene, found: Found, substeps: Int[Array, ""], strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT
+) -> Equilibrium:
+    """What a solver found, in SI units; infinite where no strain is too large."""
+    if found.state.places is not None:
+        scene = slid(scene, found.state.places * scene.rod.length)
+    scaled, units = nondimensional(scene)
+    point, outcome = found.point, found.outcome
+    nodes = found.state.shape.nodes
+    form = form_of(scaled, found.state.shape)
+    results = resultants_of(form, point)
+    elastic_energy = form.elastic_energy(point)
+    potential = elastic_energy + form.load_energy(point)
+    converged = is_converged(outcome.status)
+    axial_strain = results.axial_strain
+    is_collapsed = ~converged & (jnp.min(axial_strain) <= -1)
+    status = jnp.where(is_collapsed, Status.COLLAPSED, with_strain(outcome.status, axial_strain, strain_limit))
+    return Equilibrium(
+        s=form.field.s * scene.rod.length,
+        nodes=units.origin[None] + units.length * nodes,
+        frames=results.frames,
+        curvature=results.curvature / units.length,
+        twist=results.twist / units.length,
+        total_twist=point.total_twist,
+        tension=results.tension * units.force,
+        axial_strain=axial_strain,
+        energy=units.energy * potential + energy_of_origin(scaled, units),
+        elastic_energy=units.energy * elastic_energy,
+        start_force=results.start_force * units.force,
+        start_moment=results.start_moment * units.energy,
+        end_force=results.end_force * units.force,
+        end_moment=results.end_moment * units.energy,
+        converged=converged,
+        stable=converged & found.is_stable,
+        status=status,
+        iterations=outcome.iterations,
+        evaluations=outcome.evaluations,
+        substeps=substeps,
+        residual=outcome.residual,
+        scene=scene,
+        state=dataclasses.replace(found.state, units=units),
+        discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
+    )
+
+
+def over_leading_axes(function: Callable, *, is_patient: bool = True) -> Callable:
+    """The function of one equilibrium as one of any number of them, `compiled`: patiently, as most results are asked
+    for a few of their numbers only.
+    """
+
+    @functools.wraps(function)
+    def mapped(equilibrium: Equilibrium, *shared: Any):
+        mapped = function
+        for _ in range(equilibrium.s.ndim - 1):
+            mapped = jax.vmap(mapped, in_axes=(0, *[None] * len(shared)))
+        return mapped(equilibrium, *shared)
+
+    return compiled(mapped, is_patient=is_patient)
+
+
+def estimated_errors(equilibrium: Equilibrium) -> Errors:
+    """How far the equilibrium is from the continuum; of the continuum itself not a number."""
+    if is_known(equilibrium):
+        errors = _errors(equilibrium)
+        # Few rods can turn as a whole: the program that looks for such a turn is theirs.
+        if not np.asarray(errors.is_soft).any():
+            return errors
+    return _errors_beside_turns(equilibrium)
+
+
+def _moment_error(errors: Errors) -> Float[Array, "..."]:
+    return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
+
+
+@functools.partial(over_leading_axes, is_patient=False)  # a part of each solve without `segments`
+def _errors(equilibrium: Equilibrium) -> Errors:
+    return _errors_of(equilibrium, is_turn_held=False)
+
+
+@over_leading_axes
+def _errors_beside_turns(equilibrium: Equilibrium) -> Errors:
+    return _errors_of(equilibrium, is_turn_held=True)
+
+
+def _errors_of(equilibrium: Equilibrium, *, is_turn_held: bool) -> Errors:
+    state = equilibrium.state
+    if equilibrium.discretization == "continuum":
+        unknown = Sizes(*[jnp.full((), jnp.nan, equilibrium.nodes.dtype)] * 3)
+        return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), *unknown, unknown, jnp.array(False), None)
+    form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        errors = errors_of_frames(form, point, is_turn_held=is_turn_held)
+    elif isinstance(state.shape, Curve):
+        assert isinstance(form, MixedForm)
+        errors = errors_of_elements(form, point, is_turn_held=is_turn_held)
+    else:
+        assert isinstance(form, MixedForm)
+        errors = errors_of_differences(
+            form, point, state.shape.nodes, equilibrium.tangents.T, is_turn_held=is_turn_held
+        )
+    if isinstance(form, TouchingForm):
+        errors = with_contacts(errors, form, point)
+    if errors.axial is None:
+        return errors
+    # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
+    now = slide(form.scene, state.shape, point)
+    further = -jnp.linalg.solve(now.rates, errors.axial)
+    nodes, forces, moments, curvature = (
+        jnp.tensordot(further, rate, 1) for rate in (now.nodes, now.forces, now.moments, now.curvature)
+    )
+    more = Sizes(longest(forces), longest(moments), jnp.max(jnp.abs(curvature))).relative_to(errors.scale)
+    return errors._replace(
+        nodes=errors.nodes + nodes,
+        force=errors.force + more.force,
+        moment=errors.moment + more.moment,
+        curvature=errors.curvature + more.curvature,
+    )
+
+
+class _Examination(eqx.Module):
+    critical: Bool[Array, "..."]
+    index: Int[Array, "..."]
+    neutral: Bool[Array, "..."]
+
+
+@over_leading_axes
+def _examination(equilibrium: Equilibrium) -> _Examination:
+    nothing = _Examination(jnp.array(False), jnp.full((), -1), jnp.array(False))
+    if equilibrium.discretization == "continuum":
+        return nothing
+    form, point = form_and_point(equilibrium)
+    here = form.linearized(point)
+    _, critical, turn = examined(form, point, here, equilibrium.residual)
+    if not form.has_potential:
+        return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
+    negative = factor(form.regular(here.system), is_regularized=True).negative
+    if slides(equilibrium.scene):
+        stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
+        negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
+    return _Examination(critical, negative, jnp.any(turn.rotation != 0))
+
+
+def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:
+    """How deep the rod lies within obstacles, at nodes and between them, as a part of the radius."""
+    if not equilibrium.scene.obstacles:
+        return np.zeros(equilibrium.s.shape[:-1])
+    return np.asarray(_deepest(equilibrium))
+
+
+@over_leading_axes
+def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    return jnp.max(depths_of_elements(form, point))
+
+
+@over_leading_axes
+def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Float[Array, "n+1 3"]]:
+    """What clips and what obstacles apply to the rod, of a scene with obstacles."""
+    form, _ = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    state = equilibrium.state
+    forces = form.at_nodes(state.end_force).T * state.units.force
+    clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
+    return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
+
+
+@over_leading_axes
+def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
+    form, point = form_and_point(equilibrium)
+    return clip_moments_of(form, point) * equilibrium.state.units.energy
+
+
+class Sides(eqx.Module):
+    """Arclengths [m] of both ends of each element in turn; curvature [1/m], twist [rad/m] and axial strain there."""
+
+    s: Float[Array, "... 2n"]
+    curvature: Float[Array, "... 2n"]
+    twist: Float[Array, "... 2n"]
+    axial_strain: Float[Array, "... 2n"]
+
+
+@over_leading_axes
+def beside_nodes(equilibrium: Equilibrium) -> Sides:
+    """Of an equilibrium on elements whose frames are unknown, on both sides of its nodes: at clips they jump."""
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, FrameForm)
+    s, strains, axial = strains_beside_nodes(form, point)
+    length = equilibrium.state.units.length
+    curvature = root(dot(strains[:2], strains[:2]))
+    return Sides(s * length, curvature / length, strains[2] / length, axial)
+
+
+@over_leading_axes
+def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    shape, units = equilibrium.state.shape, equilibrium.state.units
+    form, point = form_and_point(equilibrium)
+    if isinstance(shape, Polyline):
+        slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
+        return cubic(equilibrium.s, equilibrium.nodes, slopes, s)
+    positions = positions_between_nodes(form, point, shape.nodes, s / units.length)
+    return units.origin[None] + units.length * positions
+
+
+def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
+    scaled, _ = nondimensional(equilibrium.scene)
+    state = equilibrium.state
+    return form_of(scaled, state.shape), state.shape.point(state.end_force, equilibrium.total_twist)
+
+
+def describe(equilibrium: Equilibrium) -> str:
+    """How a solve ended, in words, what is special about the equilibrium, and the estimated errors of its mesh.
+
+    Of several: each with its count, and the largest errors of those that converged.
+    """
+    instance(equilibrium, "equilibrium", Equilibrium)
+    examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
+    converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
+    potential = np.full(converged.shape, has_potential(equilibrium.scene))
+    remarks = {
+        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
+        "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
+        "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
+        "pressed to nothing somewhere (axial strain below -1): EA is too small": np.any(axial_strain <= -1, axis=-1),
+        f"pressed into an obstacle by more than {MOST_PENETRATION:g} of the radius": _penetration(equilibrium)
+        > MOST_PENETRATION,
+    }
+    counts = {remark: int(np.sum(np.asarray(holds) & converged)) for remark, holds in remarks.items()}
+    strain = [_largest_strain(equilibrium)] if np.any(_is_overstretched(equilibrium)) else []
+    told = _errors_told(equilibrium)
+    if converged.ndim == 0:
+        special = [remark for remark, count in counts.items() if count]
+        return "; ".join([_outcome(equilibrium), *strain, *special, *told])
+    special = [f"{count} {remark}" for remark, count in counts.items() if count]
+    return "\n".join([_outcome(equilibrium), *strain, *special, *told])
+
+
+def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:
+    return np.asarray(equilibrium.status) == Status.OVERSTRETCHED
+
+
+def _largest_strain(equilibrium: Equilibrium) -> str:
+    """The largest |axial strain| among the overstretched rods, and where it is."""
+    strain = np.asarray(equilibrium.axial_strain)
+    size = np.where(_is_overstretched(equilibrium)[..., None], np.abs(strain), 0.0)
+    *case, node = np.unravel_index(np.argmax(size), size.shape)
+    place = f"{100 * strain[(*case, node)]:+.3g} % at s = {float(np.asarray(equilibrium.s)[(*case, node)]):.4g} m"
+    numbers = ", ".join(str(int(k)) for k in case)
+    return f"largest axial strain {place}" + (f" of case {numbers}" if case else "")
+
+
+def _errors_told(equilibrium: Equilibrium) -> list[str]:
+    """The estimated errors, of several the largest; nothing where there are none."""
+    converged = np.asarray(equilibrium.converged)
+    if equilibrium.discretization == "continuum" or not np.any(converged):
+        return []
+    errors = estimated_errors(equilibrium)
+    sizes = (
+        np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1),
+        errors.force,
+        _moment_error(errors),
+        errors.curvature,
+    )
+    shape, *others = (float(np.max(np.asarray(size)[converged])) for size in sizes)
+    force, moment, curvature = (f"{100 * error:.2g} %" for error in others)
+    return [
+        f"estimated errors on {equilibrium.s.shape[-1] - 1} segments: shape {shape:.1e} of the length, forces {force}, "
+        f"moments {moment}, curvature {curvature} of the largest"
+    ]
+
+
+def _outcome(equilibrium: Equilibrium) -> str:
+    codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
+    messages = {code: Status(code).message for code in codes}
+    if Status.PASSED_THROUGH in messages:
+        messages[Status.PASSED_THROUGH] += _passages(equilibrium)
+    if equilibrium.status.ndim == 0:
+        return (
+            f"{messages[codes[0]]}; residual {float(equilibrium.residual):.1e} EI/L^2 "
+            f"after {int(equilibrium.iterations)} iterations"
+        )
+    return "\n".join(f"{count} {messages[code]}" for code, count in zip(codes, counts, strict=True))
+
+
+def _passages(equilibrium: Equilibrium) -> str:
+    """Which obstacles those that came through one did, and where."""
+    found = _passage_of(equilibrium)
+    passed = np.argwhere((np.asarray(equilibrium.status) == Status.PASSED_THROUGH) & ~np.asarray(found.is_sound))
+    named = []
+    for index in map(tuple, passed[:MOST_NAMED]):
+        k, length = int(found.obstacle[index]), float(equilibrium.scene.rod.length[index])
+        how = "within" if found.is_within[index] else "through"
+        which = f"{list(map(int, index))}: " if index else ""
+        kind = type(equilibrium.scene.obstacles[k]).__name__
+        named.append(f"{which}{how} obstacles[{k}] ({kind}) at s = {float(found.place[index]) * length:.4g} m")
+    more = [f"and {len(passed) - MOST_NAMED} more"] if len(passed) > MOST_NAMED else []
+    return "".join(f" ({part})" for part in [", ".join([*named, *more])] if part)
+
+
+@over_leading_axes
+def _passage_of(equilibrium: Equilibrium) -> Passage:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, TouchingForm)
+    state = equilibrium.state
+    if state.before is None:  # of a file of an earlier version
+        return Passage(jnp.full((), -1), jnp.full_like(equilibrium.residual, jnp.nan), jnp.array(False))
+    found, _ = passage_to(form, point, state.shape.nodes, state.units, state.before)
+    return found
+
+
+def passage_to(
+    form: TouchingForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
+) -> tuple[Passage, Before]:
+    """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
+    points, radius, held = form.places(nodes, point)
+    points, held = (units.origin[None] + units.length * place for place in (points, held))
+    obstacles = tuple(obstacle.obstacle for obstacle in form.scene.obstacles if isinstance(obstacle, InUnits))
+    found = passage(before, points, obstacles, units.length * radius, held)
+    return found, Before(points, obstacles)
+
+
+def warn_if_coarse(equilibrium: Equilibrium) -> None:
+    """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that."""
+    curvature, s = np.asarray(equilibrium.curvature), np.asarray(equilibrium.s)
+    turn = np.maximum(curvature[..., 1:], curvature[..., :-1]) * (s[..., 1:] - s[..., :-1])
+    if equilibrium.discretization == "finite_difference":
+        turn = 2 * np.arctan(turn / 2)  # their curvature is 2 tan(turn/2)/h
+    is_coarse = (turn > MOST_TURN[equilibrium.discretization]).any(-1)
+    if not is_coarse.any():
+        return
+    is_coarse &= np.asarray(equilibrium.converged)
+    if is_coarse.any():
+        many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
+        most = f"{np.max(turn[is_coarse]):.1f} rad"
+        warn(
+            f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {most} along one of them; "
+            "more segments, or rtol in the place of segments, may help; rodjax.describe tells the errors",
+            MeshWarning,
+        )
+
+
+@functools.cache
+def warn_of_unknown_mesh(segments: int) -> None:
+    """Once in a process: where numbers are not known, no error can be looked at and no mesh chosen."""
+    warn(
+        f"the mesh is one of {segments} segments, whatever its errors, as numbers are not known inside jax.jit, vmap "
+        "or grad: values and derivatives differ by those errors from what the same solve gives outside, on a mesh "
+        "chosen for rtol; segments= states a mesh (this is said once)",
+        MeshWarning,
+    )
+
+
+def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT) -> None:
+    """Where statuses are known, of those that are not converged and of those above a strain."""
+    if not is_known(equilibrium.status):
+        return
+    status = np.asarray(equilibrium.status)
+    if not status.any():  # all CONVERGED
+        return
+    if not np.all(np.asarray(equilibrium.converged)):
+        warn(_outcome(equilibrium), NotConvergedWarning)
+    is_overstretched = status == Status.OVERSTRETCHED
+    # In the continuum strains may be traced where the status is not.
+    if not is_overstretched.any() or not is_known(equilibrium.axial_strain, strain_limit):
+        return
+    count = int(np.sum(is_overstretched))
+    rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
+    warn(
+        f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}",
+        OverstretchedWarning,
+    )

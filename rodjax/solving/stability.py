@@ -1,0 +1,152 @@
+"""How firmly an equilibrium stands: whether its softest motion has any stiffness left."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.forms import form_of
+from rodjax.discretization.joints import generic_field
+from rodjax.discretization.motion import Motion, neutral_turn
+from rodjax.discretization.shape import Shape
+from rodjax.geometry.vectors import components
+from rodjax.linalg.saddle_point import AnyFactors, factor, factor_and_solve
+from rodjax.model.scene import Scene
+
+# Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
+SHIFT_ROUNDINGS = 100.0
+# The most of it, in single precision: a thousandth of the softest bending mode's pi^2.
+MOST_SHIFT = 0.01
+# At a fold the residual is the square of the softest stiffness, over twice its change along that motion: up to this
+# multiple of the residual the square may be nothing but what was left unsolved.
+CRITICAL = 100.0
+# A solution that leaves more than this part of the right side is none.
+MOST_LEFT = 1e-3
+# The lowest eigenvalue is bracketed by powers of this factor, by so many at most, halved so often, and then found by
+# so many inverse iterations.
+BRACKET_GROWTH = 4.0
+MAX_BRACKETS = 30
+HALVINGS = 16
+INVERSE_ITERATIONS = 4
+
+
+def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
+    """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
+
+    The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
+    carried there.
+    """
+    form = form_of(scene, shape)
+    begin = form.holding(point)
+    if motion is None:
+        return form, begin
+    force_change = form.layout.forces(form.closure(motion.multipliers))
+    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
+
+
+def examined(
+    form: Form, point: Point, here: Linearization, residual: Float[Array, ""]
+) -> tuple[AnyFactors, Bool[Array, ""], Motion]:
+    """The factors at an equilibrium, whether it is critical, and its neutral turn, or no motion where it has none.
+
+    Critical: a motion other than the neutral one has no stiffness left, as far as the residual allows to tell.
+    """
+    places = point.tangents.shape[1]
+    # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
+    shift = min(SHIFT_ROUNDINGS * float(jnp.finfo(residual.dtype).eps) * 4 * places**2, MOST_SHIFT)
+    shift = jnp.asarray(shift, residual.dtype)
+    generic = components(here.bases, generic_field(point.tangents))
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+    # The first step of the inverse iteration in one sweep with the factorisation.
+    system = here.system.shifted(shift / places)
+    factors, softer, multipliers = factor_and_solve(system, generic / places, nothing.multipliers)
+    # Which motions are soft is a matter of the point alone; only the factors are differentiated.
+    form, point, here, residual, generic = jax.lax.stop_gradient((form, point, here, residual, generic))
+    system, softer, multipliers = jax.lax.stop_gradient((system, softer, multipliers))
+    stiffness = _stiffness(generic, softer)
+    # By symmetry a part of a rod that can turn may be as neutral as all of it, which leaves no digit of the solution.
+    left = jnp.max(jnp.abs(system.times(softer, multipliers)[0] - generic / places))
+    is_lost = jnp.isfinite(left) & (left > MOST_LEFT * jnp.max(jnp.abs(generic)) / places)
+    least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
+
+    def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
+        return (stiffness**2 <= least) | ~jnp.isfinite(stiffness)
+
+    def closer(fixed: tuple[Form, Point, Linearization, AnyFactors]) -> tuple[Bool[Array, ""], Motion]:
+        form, point, here, factors = fixed
+        # Under a dead moment, without symmetry of the system, no turn is looked for.
+        neutral = neutral_turn(form, point, here) if form.has_potential else nothing
+        other = Motion(generic, nothing.multipliers).without(neutral).rotation
+        softest = Motion(*factors.solve(other / places, nothing.multipliers)).without(neutral)
+        return is_soft(_stiffness(other, softest.rotation)) & ~is_lost, neutral
+
+    fixed = (form, point, here, jax.lax.stop_gradient(factors))
+    critical, neutral = jax.lax.cond(is_soft(stiffness) | is_lost, closer, lambda _: (jnp.array(False), nothing), fixed)
+    return factors, critical, neutral
+
+
+def _stiffness(generic: Float[Array, "b m"], softer: Float[Array, "b m"]) -> Float[Array, ""]:
+    """Rayleigh's quotient [EI/L^2 per rad and length] of what a generic motion becomes by a step of inverse iteration.
+
+    That of the softest motion, where this is much softer than all others; never less.
+    """
+    return jnp.sum(generic * softer) / jnp.sum(softer**2)
+
+
+def softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
+    """The lowest eigenvalue [EI/L^2] of the Hessian under the constraints, by the length of rod, and its motion.
+
+    The derivative of the eigenvalue is that of Rayleigh's quotient of its motion, which is stationary at it; of two
+    equal eigenvalues that of one motion. The motion has none.
+    """
+    stiffness, motion = _softest(*jax.lax.stop_gradient((form, point, here)))
+    moments, gaps = here.system.times(motion.rotation, motion.multipliers)
+    work = jnp.sum(motion.rotation * moments) + jnp.sum(motion.multipliers * gaps)
+    quotient = work / jnp.sum(_inertia(form, here)[None] * motion.rotation**2)
+    return stiffness + quotient - jax.lax.stop_gradient(quotient), motion
+
+
+def _inertia(form: Form, here: Linearization) -> Float[Array, "m"]:
+    """By the length of rod; none where a support holds the tangent."""
+    return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+
+
+def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
+    """The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion."""
+    mass = _inertia(form, here)
+    one = jnp.ones((), mass.dtype)
+
+    def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
+        return factor(here.system.shifted(-value * mass)).negative > 0
+
+    # Outwards from zero until the sign changes, then by halves.
+    sign = jnp.where(lies_below(0 * one), -1.0, 1.0).astype(one.dtype)
+    width = jax.lax.while_loop(
+        lambda width: (lies_below(sign * width) == (sign < 0)) & (width < BRACKET_GROWTH**MAX_BRACKETS),
+        lambda width: BRACKET_GROWTH * width,
+        one,
+    )
+    inner = jnp.where(width > 1, width / BRACKET_GROWTH, 0.0)
+    bounds = jnp.minimum(sign * inner, sign * width), jnp.maximum(sign * inner, sign * width)
+
+    def halved(_, bounds: tuple[Float[Array, ""], Float[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        low, high = bounds
+        middle = (low + high) / 2
+        is_below = lies_below(middle)
+        return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
+
+    low, high = jax.lax.fori_loop(0, HALVINGS, halved, bounds)
+    low -= high - low
+    factors = factor(here.system.shifted(-low * mass))
+    generic = components(here.bases, generic_field(point.tangents))
+    first = Motion(generic, jnp.zeros_like(here.closure)), low
+
+    def closer(_, found: tuple[Motion, Float[Array, ""]]) -> tuple[Motion, Float[Array, ""]]:
+        motion, _ = found
+        motion = Motion(*factors.solve(mass[None] * motion.rotation, jnp.zeros_like(here.closure)))
+        size = jnp.sqrt(jnp.sum(mass[None] * motion.rotation**2))
+        share = jnp.sum(mass[None] * motion.rotation * found[0].rotation)
+        return Motion(motion.rotation / size, motion.multipliers / size), low + share / size**2
+
+    motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
+    return stiffness, motion

@@ -1,0 +1,29 @@
+"""sweep(): one scene file over a grid or table of its values, streamed to one HDF5 file; merge(): shards put together.
+
+A sweep of any size runs in bounded memory, chunk by chunk, and goes on after a kill where it stopped.
+
+**The values.** Keys are those of the scene file with dots, `rod.EI` or `loads.point_force.0.at`; one component of a
+vector goes by its number, `end.position.2`. Values are as the scene file has them, or plain numbers in SI units. A
+grid is TOML; its cases are the product of all keys, the last key fastest:
+
+    "rod.EI" = [0.004, 0.005]
+    "end.position" = ["[70, 0, 0] cm", [0.8, 0, 0]]
+    "rod.length" = { from = "0.9 m", to = 1.2, count = 11 }                      # equal steps
+    "rod.EA" = { from = "80 N", to = "8 kN", count = 3, spacing = "log" }        # equal factors
+
+A table is CSV: a header of keys, then one row a case. Cases count from 0. All are solved on the mesh of
+`[solve] segments`; without it, on as many equal segments as the first case needs for `[solve] rtol`, and those that
+need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the finest is counted.
+
+**The result**, HDF5, first axis the case: `case` its number, `status`, `converged`, `stable`, `iterations`, `residual`,
+`error_estimate`, `force_error`, `moment_error`, `curvature_error` of the mesh, `energy`, `elastic_energy`,
+`total_twist`, `start_force`, `start_moment`, `end_force`, `end_moment`, `nodes` (cases, segments + 1, 3), as in
+`rodjax.Equilibrium`, `segments` of the mesh of each case (its `nodes` are those that the coarsest mesh has), and
+`parameters/<key>` in SI units; each has the attributes `units` and `description`. Attributes of the file: the texts
+`scene` and `over`, and what is in `rodjax.sweep.sweep.Manifest`, with its `fingerprint`.
+
+**On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
+solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
+the shard and wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and
+the same bits in the end.
+"""

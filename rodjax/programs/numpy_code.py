@@ -20,8 +20,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from rodjax.programs import numpy_operations
 
 Values = tuple[Any, ...]
-# The names of results, one for each result of an equation.
-Names = list[str]
+# So many numbers of a result of constants are made when the program is written, and not each time it runs.
+LARGEST_CONSTANT = 4096
 
 
 class NotInNumpyError(Exception):
@@ -79,6 +79,7 @@ class _Writer:
     def __init__(self) -> None:
         self.lines: list[str] = []
         self.constants: list[Any] = []
+        self.space: dict[str, Any] = {"np": np, "op": numpy_operations}
         self._names_of_constants: dict[Any, str] = {}
         self._functions: dict[int, tuple[str, Any]] = {}
 
@@ -93,8 +94,9 @@ class _Writer:
                 value = value[()]
             key = value.dtype.str, value.shape, value.tobytes()
         if key not in self._names_of_constants:
-            self._names_of_constants[key] = f"k{len(self.constants)}"
+            name = self._names_of_constants[key] = f"k{len(self.constants)}"
             self.constants.append(value)
+            self.space[name] = value
         return self._names_of_constants[key]
 
     def function(self, program: ClosedJaxpr | Jaxpr, name: str | None = None) -> str:
@@ -171,6 +173,8 @@ class _Body:
         if primitive in ELEMENTWISE:
             given = [self.any(v) for v in equation.invars]
             expression = ELEMENTWISE[primitive](self, equation, *given)
+            if all(map(_is_constant, given)) and self.fold(equation, expression):
+                return
             shape = results[0].aval.shape
             if shape and not any(v.aval.shape == shape and not self.is_partial(v) for v in equation.invars):
                 self.partial.add(results[0])
@@ -182,6 +186,8 @@ class _Body:
             raise NotInNumpyError(primitive)
         given = [self.full(v) for v in equation.invars]
         expression = OTHERS[primitive](self, equation, *given)
+        if primitive not in INNER and all(map(_is_constant, given)) and self.fold(equation, expression):
+            return
         targets = ", ".join(self.new(v) for v in results)
         if isinstance(expression, str):
             if equation.primitive.multiple_results:
@@ -191,29 +197,35 @@ class _Body:
             # Line by line where a name would be given away before it is used.
             self.lines.append(f" {targets}, = {', '.join(expression)}," if results else " pass")
 
-    def broadcast(self, equation: Any) -> None:
-        (given, *_) = equation.invars
+    def fold(self, equation: Any, expression: Any) -> bool:
+        """Whether a result is a constant itself: one of constants that does not take much room."""
+        if equation.primitive.multiple_results or equation.outvars[0].aval.size > LARGEST_CONSTANT:
+            return False
+        with np.errstate(all="ignore"):
+            value = eval(expression, self.writer.space)
         (result,) = equation.outvars
-        shape, dims = equation.params["shape"], equation.params["broadcast_dimensions"]
-        name = self.any(given)
-        old = given.aval.shape
-        is_partial = self.is_partial(given)
-        if not old:
-            expression = name
-        else:
-            if is_partial:
-                name = self.full(given)
-                is_partial = False
-            axes = [1] * len(shape)
-            for axis, size in zip(dims, old, strict=True):
-                axes[axis] = size
-            expression = name if tuple(axes) == tuple(old) else f"{name}.reshape({self.writer.constant(tuple(axes))})"
-            if tuple(axes) == tuple(shape):
-                self.lines.append(f" {self.new(result)} = {expression}")
-                return
-        if shape:
+        self.names[result] = self.writer.constant(np.broadcast_to(value, result.aval.shape))
+        return True
+
+    def broadcast(self, equation: Any) -> None:
+        (given, *_), (result,) = equation.invars, equation.outvars
+        shape = equation.params["shape"]
+        axes = [1] * len(shape)
+        for axis, size in zip(equation.params["broadcast_dimensions"], given.aval.shape, strict=True):
+            axes[axis] = size
+        # A number broadcasts to any shape.
+        name = self.full(given) if given.aval.shape else self.any(given)
+        is_same = tuple(axes) == given.aval.shape or not given.aval.shape
+        expression = name if is_same else f"{name}.reshape({self.writer.constant(tuple(axes))})"
+        if _is_constant(name) and self.fold(equation, expression):
+            return
+        if tuple(axes) != tuple(shape) or (shape and not given.aval.shape):
             self.partial.add(result)
         self.lines.append(f" {self.new(result)} = {expression}")
+
+
+def _is_constant(name: str) -> bool:
+    return name.startswith("k")
 
 
 Rule = Callable[..., Any]
@@ -356,23 +368,27 @@ MOVES = (jax.lax.GatherScatterMode.CLIP, jax.lax.GatherScatterMode.PROMISE_IN_BO
 
 def _gather(body: _Body, equation: Any, x: str, starts: str) -> str:
     params, dims = equation.params, equation.params["dimension_numbers"]
-    dtype = np.dtype(equation.outvars[0].aval.dtype)
-    missing = None
-    if params["mode"] not in MOVES:
-        missing = params["fill_value"]
-        if missing is None:
-            missing = np.nan if dtype.kind == "f" else True if dtype.kind == "b" else _unlikely(dtype)
-        missing = dtype.type(missing)
-    fixed = [
-        equation.outvars[0].aval.shape,
-        tuple(params["slice_sizes"]),
-        dims.offset_dims,
-        dims.collapsed_slice_dims,
+    operand, where = (v.aval.shape for v in equation.invars)
+    result = equation.outvars[0].aval
+    moves = params["mode"] in MOVES
+    missing = params["fill_value"]
+    if missing is None:
+        kind = np.dtype(result.dtype)
+        missing = np.nan if kind.kind == "f" else True if kind.kind == "b" else _unlikely(kind)
+    windows = numpy_operations.Windows(
+        operand,
+        params["slice_sizes"],
+        where[:-1],
         dims.start_index_map,
+        dims.collapsed_slice_dims,
         dims.operand_batching_dims,
         dims.start_indices_batching_dims,
-        missing,
-    ]
+        moves,
+    )
+    # Axes of the result, as they stand in what was picked: those of the starts, then those of a window.
+    others = [axis for axis in range(result.ndim) if axis not in dims.offset_dims]
+    order = tuple(int(k) for k in np.argsort([*others, *dims.offset_dims]))
+    fixed = [windows, order, np.asarray(missing, result.dtype)]
     return f"op.gather({', '.join([x, starts, *map(body.writer.constant, fixed)])})"
 
 
@@ -384,24 +400,31 @@ def _unlikely(dtype: np.dtype) -> int:
 
 def _scatter(combine: str) -> Rule:
     def rule(body: _Body, equation: Any, x: str, starts: str, updates: str) -> str:
-        params, dims = equation.params, equation.params["dimension_numbers"]
-        fixed = [
-            dims.update_window_dims,
-            dims.inserted_window_dims,
+        dims = equation.params["dimension_numbers"]
+        operand, where, new = (v.aval.shape for v in equation.invars)
+        others = [axis for axis in range(len(new)) if axis not in dims.update_window_dims]
+        left_out = {*dims.inserted_window_dims, *dims.operand_batching_dims}
+        sizes = iter(new[axis] for axis in dims.update_window_dims)
+        windows = numpy_operations.Windows(
+            operand,
+            [1 if axis in left_out else next(sizes) for axis in range(len(operand))],
+            where[:-1],
             dims.scatter_dims_to_operand_dims,
+            dims.inserted_window_dims,
             dims.operand_batching_dims,
             dims.scatter_indices_batching_dims,
-            params["mode"] in MOVES,
-        ]
+            equation.params["mode"] in MOVES,
+        )
+        fixed = [windows, (*others, *dims.update_window_dims)]
         return f"op.scatter({', '.join([x, starts, updates, combine, *map(body.writer.constant, fixed)])})"
 
     return rule
 
 
 def _dot_general(body: _Body, equation: Any, a: str, b: str) -> str:
-    (contracted, batched) = equation.params["dimension_numbers"]
-    fixed = [tuple(map(tuple, contracted)), tuple(map(tuple, batched))]
-    product = f"op.dot_general({', '.join([a, b, *map(body.writer.constant, fixed)])})"
+    shapes = tuple(v.aval.shape for v in equation.invars)
+    plan = numpy_operations.Product(shapes, *equation.params["dimension_numbers"])
+    product = f"{body.writer.constant(plan)}({a}, {b})"
     new = equation.params["preferred_element_type"]
     if new is None or new == equation.invars[0].aval.dtype:
         return product
@@ -541,7 +564,23 @@ ELEMENTWISE: dict[str, Rule] = {
     "reduce_precision": lambda body, equation, x: x,
 }
 
+# Those whose code calls other functions of the program.
+INNER: dict[str, Rule] = {
+    "jit": _inner("jaxpr"),
+    "pjit": _inner("jaxpr"),
+    "closed_call": _inner("call_jaxpr"),
+    "core_call": _inner("call_jaxpr"),
+    "custom_jvp_call": _inner("call_jaxpr"),
+    "custom_vjp_call": _inner("call_jaxpr"),
+    "checkpoint": _inner("jaxpr"),
+    "while": _while,
+    "scan": _scan,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}
+
 OTHERS: dict[str, Rule] = {
+    **INNER,
     "reduce_sum": _reduce("np.add"),
     "reduce_prod": _reduce("np.multiply"),
     "reduce_max": _reduce("np.maximum"),
@@ -583,18 +622,7 @@ OTHERS: dict[str, Rule] = {
     "lu_pivots_to_permutation": _operation("permutation", "permutation_size"),
     "triangular_solve": _triangular_solve,
     "eigh": lambda body, equation, x: f"op.eigh({x}, {equation.params['lower']})",
-    "jit": _inner("jaxpr"),
-    "pjit": _inner("jaxpr"),
-    "closed_call": _inner("call_jaxpr"),
-    "core_call": _inner("call_jaxpr"),
-    "custom_jvp_call": _inner("call_jaxpr"),
-    "custom_vjp_call": _inner("call_jaxpr"),
-    "checkpoint": _inner("jaxpr"),
-    "while": _while,
-    "scan": _scan,
-    "cond": _cond,
     "platform_index": _platform_index,
-    "custom_linear_solve": _linear_solve,
     "optimization_barrier": _same,
     "device_put": _same,
 }

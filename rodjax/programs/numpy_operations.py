@@ -153,100 +153,87 @@ def dynamic_update_slice(x: np.ndarray, update: np.ndarray, starts: Values) -> n
 # --- places ----------------------------------------------------------------------------------------------------------
 
 
-def _places(
-    shape: tuple[int, ...],
-    starts: np.ndarray,
-    windows: Sequence[int],
-    mapped: Sequence[int],
-    fixed: Sequence[int],
-    batched: Sequence[int],
-    batched_starts: Sequence[int],
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Of each axis of an array the places that windows take, over the axes of `starts` and then those of a window; and
-    which windows lie within the array. Windows beyond it are moved into it.
+class Windows:
+    """Where windows of an array of a shape lie that begin at given starts, as `gather` and `scatter` have them.
 
-    `windows`: their size along each axis; `mapped`: the axes that the numbers of `starts` speak of; `fixed`: axes of
-    the array that windows lack; `batched`: axes that go with the axes `batched_starts` of `starts`.
+    `sizes`: of a window along each axis; `mapped`: the axes of the array that the numbers of a start speak of; `fixed`:
+    those that windows lack; `batched`: those that go with the axes `batched_starts` of the starts; `moves`: whether
+    windows beyond the array are moved into it, not left out.
     """
-    outer = starts.ndim - 1
-    inner = [axis for axis in range(len(shape)) if axis not in fixed and axis not in batched]
-    is_within = np.ones(starts.shape[:-1], bool)
-    places = []
-    for axis, (n, size) in enumerate(zip(shape, windows, strict=True)):
-        if axis in batched:
-            own = batched_starts[list(batched).index(axis)]
-            place = np.arange(n).reshape([-1 if k == own else 1 for k in range(outer)])
-        elif axis in mapped:
-            place = starts[..., list(mapped).index(axis)].astype(np.intp)
-            is_within &= (place >= 0) & (place <= n - size)
-            place = np.clip(place, 0, n - size)
-        else:
-            place = np.zeros((1,) * outer, np.intp)
-        place = place.reshape(place.shape + (1,) * len(inner))
-        if axis in inner and size > 1:
-            along = outer + inner.index(axis)
-            place = place + np.arange(size).reshape([-1 if k == along else 1 for k in range(outer + len(inner))])
-        places.append(place)
-    return places, is_within
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        sizes: Sequence[int],
+        outer: tuple[int, ...],
+        mapped: Sequence[int],
+        fixed: Sequence[int],
+        batched: Sequence[int],
+        batched_starts: Sequence[int],
+        moves: bool,
+    ):
+        inner = [axis for axis in range(len(shape)) if axis not in fixed and axis not in batched]
+        count = len(outer) + len(inner)
+        self.shape = (*outer, *(sizes[axis] for axis in inner))
+        self.ones = (1,) * len(inner)
+        self.moves = moves
+        # Of each axis: which number of a start, the last place where a window fits, and places from there.
+        self.axes: list[tuple[int | None, int, np.ndarray | int]] = []
+        for axis, (n, size) in enumerate(zip(shape, sizes, strict=True)):
+            places: np.ndarray | int = 0
+            if axis in batched:
+                places = _line(n, batched_starts[list(batched).index(axis)], count)
+            elif axis in inner and size > 1:
+                places = _line(size, len(outer) + inner.index(axis), count)
+            self.axes.append((list(mapped).index(axis) if axis in mapped else None, n - size, places))
+
+    def places(self, starts: np.ndarray) -> tuple[tuple[np.ndarray | int, ...], Any]:
+        """Of each axis the places, over the axes of the starts and then those of a window; and which windows lie
+        within the array, `True` where that does not matter.
+        """
+        is_within: Any = True
+        index: list[np.ndarray | int] = []
+        for number, last, places in self.axes:
+            if number is not None:
+                first = starts[..., number]
+                if not self.moves:
+                    is_within &= (first >= 0) & (first <= last)
+                first = np.minimum(np.maximum(first, 0), last)
+                places = first.reshape(first.shape + self.ones) + places
+            index.append(places)
+        return tuple(index), True if is_within is True or is_within.all() else is_within
 
 
-def gather(
-    x: Any,
-    starts: np.ndarray,
-    shape: tuple[int, ...],
-    sizes: Sequence[int],
-    offset_dims: Sequence[int],
-    collapsed: Sequence[int],
-    mapped: Sequence[int],
-    batched: Sequence[int],
-    batched_starts: Sequence[int],
-    missing: Any,
-) -> np.ndarray:
-    """`shape`: of the result; `missing`: what stands for a window beyond the array, `None` where such are moved."""
-    x = np.asarray(x)
-    places, is_within = _places(x.shape, starts, sizes, mapped, collapsed, batched, batched_starts)
-    outer = starts.ndim - 1
-    inner = len(offset_dims)
-    others = [axis for axis in range(len(shape)) if axis not in offset_dims]
-    whole = [shape[axis] for axis in others] + [shape[axis] for axis in offset_dims]
-    result = np.broadcast_to(x[tuple(places)], whole)
-    if missing is not None and not is_within.all():
-        result = np.where(is_within.reshape(is_within.shape + (1,) * inner), result, missing)
-    order = [
-        outer + list(offset_dims).index(axis) if axis in offset_dims else others.index(axis)
-        for axis in range(len(shape))
-    ]
+def _line(n: int, axis: int, count: int) -> np.ndarray:
+    """0 to n - 1 along one of so many axes."""
+    return np.arange(n).reshape([-1 if k == axis else 1 for k in range(count)])
+
+
+def gather(x: Any, starts: np.ndarray, windows: Windows, order: Sequence[int], missing: Any) -> np.ndarray:
+    """`order`: of the axes in the result; `missing`: what stands for a window beyond the array."""
+    places, is_within = windows.places(starts)
+    result = np.asarray(x)[places]
+    if result.shape != windows.shape:
+        result = np.broadcast_to(result, windows.shape)
+    if is_within is not True:
+        result = np.where(is_within.reshape(is_within.shape + windows.ones), result, missing)
     return result.transpose(order)
 
 
 def scatter(
-    x: Any,
-    starts: np.ndarray,
-    updates: Any,
-    combine: Any,
-    window_dims: Sequence[int],
-    inserted: Sequence[int],
-    mapped: Sequence[int],
-    batched: Sequence[int],
-    batched_starts: Sequence[int],
-    moves: bool,
+    x: Any, starts: np.ndarray, updates: Any, combine: Any, windows: Windows, order: Sequence[int]
 ) -> np.ndarray:
-    """`combine`: a ufunc, `None` to replace; `moves`: whether windows beyond the array are moved, not left out."""
-    result, updates = np.array(x), np.asarray(updates)
-    others = [axis for axis in range(updates.ndim) if axis not in window_dims]
-    updates = updates.transpose([*others, *window_dims])
-    sizes = iter(updates.shape[len(others) :])
-    windows = [1 if axis in inserted or axis in batched else next(sizes) for axis in range(result.ndim)]
-    places, is_within = _places(result.shape, starts, windows, mapped, inserted, batched, batched_starts)
-    if not moves and not is_within.all():
-        inner = (1,) * len(window_dims)
-        chosen = np.broadcast_to(is_within.reshape(is_within.shape + inner), updates.shape)
-        places = [np.broadcast_to(place, updates.shape)[chosen] for place in places]
+    """`combine`: a ufunc, `None` to replace; `order`: of the axes of the updates, those of the starts first."""
+    result, updates = np.array(x), np.asarray(updates).transpose(order)
+    places, is_within = windows.places(starts)
+    if is_within is not True:
+        chosen = np.broadcast_to(is_within.reshape(is_within.shape + windows.ones), updates.shape)
+        places = tuple(np.broadcast_to(place, updates.shape)[chosen] for place in places)
         updates = updates[chosen]
     if combine is None:
-        result[tuple(places)] = updates
+        result[places] = updates
     else:
-        combine.at(result, tuple(places), updates)
+        combine.at(result, places, updates)
     return result
 
 
@@ -284,24 +271,30 @@ def before_in_order(a: Any, b: Any, or_same: bool) -> Any:
     return a <= b if or_same else a < b
 
 
-def dot_general(
-    a: np.ndarray,
-    b: np.ndarray,
-    contracted: tuple[Sequence[int], Sequence[int]],
-    batched: tuple[Sequence[int], Sequence[int]],
-) -> Any:
-    free = [
-        [axis for axis in range(x.ndim) if axis not in over and axis not in along]
-        for x, over, along in zip((a, b), contracted, batched, strict=True)
-    ]
-    shape = [a.shape[axis] for axis in (*batched[0], *free[0])] + [b.shape[axis] for axis in free[1]]
-    outer = [a.shape[axis] for axis in batched[0]]
-    n = math.prod(a.shape[axis] for axis in contracted[0])
-    rows = math.prod(a.shape[axis] for axis in free[0])
-    columns = math.prod(b.shape[axis] for axis in free[1])
-    left = a.transpose([*batched[0], *free[0], *contracted[0]]).reshape([*outer, rows, n])
-    right = b.transpose([*batched[1], *contracted[1], *free[1]]).reshape([*outer, n, columns])
-    return np.matmul(left, right).reshape(shape)
+class Product:
+    """A contraction of two arrays as a product of matrices, for arrays of given shapes."""
+
+    def __init__(
+        self,
+        shapes: tuple[tuple[int, ...], tuple[int, ...]],
+        contracted: tuple[Sequence[int], Sequence[int]],
+        batched: tuple[Sequence[int], Sequence[int]],
+    ):
+        free = [
+            [axis for axis in range(len(shape)) if axis not in over and axis not in along]
+            for shape, over, along in zip(shapes, contracted, batched, strict=True)
+        ]
+        outer = [shapes[0][axis] for axis in batched[0]]
+        n = math.prod(shapes[0][axis] for axis in contracted[0])
+        self.orders = [*batched[0], *free[0], *contracted[0]], [*batched[1], *contracted[1], *free[1]]
+        rows, columns = ([shape[axis] for axis in axes] for shape, axes in zip(shapes, free, strict=True))
+        self.matrices = [*outer, math.prod(rows), n], [*outer, n, math.prod(columns)]
+        self.shape = [*outer, *rows, *columns]
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        left = a.transpose(self.orders[0]).reshape(self.matrices[0])
+        right = b.transpose(self.orders[1]).reshape(self.matrices[1])
+        return np.matmul(left, right).reshape(self.shape)
 
 
 # --- linear algebra --------------------------------------------------------------------------------------------------

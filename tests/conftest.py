@@ -11,6 +11,7 @@ import jax
 import pytest
 
 import rodjax
+from rodjax.programs import compilation
 
 # Before JAX's first program. Most of the tests' time is compiling: without optimisation half as long, and what is
 # compiled runs half as fast. `RODJAX_TESTS_OPTIMIZED` asks for programs as users have them.
@@ -41,6 +42,8 @@ rodjax.enable_compilation_cache()
 # Tests replace functions of the library, of which programs kept on disk would know nothing.
 os.environ["RODJAX_CACHE"] = "off"
 rodjax.keep_programs(False)
+# Few programs are called so often here that compiling them would pay.
+compilation.ANSWERS.is_patient = True
 
 
 def pytest_addoption(parser):

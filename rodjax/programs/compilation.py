@@ -58,12 +58,12 @@ class _Program:
         self.executable: Any = None
         self.code: AnswerCode | None = None
         self.traced: Any = None
-        self.answer = _answers.number
+        self.answer = ANSWERS.number
         self.seconds_left = math.inf
 
     def prepare(self, args: tuple, options: dict[str, Any]) -> None:
         """Finds or makes what the first call needs."""
-        if not _answers.by_numpy:
+        if not ANSWERS.by_numpy:
             return self._compile(args, options)
         if self.name is not None:
             self.code = kept.load_code(self.name)
@@ -97,8 +97,8 @@ class _Program:
 
     def _is_by_numpy(self) -> bool:
         """Within the answer for which it was made, as long as compiling would take longer."""
-        is_same = self.is_patient or _answers.is_patient or self.answer == _answers.number
-        return _answers.by_numpy and self.code is not None and is_same and self.seconds_left > 0
+        is_same = self.is_patient or ANSWERS.is_patient or self.answer == ANSWERS.number
+        return ANSWERS.by_numpy and self.code is not None and is_same and self.seconds_left > 0
 
     def _compile(self, args: tuple, options: dict[str, Any]) -> None:
         if self.name is not None:
@@ -163,7 +163,7 @@ class _Programs:
         if None in kinds:
             return self._by_jax(args, options)
         key = tree, kinds, statics, getattr(jax.config, PRECISION)
-        with _answers.one():
+        with ANSWERS.one():
             try:
                 program = self.known[key]
             except KeyError:
@@ -208,7 +208,7 @@ class _Answers:
                 self.depth -= 1
 
 
-_answers = _Answers()
+ANSWERS = _Answers()
 
 
 class numpy_first:  # noqa: N801 - called as a function
@@ -224,13 +224,13 @@ class numpy_first:  # noqa: N801 - called as a function
     def __init__(self, enabled: bool = True):
         if not isinstance(enabled, bool):
             raise TypeError(f"enabled must be True or False, got {shown(enabled)}")
-        self._before, _answers.by_numpy = _answers.by_numpy, enabled
+        self._before, ANSWERS.by_numpy = ANSWERS.by_numpy, enabled
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, *_: object) -> None:
-        _answers.by_numpy = self._before
+        ANSWERS.by_numpy = self._before
 
 
 def one_answer(function: F) -> F:
@@ -238,7 +238,7 @@ def one_answer(function: F) -> F:
 
     @functools.wraps(function)
     def answer(*args, **options):
-        with _answers.one():
+        with ANSWERS.one():
             return function(*args, **options)
 
     return cast(F, answer)

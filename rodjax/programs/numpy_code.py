@@ -182,11 +182,12 @@ class _Body:
             return
         if primitive == "broadcast_in_dim":
             return self.broadcast(equation)
-        if primitive not in OTHERS:
+        rule = OTHERS.get(primitive) or INNER.get(primitive)
+        if rule is None:
             raise NotInNumpyError(primitive)
         given = [self.full(v) for v in equation.invars]
-        expression = OTHERS[primitive](self, equation, *given)
-        if primitive not in INNER and all(map(_is_constant, given)) and self.fold(equation, expression):
+        expression = rule(self, equation, *given)
+        if primitive in OTHERS and all(map(_is_constant, given)) and self.fold(equation, expression):
             return
         targets = ", ".join(self.new(v) for v in results)
         if isinstance(expression, str):
@@ -580,7 +581,6 @@ INNER: dict[str, Rule] = {
 }
 
 OTHERS: dict[str, Rule] = {
-    **INNER,
     "reduce_sum": _reduce("np.add"),
     "reduce_prod": _reduce("np.multiply"),
     "reduce_max": _reduce("np.maximum"),
@@ -606,6 +606,9 @@ OTHERS: dict[str, Rule] = {
     "tile": _tile,
     "pad": _pad,
     "iota": _iota,
+    "empty2": lambda body, equation: (
+        f"np.empty({body.writer.constant(equation.outvars[0].aval.shape)}, {_dtype(body, equation)})"
+    ),
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,

@@ -353,18 +353,21 @@ def permutation(pivots: np.ndarray, size: int) -> np.ndarray:
 def triangular_solve(
     a: np.ndarray, b: np.ndarray, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool
 ) -> np.ndarray:
-    """x of op(a) x = b, or of x op(a) = b."""
-
-    def one(a: np.ndarray, b: np.ndarray) -> Values:
-        is_transposed = transpose_a == left_side
-        right = b if left_side else b.T
-        (trtrs,) = scipy.linalg.get_lapack_funcs(("trtrs",), (a, right))
-        x, info = trtrs(a, right, lower=lower, trans=int(is_transposed), unitdiag=unit_diagonal)
-        if info:  # a zero on the diagonal
-            x = np.full_like(right, np.nan)
-        return (x if left_side else x.T,)
-
-    return _each_matrix(one, a, b)[0]
+    """x of op(a) x = b, or of x op(a) = b; not a number where there is none."""
+    a = np.tril(a) if lower else np.triu(a)
+    if unit_diagonal:
+        places = np.arange(a.shape[-1])
+        a[..., places, places] = 1
+    if transpose_a == left_side:
+        a = np.swapaxes(a, -1, -2)
+    right = b if left_side else np.swapaxes(b, -1, -2)
+    # Not LAPACK's own routine for triangles, which starts threads for the smallest matrix.
+    try:
+        x = np.linalg.solve(a, right)
+    except np.linalg.LinAlgError:
+        is_regular = (np.diagonal(a, axis1=-2, axis2=-1) != 0).all(-1)[..., None, None]
+        x = np.where(is_regular, np.linalg.solve(np.where(is_regular, a, np.eye(a.shape[-1])), right), np.nan)
+    return x if left_side else np.swapaxes(x, -1, -2)
 
 
 def eigh(x: np.ndarray, lower: bool) -> Values:

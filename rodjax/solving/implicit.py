@@ -20,6 +20,7 @@ from rodjax.discretization.forms import form_of
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
 from rodjax.model.scene import Scene, nondimensional, slid, sliding_places
+from rodjax.programs.linear import linear
 from rodjax.solving.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
 from rodjax.solving.stability import carried_to, examined
 from rodjax.solving.status import Outcome
@@ -56,7 +57,7 @@ def _(primals, tangents):
     return value, _change_of_result(*jax.lax.optimization_barrier((scene, value)), scene_change)
 
 
-@jax.jit
+@linear
 def _change_of_result(scene: Scene, result: Equilibrium, scene_change: Scene) -> Equilibrium:
     mapped = _change_of_one
     for _ in range(result.s.ndim - 1):

@@ -14,6 +14,7 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clip
 from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
+from rodjax.programs.compilation import numpy_first
 from rodjax.solving.equilibrium import solve
 from rodjax.solving.result import Equilibrium, describe
 
@@ -65,4 +66,6 @@ def warm(jobs: dict[str, Callable[[], object]], progress: bool) -> None:
         warnings.simplefilter("ignore")
         for name, job in bar:
             bar.set_description(name)
-            job()
+            job()  # what a first answer needs
+            with numpy_first(False):  # and all others
+                job()

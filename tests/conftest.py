@@ -78,6 +78,13 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 
 
+@pytest.fixture
+def compiled_at_once():
+    """No first answers from NumPy code."""
+    with rodjax.numpy_first(False):
+        yield
+
+
 @pytest.fixture(scope="session")
 def cable() -> rodjax.Rod:
     """Cable C: 1 m long, 10 mm thick, EI = 4.9087e-3 N m^2, GJ/EI = 2/3, EA L^2/EI = 1.6e5."""

@@ -12,7 +12,7 @@ from rodjax.programs import compilation
 
 def test_the_cache_is_filled(tmp_path):
     code = (
-        "import sys, rodjax as rj; print(rj.enable_compilation_cache(sys.argv[1]));"
+        "import sys, rodjax as rj; rj.numpy_first(False); print(rj.enable_compilation_cache(sys.argv[1]));"
         "rj.solve(rj.problems.cantilever(0.1), segments=4)"
     )
     folder = tmp_path / "new" / "folder"
@@ -22,7 +22,7 @@ def test_the_cache_is_filled(tmp_path):
 
 
 @pytest.mark.skipif(compilation._most_maps() is None, reason="Linux alone counts the memory maps of a process")
-def test_programs_are_dropped_before_the_process_has_too_many_maps(monkeypatch, caplog):
+def test_programs_are_dropped_before_the_process_has_too_many_maps(monkeypatch, caplog, compiled_at_once):
     """Without, some hundred meshes crash it: here as many as fit beside those that are there already."""
 
     def solve(segments: int) -> rj.Equilibrium:

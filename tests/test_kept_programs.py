@@ -17,22 +17,25 @@ import rodjax as rj
 from rodjax.programs import kept
 from rodjax.programs.compilation import compiled
 
-# Solves, and says how many programs were compiled for that and where the rod is. Under a moment LAPACK takes part.
+# Solves, and says how many programs were traced and compiled for that and where the rod is. Under a moment LAPACK takes
+# part.
 SCRIPT = """
 import jax; jax.config.update("jax_enable_x64", True)
 import rodjax as rj
-compiled = [0]
-def listen(name, *_, **more): compiled[0] += name.endswith("backend_compile_duration")
+traced, compiled = [0], [0]
+def listen(name, *_, **more):
+    compiled[0] += name.endswith("backend_compile_duration")
+    traced[0] += name.endswith("jaxpr_trace_duration")
 jax.monitoring.register_event_duration_secs_listener(listen)
 clamp = rj.Clamp((0, 0, 0), rj.frame(tangent=(1, 0, 0)))
 result = rj.solve(rj.Scene(rj.Rod(1.0, 1.0, 1.0, 1e4), clamp, rj.Free(moment=(0.1, 0.2, 0.3))), segments=4)
-print(compiled[0], result.nodes.tolist())
+print(traced[0], compiled[0], result.nodes.tolist())
 """
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A new folder in which programs are kept, without JAX's cache: what comes from there cannot be."""
+def folder(tmp_path, compiled_at_once):
+    """A new folder in which executables are kept, without JAX's cache: what comes from there cannot be."""
     jaxs = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
@@ -56,20 +59,40 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.program"))
 
 
-def test_another_process_compiles_nothing(tmp_path):
-    def run() -> tuple[int, str]:
+@pytest.mark.parametrize("first", ["on", "off"])
+def test_another_process_neither_traces_nor_compiles(tmp_path, first):
+    def run() -> tuple[int, int, str]:
         settings = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-        settings["RODJAX_CACHE"] = str(tmp_path)
+        settings |= {"RODJAX_CACHE": str(tmp_path), "RODJAX_NUMPY_FIRST": first}
         done = subprocess.run(
             [sys.executable, "-c", SCRIPT], env=settings, capture_output=True, text=True, check=True, timeout=300
         )
-        count, said = done.stdout.split(" ", 1)
-        return int(count), said
+        traces, programs, said = done.stdout.split(" ", 2)
+        return int(traces), int(programs), said
 
-    (first, there), (second, again) = run(), run()
-    assert first >= 2
-    assert second == 0
-    assert there == again
+    (traces, programs, there), (traced_again, again, here) = run(), run()
+    assert traces >= 2
+    assert programs >= 2 if first == "off" else programs == 0
+    assert again == 0
+    # Where an executable calls LAPACK, JAX prepares that by tracing a call of its own.
+    assert traced_again == (first == "off")
+    assert there == here
+    assert {path.suffix for path in tmp_path.iterdir()} == {".program" if first == "off" else ".numpy"}
+
+
+def test_code_is_kept_and_found_by_its_arguments(folder):
+    """First answers come from the code, also in another process, and the executable is made when asked for again."""
+    x = np.arange(3.0)
+    with rj.numpy_first():
+        np.testing.assert_array_equal(program()(x)["scaled"], [0, 2, 4])
+        assert [path.suffix for path in folder.iterdir()] == [".numpy"]
+        # As if by another version of the source: what is kept under that name is taken.
+        other = program(scale=5.0)
+        np.testing.assert_array_equal(other(x)["scaled"], [0, 2, 4])
+        np.testing.assert_array_equal(other(np.arange(4.0))["scaled"], [0, 5, 10, 15])
+    assert len(list(folder.glob("*.numpy"))) == 2
+    np.testing.assert_array_equal(other(np.arange(4.0))["scaled"], [0, 5, 10, 15])
+    assert len(files(folder)) == 1
 
 
 def test_a_program_is_found_by_its_arguments(folder):

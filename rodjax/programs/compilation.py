@@ -106,7 +106,7 @@ class _Program:
         if self.executable is None:
             traced = self.traced or self.run.trace(*args, **options)
             with waiting():
-                self.executable, is_new = kept.compile_lowered(traced.lower())
+                self.executable, is_new = kept.compile_lowered(traced.lower(), QUICK if _knows_quick() else None)
             if is_new and self.name is not None:
                 kept.store(self.name, self.executable)
         self.code = self.traced = None
@@ -170,7 +170,7 @@ class _Programs:
                 name = None
                 if kept.is_keeping():
                     name = kept.name_of(self.name, QUICK, statics, tree, kinds)
-                program = _Program(self.quick if _knows_quick() else self.part, tree, name, self.is_patient)
+                program = _Program(self.part, tree, name, self.is_patient)
                 program.prepare(args, options)
                 self.known[key] = program
             return program(args, options, leaves, given, named)

@@ -153,10 +153,10 @@ def _listen(event: str, **_: Any) -> None:
 jax.monitoring.register_event_listener(_listen)
 
 
-def compile_lowered(lowered: Any) -> tuple[Any, bool]:
+def compile_lowered(lowered: Any, options: dict[str, Any] | None) -> tuple[Any, bool]:
     """The program, and whether it can be kept."""
     _compiling.taken = False
-    program = lowered.compile()
+    program = lowered.compile(options)
     return program, not _compiling.taken
 
 

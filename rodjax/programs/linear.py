@@ -125,7 +125,7 @@ def _transpose(
 def _batch(
     leaves: Sequence[Any], axes: Sequence[Any], *, program: _Linear, tree: Any, steps: Steps, kinds: Kinds
 ) -> tuple[list[Any], list[int]]:
-    axes = tuple(None if axis is batching.not_mapped else axis for axis in axes)
+    axes = tuple(axis for axis in axes)
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     kinds = tuple(((size, *shape), dtype) for shape, dtype in kinds)
     steps = (*steps, ("map", axes))

@@ -444,11 +444,6 @@ def _sort(body: _Body, equation: Any, *arrays: str) -> str:
     return f"op.sort(({', '.join(arrays)},), {equation.params['dimension']}, {equation.params['num_keys']})"
 
 
-def _top_k(body: _Body, equation: Any, x: str) -> str:
-    axis = equation.params.get("axis", equation.invars[0].aval.ndim - 1)
-    return f"op.top_k({x}, {equation.params['k']}, {axis})"
-
-
 def _triangular_solve(body: _Body, equation: Any, a: str, b: str) -> str:
     names = ("left_side", "lower", "transpose_a", "unit_diagonal")
     return f"op.triangular_solve({', '.join([a, b, *(repr(bool(equation.params[name])) for name in names)])})"
@@ -618,7 +613,6 @@ OTHERS: dict[str, Rule] = {
     "scatter-min": _scatter("np.minimum"),
     "scatter-max": _scatter("np.maximum"),
     "sort": _sort,
-    "top_k": _top_k,
     "dot_general": _dot_general,
     "cholesky": lambda body, equation, x: f"op.cholesky({x})",
     "lu": lambda body, equation, x: f"op.lu({x})",

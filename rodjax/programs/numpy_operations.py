@@ -254,12 +254,6 @@ def sort(arrays: Values, axis: int, keys: int) -> Values:
     return tuple(np.take_along_axis(array, order, axis) for array in arrays)
 
 
-def top_k(x: np.ndarray, k: int, axis: int) -> Values:
-    order = np.flip(np.argsort(np.flip(x, axis), axis, kind="stable"), axis)  # of equal ones the first comes first
-    order = np.take(x.shape[axis] - 1 - order, np.arange(k), axis)
-    return np.take_along_axis(x, order, axis), order.astype(np.int32)
-
-
 def before_in_order(a: Any, b: Any, or_same: bool) -> Any:
     """a < b, with -0 before 0 and what is no number last."""
     if not np.issubdtype(a.dtype, np.floating):

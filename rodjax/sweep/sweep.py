@@ -27,6 +27,7 @@ from rodjax.io.scene_file import SceneFile
 from rodjax.io.scene_keys import unit_of
 from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_batch
+from rodjax.programs.compilation import numpy_first
 from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.solving.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
 from rodjax.solving.result import (
@@ -253,7 +254,8 @@ def sweep(
         say(f"{output} is complete, nothing is left to do")
         return summary(output)
     manifest = _begin(reader, manifest, parts, say)
-    _solve_chunks(reader, manifest, parts, progress)
+    with numpy_first(False):  # bits that do not depend on where a sweep was stopped
+        _solve_chunks(reader, manifest, parts, progress)
     files = (_arrays(_part(parts, chunk), manifest, chunk) for chunk in manifest.chunks)
     texts = {"scene": reader.scene_text, "over": reader.over_text}
     _assemble(output, parts / "assembled.tmp", manifest, texts, files)

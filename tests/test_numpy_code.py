@@ -1,0 +1,279 @@
+"""Programs as NumPy code: each operation beside JAX's own, and when such code runs in the place of an executable."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import rodjax as rj
+from rodjax.programs import compilation, numpy_operations
+from rodjax.programs.compilation import ANSWERS, compiled, one_answer
+from rodjax.programs.linear import linear
+from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
+
+X = np.random.default_rng(0).normal(size=(4, 5))
+POSITIVE = X[:, :4] @ X[:, :4].T + np.eye(4)
+STACK = np.stack([POSITIVE, 2 * POSITIVE])
+PLACES = np.array([3, 0, 7, -9])
+SAME_ORDER = dict(num_keys=2, dimension=0)
+
+
+def windows(mode):
+    """Gathers of windows, some beyond the array."""
+    dims = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(0,), start_index_map=(0, 1))
+    starts = np.array([[0, 1], [3, 4], [5, 0], [1, -2]])
+    return lambda x: lax.gather(x, starts, dims, slice_sizes=(1, 3), mode=mode)
+
+
+OPERATIONS = {
+    "arithmetic": lambda x: (x + 2 * x**3 - x / 3) ** -2 + jnp.sign(x) * abs(x) ** 0.5 - (-x),
+    "functions": lambda x: [getattr(jnp, f)(x) for f in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "tanh")],
+    "two arrays": lambda x: [f(x, x[::-1]) for f in (jnp.arctan2, jnp.maximum, jnp.minimum, jnp.fmod, jnp.nextafter)],
+    "whole numbers": lambda x: [
+        (7 * x).astype(jnp.int32) // 3,
+        (7 * x).astype(jnp.int32) % 3,
+        jnp.sum((7 * x).astype(jnp.int32), 0),
+        lax.div((7 * x).astype(jnp.int32), jnp.int32(2)),
+        jnp.cumsum((7 * x).astype(jnp.int32), 1),
+    ],
+    "truth": lambda x: [x > 0, (x > 0) & ~(x < 1) | (x == 0), jnp.any(x > 1, 0), jnp.all(x > 1), jnp.isfinite(x / 0)],
+    "rounding": lambda x: [
+        jnp.round(3 * x),
+        jnp.floor(x),
+        jnp.ceil(x),
+        lax.round(x, lax.RoundingMethod.AWAY_FROM_ZERO),
+    ],
+    "choices": lambda x: [
+        jnp.where(x > 0, x, 0.0),
+        jnp.where(x[0, 0] > 0, x, -x),
+        jnp.clip(x, -0.5, 0.5),
+        lax.select_n((abs(2 * x)).astype(jnp.int32) % 3, x, 2 * x, 3 * x),
+    ],
+    "sums": lambda x: [x.sum(), x.sum((0, 1)), x.prod(0), x.max(1), x.min(), jnp.argmax(x, 0), jnp.argmin(x, 1)],
+    "running sums": lambda x: [jnp.cumsum(x, 0), lax.cumsum(x, 1, reverse=True), lax.cummax(x, 0), jnp.cumprod(x, 1)],
+    "shapes": lambda x: [x.T, x.reshape(2, 10), x[::-1, 1:4:2], x[None, :, None], jnp.tile(x, (2, 1)), x.ravel()[3]],
+    "parts": lambda x: [*jnp.unstack(x), *jnp.unstack(x, axis=1), *jnp.split(x, [1, 3], axis=1)],
+    "joined": lambda x: [jnp.concatenate([x, 2 * x], 1), jnp.stack([x, -x], 1), jnp.stack([x[0, 0], x[1, 1]])],
+    "padding": lambda x: [
+        lax.pad(x, 7.0, [(1, 2, 0), (0, 0, 1)]),
+        lax.pad(x, 7.0, [(-1, -2, 0), (2, -1, 2)]),
+        lax.pad(x, 7.0, [(-3, 1, 2), (-4, -1, 0)]),
+        lax.pad(x, 7.0, [(-2, -2, 0), (0, 0, 0)]),
+    ],
+    "broadcasts": lambda x: [
+        jnp.zeros((2, 3)) + 1.0,
+        jnp.broadcast_to(x[0], (3, 5)) * 2.0,
+        jnp.ones((5, 4)).sum(0),
+        jnp.broadcast_to(x[:, :1], (4, 5)) @ x.T,
+        lax.mul(x[:1], x),
+    ],
+    "places": lambda x: [
+        x[PLACES],
+        x[PLACES, 2],
+        x.at[PLACES].get(mode="fill"),
+        jnp.take_along_axis(x, PLACES[:, None], 1),
+    ],
+    "slices at run time": lambda x: [
+        lax.dynamic_slice(x, (jnp.argmax(x[:, 0]), 3), (2, 3)),
+        lax.dynamic_update_slice(x, x[:2, :2], (jnp.argmax(x[:, 0]), 3)),
+        jax.vmap(lambda row, k: row[k])(x, jnp.arange(4)),
+        jax.vmap(lambda row, k: lax.dynamic_slice(row, (k,), (3,)))(x, jnp.arange(4)),
+    ],
+    "windows": lambda x: [windows(mode)(x) for mode in ("clip", "fill")],
+    "updates": lambda x: [
+        x.at[1].set(0.0),
+        x.at[PLACES, 1].add(x[:, 0]),
+        x.at[PLACES].multiply(2.0, mode="drop"),
+        x.at[jnp.array([1, 1]), 2].max(0.3),
+        x.at[1:3, ::2].min(0.0),
+        jax.vmap(lambda row, k: row.at[k].set(9.0))(x, jnp.arange(4)),
+    ],
+    "order": lambda x: [
+        jnp.sort(x, 0),
+        jnp.argsort(x, 1),
+        lax.sort((jnp.round(x), x, 2 * x), **SAME_ORDER),
+        jnp.searchsorted(jnp.sort(x[0]), x[1]),
+        jnp.searchsorted(jnp.sort(x[0]), x[1], side="right", method="sort"),
+    ],
+    "products": lambda x: [
+        x @ x.T,
+        jnp.einsum("ij,kj->ik", x, x),
+        jnp.einsum("bij,bjk->bik", STACK, STACK),
+        jnp.tensordot(STACK, STACK, ((2,), (1,))),
+        jnp.einsum("bij,bkj->kbi", STACK, STACK),
+        x[0] @ x[1],
+        jnp.zeros((0, 4)) @ POSITIVE,
+    ],
+    "matrices": lambda x: [
+        jnp.linalg.solve(POSITIVE + x[0, 0], x),
+        jnp.linalg.inv(STACK),
+        jnp.linalg.det(POSITIVE),
+        jnp.linalg.cholesky(STACK),
+        jnp.linalg.cholesky(-POSITIVE),
+        jnp.linalg.eigvalsh(STACK),
+        jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(POSITIVE), True), x),
+        *[
+            lax.linalg.triangular_solve(POSITIVE, x if left else x.T, left_side=left, lower=lower, transpose_a=flip)
+            for left in (True, False)
+            for lower in (True, False)
+            for flip in (True, False)
+        ],
+        lax.linalg.triangular_solve(POSITIVE, x, left_side=True, lower=True, unit_diagonal=True),
+    ],
+    "loops": lambda x: [
+        lax.while_loop(lambda c: jnp.sum(c) < 50, lambda c: c + abs(x), x),
+        lax.fori_loop(0, 5, lambda k, c: c * 0.5 + k, x),
+        jax.vmap(lambda row: lax.while_loop(lambda c: c[0] < 3, lambda c: c + 1, row))(x),
+        lax.scan(lambda c, row: (c + row, c * row), x[0], x),
+        lax.scan(lambda c, row: (c + row, None), x[0], x, reverse=True),
+        lax.map(lambda row: row.sum(), x, batch_size=3),
+    ],
+    "branches": lambda x: [
+        lax.cond(x[0, 0] > 0, lambda: x, lambda: 2 * x),
+        lax.switch(jnp.argmax(x[0]), [lambda: x, lambda: -x, lambda: x + 1]),
+    ],
+    "derivatives": lambda x: [
+        jax.grad(lambda x: jnp.sum(jnp.linalg.solve(POSITIVE, x) ** 2))(x),
+        jax.vjp(lambda x: lax.scan(lambda c, row: (jnp.sin(c) + row, c), x[0], x), x)[1]((x[0], x)),
+        jax.jit(lambda x: jax.jvp(jax.nn.relu, (x,), (x,)))(x),
+    ],
+    "kept apart": lambda x: lax.optimization_barrier((x, 2 * x)),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning", "ignore:divide by zero:RuntimeWarning")
+def test_operations_give_what_jax_gives(name):
+    function = OPERATIONS[name]
+    expected = jax.jit(function)(X)
+    found = AnswerCode.of(jax.jit(function).trace(X))([X], np.inf)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        # Other roundings of the same operations; products of positive matrices of condition 100.
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+def test_a_singular_triangle_spoils_no_other():
+    singular = np.stack([POSITIVE, np.triu(np.ones((4, 4)), 1)])
+    x = numpy_operations.triangular_solve(singular, STACK, True, True, False, False)
+    assert np.isfinite(x[0]).all()
+    assert np.isnan(x[1]).all()
+
+
+def test_single_precision_stays_single():
+    with jax.enable_x64(False):
+        x = np.float32(X)
+        traced = jax.jit(lambda x: (jnp.sin(x) * 2 + jnp.arange(5, dtype=x.dtype)[None]).sum(0)).trace(x)
+        (found,) = jax.tree.leaves(AnswerCode.of(traced)([x], np.inf))
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, (np.sin(x) * 2 + np.arange(5)).sum(0), rtol=1e-5)
+
+
+def test_what_numpy_lacks_is_told():
+    with pytest.raises(NotInNumpyError, match="conv_general_dilated"):
+        AnswerCode.of(jax.jit(lambda x: jnp.convolve(x[0], x[1])).trace(X))
+
+
+def test_loops_end_in_time():
+    endless = AnswerCode.of(jax.jit(lambda x: lax.while_loop(lambda x: x[0, 0] < jnp.inf, lambda x: x + 1, x)).trace(X))
+    with pytest.raises(numpy_operations.TookTooLongError):
+        endless([X], 0.01)
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """As users have it: tests are patient."""
+    monkeypatch.setattr(ANSWERS, "is_patient", False)
+
+
+def executables(function) -> int:
+    (programs,) = [programs for programs in compilation._compiled if programs.name.endswith(function.__qualname__)]
+    return sum(program.executable is not None for program in programs.known.values())
+
+
+def test_the_second_answer_is_compiled(impatient):
+    @compiled
+    def doubled(x):
+        return 2 * x
+
+    np.testing.assert_array_equal(doubled(X), 2 * X)
+    assert executables(doubled) == 0
+    np.testing.assert_array_equal(doubled(X), 2 * X)
+    assert executables(doubled) == 1
+
+    @one_answer
+    def often():
+        return [tripled(X) for _ in range(3)]
+
+    @compiled
+    def tripled(x):
+        return 3 * x
+
+    often()
+    assert executables(tripled) == 0
+    often()
+    assert executables(tripled) == 1
+    with rj.numpy_first(False):
+        tripled(X[0])
+    assert executables(tripled) == 2
+
+
+def test_what_takes_longer_than_compiling_is_compiled(impatient, monkeypatch):
+    monkeypatch.setattr(compilation, "PATIENCE", 0.0)
+
+    @compiled
+    def counted(x):
+        return lax.while_loop(lambda x: x[0, 0] < 1e4, lambda x: x + 1, x)
+
+    assert counted(X)[0, 0] >= 1e4
+    assert executables(counted) == 1
+
+
+def test_numpy_first_is_yes_or_no():
+    with pytest.raises(TypeError, match="enabled must be True or False, got 'off'"):
+        rj.numpy_first("off")
+
+
+def test_both_codes_of_a_solve_agree(compiled_at_once):
+    """Contact has every kind of loop and factorisation; the residual alone is all rounding."""
+    scene = rj.problems.hanging_cable()
+    floor = rj.Plane((0.0, 0.0, -0.15), (0.0, 0.0, 1.0))
+    scene = rj.Scene(scene.rod, scene.start, scene.end, scene.gravity, obstacles=[floor])
+    one = rj.solve(scene, segments=8)
+    with rj.numpy_first():
+        other = rj.solve(scene, segments=8, guess=rj.Guess(np.asarray(one.nodes)))
+    assert other.converged
+    # Both stop where the residual is below 1e-8 EI/L^2.
+    np.testing.assert_allclose(other.nodes, one.nodes, atol=1e-9)
+    np.testing.assert_allclose(other.contact_forces, one.contact_forces, atol=1e-9)
+
+
+@linear
+def scaled_change(factors, value, change):
+    """Of value = sin(factors) summed, squared: a function that is linear in `change`."""
+    return {"sum": 2 * value["sum"] * jnp.sum(jnp.cos(factors["x"]) * change["x"]), "count": None}
+
+
+def test_linear_programs_have_all_derivatives():
+    factors, value = {"x": jnp.array([0.1, 0.2, 0.3])}, {"sum": jnp.array(2.0), "count": jnp.array(3)}
+
+    def change(dx):
+        return scaled_change(factors, value, {"x": dx})["sum"]
+
+    weights = 4.0 * np.cos([0.1, 0.2, 0.3])
+    eye = jnp.eye(3)
+    np.testing.assert_allclose(change(eye[0]), weights[0], rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(change)(eye[0]), weights, rtol=1e-14)
+    np.testing.assert_allclose(jax.vmap(change)(eye), weights, rtol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(change)(eye[0]), weights, rtol=1e-14)
+    np.testing.assert_allclose(jax.jacrev(lambda x: jnp.stack([change(x), change(2 * x)]))(eye[0])[1], 2 * weights)
+    np.testing.assert_allclose(jax.jit(jax.grad(change))(eye[0]), weights, rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.vmap(change))(eye), weights, rtol=1e-14)
+    # Known to JAX as a constant of a program.
+    np.testing.assert_allclose(compiled(lambda s: s * jax.grad(change)(eye[0]))(2.0), 2 * weights, rtol=1e-14)
+
+    def of_factors(x):
+        return scaled_change({"x": x}, value, {"x": eye[0]})["sum"]
+
+    np.testing.assert_allclose(jax.grad(of_factors)(factors["x"])[0], -4.0 * np.sin(0.1), rtol=1e-14)

@@ -8,6 +8,7 @@ import itertools
 import logging
 import math
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -41,6 +42,9 @@ PRECISION = "jax_enable_x64"
 SETTINGS = ("jax_disable_jit", "jax_default_device")
 # Around what may take seconds; the command line says so there.
 waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+# So many programs keep what JAX traced, and so many their NumPy code (some 10 MB and 1 MB each).
+MOST_TRACED, MOST_CODES = 16, 300
+_slots = threading.BoundedSemaphore(os.cpu_count() or 1)
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 F = TypeVar("F", bound=Callable)
 _log = logging.getLogger("rodjax")
@@ -50,7 +54,7 @@ class _Program:
     """What a function becomes for arguments of one structure and types: NumPy code, an executable, or one after the
     other.
 
-    `name`: on disk, `None` where it is not kept.
+    `name`: on disk, `None` where it is not kept; `answer`: the number of the one for which it was made.
     """
 
     def __init__(self, run: Any, tree: Any, name: str | None, is_patient: bool):
@@ -60,11 +64,35 @@ class _Program:
         self.traced: Any = None
         self.answer = ANSWERS.number
         self.seconds_left = math.inf
+        self.lock = threading.Lock()
 
-    def prepare(self, args: tuple, options: dict[str, Any]) -> None:
-        """Finds or makes what the first call needs."""
-        if not ANSWERS.by_numpy:
-            return self._compile(args, options)
+    def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
+        if self.executable is None and self._is_by_numpy(args, options):
+            assert self.code is not None
+            begin = time.perf_counter()
+            try:
+                return self.code(leaves, self.seconds_left)
+            except TookTooLongError:
+                pass
+            finally:
+                self.seconds_left -= time.perf_counter() - begin
+        if self.executable is None:
+            ANSWERS.compile_others(self)
+            with waiting():
+                self.compile(lambda: self.run.trace(*args, **options))
+            _make_room()
+        return self.executable(*given, **named)
+
+    def _is_by_numpy(self, args: tuple, options: dict[str, Any]) -> bool:
+        """Within the answer for which it was made, as long as compiling would take longer."""
+        is_same = self.is_patient or ANSWERS.is_patient or self.answer == ANSWERS.number
+        if not ANSWERS.by_numpy or not is_same or self.seconds_left <= 0:
+            return False
+        if self.code is None:
+            self._find_or_write_code(args, options)
+        return self.code is not None
+
+    def _find_or_write_code(self, args: tuple, options: dict[str, Any]) -> None:
         if self.name is not None:
             self.code = kept.load_code(self.name)
             if self.code is None:
@@ -75,42 +103,27 @@ class _Program:
                 self.code = AnswerCode.of(self.traced)
             except NotInNumpyError as missing:
                 _log.info("compiled at once, as NumPy code lacks %s", missing)
-                return self._compile(args, options)
+                self.seconds_left = 0.0
+                return
             if self.name is not None:
                 kept.store_code(self.name, self.code)
         if self.code is not None:
             self.seconds_left = PATIENCE * COMPILE_SECONDS * len(self.code.code)
+            ANSWERS.remember(self)
 
-    def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
-        if self.executable is None and self._is_by_numpy():
-            assert self.code is not None
-            begin = time.perf_counter()
-            try:
-                return self.code(leaves, self.seconds_left)
-            except TookTooLongError:
-                pass
-            finally:
-                self.seconds_left -= time.perf_counter() - begin
-        if self.executable is None:
-            self._compile(args, options)
-        return self.executable(*given, **named)
-
-    def _is_by_numpy(self) -> bool:
-        """Within the answer for which it was made, as long as compiling would take longer."""
-        is_same = self.is_patient or ANSWERS.is_patient or self.answer == ANSWERS.number
-        return ANSWERS.by_numpy and self.code is not None and is_same and self.seconds_left > 0
-
-    def _compile(self, args: tuple, options: dict[str, Any]) -> None:
-        if self.name is not None:
-            self.executable = kept.load(self.name, self.tree)
-        if self.executable is None:
-            traced = self.traced or self.run.trace(*args, **options)
-            with waiting():
-                self.executable, is_new = kept.compile_lowered(traced.lower(), QUICK if _knows_quick() else None)
-            if is_new and self.name is not None:
-                kept.store(self.name, self.executable)
-        self.code = self.traced = None
-        _make_room()
+    def compile(self, trace: Callable[[], Any]) -> None:
+        """In any thread."""
+        with self.lock:
+            if self.executable is not None:
+                return
+            if self.name is not None:
+                self.executable = kept.load(self.name, self.tree)
+            if self.executable is None:
+                lowered = (self.traced or trace()).lower()
+                self.executable, is_new = kept.compile_lowered(lowered, QUICK if _knows_quick() else None)
+                if is_new and self.name is not None:
+                    kept.store(self.name, self.executable)
+            self.code = self.traced = None
 
 
 class _Programs:
@@ -170,9 +183,7 @@ class _Programs:
                 name = None
                 if kept.is_keeping():
                     name = kept.name_of(self.name, QUICK, statics, tree, kinds)
-                program = _Program(self.part, tree, name, self.is_patient)
-                program.prepare(args, options)
-                self.known[key] = program
+                program = self.known[key] = _Program(self.part, tree, name, self.is_patient)
             return program(args, options, leaves, given, named)
 
     def _by_jax(self, args: tuple, options: dict[str, Any]) -> Any:
@@ -194,6 +205,7 @@ class _Answers:
         self.by_numpy, self.is_patient = True, False
         self.number = self.depth = 0
         self.lock = threading.Lock()
+        self.written: list[_Program] = []  # those with NumPy code, the latest last
 
     @contextlib.contextmanager
     def one(self) -> Iterator[None]:
@@ -206,6 +218,35 @@ class _Answers:
         finally:
             with self.lock:
                 self.depth -= 1
+            if not self.depth and hasattr(sys, "ps1"):
+                self.compile_others(None)
+
+    def remember(self, program: _Program) -> None:
+        """Those written longest ago give up what takes room."""
+        with self.lock:
+            self.written = [*(one for one in self.written if one.code is not None and one is not program), program]
+            for old in self.written[:-MOST_TRACED]:
+                old.traced = None
+            for old in self.written[:-MOST_CODES]:
+                old.code = None
+
+    def compile_others(self, program: _Program | None) -> None:
+        """Side by side with a program that another answer asks for, in other threads: those that were made for the same
+        answer, as all will be asked for. In a session with a person at the keyboard (`None`): those of the last answer.
+        """
+        number = self.number if program is None else program.answer
+        settings = kept.settings()
+        for other in self.written:
+            is_due = other.answer == number and other is not program and not other.is_patient and not self.is_patient
+            if is_due and other.executable is None and other.traced is not None:
+                threading.Thread(target=_compile_beside, args=(other, settings)).start()
+
+
+def _compile_beside(program: _Program, settings: str) -> None:
+    # What a block of the user's has changed, such as the precision, other threads do not know of.
+    with contextlib.suppress(Exception), _slots:
+        if threading.main_thread().is_alive() and kept.settings() == settings:
+            program.compile(lambda: program.traced)
 
 
 ANSWERS = _Answers()

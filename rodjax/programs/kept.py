@@ -91,7 +91,7 @@ def name_of(function: str, options: dict[str, Any], statics: Sequence[Any], tree
     structure, fixed = _tree_text(tree), _text(tuple(statics))
     if structure is None or fixed is None or not function.startswith("rodjax."):
         return None
-    text = "\n".join([_surroundings(), _settings(), function, repr(options), fixed, structure, repr(leaves)])
+    text = "\n".join([_surroundings(), settings(), function, repr(options), fixed, structure, repr(leaves)])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -250,7 +250,7 @@ def _text(value: Any) -> str | None:
     return "missing" if type(value).__module__.startswith("equinox.") and repr(value) == "Missing" else None
 
 
-def _settings() -> str:
+def settings() -> str:
     """Of JAX, as they are here and now."""
     names = [name for name in sorted(jax.config.values) if not name.startswith(WITHOUT_EFFECT)]
     return repr([(name, getattr(jax.config, name, None)) for name in names])

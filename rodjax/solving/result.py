@@ -319,12 +319,13 @@ def _moment_error(errors: Errors) -> Float[Array, "..."]:
     return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
 
 
-@functools.partial(over_leading_axes, is_patient=False)  # a part of each solve without `segments`
+# These two are parts of solves without `segments`.
+@functools.partial(over_leading_axes, is_patient=False)
 def _errors(equilibrium: Equilibrium) -> Errors:
     return _errors_of(equilibrium, is_turn_held=False)
 
 
-@over_leading_axes
+@functools.partial(over_leading_axes, is_patient=False)
 def _errors_beside_turns(equilibrium: Equilibrium) -> Errors:
     return _errors_of(equilibrium, is_turn_held=True)
 

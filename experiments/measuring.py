@@ -15,6 +15,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import numpy as np
 
+import rodjax
+
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # A slow program is repeated for about so long [s] in a round, once at least.
 ROUND_SECONDS = 6.0
@@ -28,9 +30,12 @@ Result = TypeVar("Result")
 
 
 def set_up() -> None:
-    """Double precision, and one thread of XLA unless XLA_FLAGS says otherwise; before JAX makes its first array."""
+    """Double precision, one thread of XLA unless XLA_FLAGS says otherwise, and compiled programs from the first call;
+    before JAX makes its first array.
+    """
     os.environ.setdefault("XLA_FLAGS", ONE_THREAD)
     jax.config.update("jax_enable_x64", True)
+    rodjax.numpy_first(False)
 
 
 def conditions() -> str:

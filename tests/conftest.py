@@ -42,8 +42,9 @@ rodjax.enable_compilation_cache()
 # Tests replace functions of the library, of which programs kept on disk would know nothing.
 os.environ["RODJAX_CACHE"] = "off"
 rodjax.keep_programs(False)
-# Few programs are called so often here that compiling them would pay.
+# Few programs are called so often here that compiling them would pay. What is compared bit by bit is compiled.
 compilation.ANSWERS.is_patient = True
+rodjax.numpy_first(not IS_OPTIMIZED)
 
 
 def pytest_addoption(parser):

@@ -16,6 +16,13 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 sys.path.insert(0, str(EXPERIMENTS))  # as for a script that is run, so that it finds `measuring` and `peer_programs`
 
 
+@pytest.fixture(autouse=True)
+def numpy_first():
+    """Experiments that measure times turn it off."""
+    with rj.numpy_first():
+        yield
+
+
 def script(name: str):
     spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
     assert spec is not None
@@ -105,6 +112,16 @@ def test_nonlinear_cg(tmp_path, capsys, monkeypatch):
     with open(tmp_path / "nonlinear_cg.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == 3
     assert (tmp_path / "nonlinear_cg.png").stat().st_size > 10_000
+
+
+def test_first_answers(tmp_path, capsys):
+    (row,) = script("first_answers").main(["segments_50", "--answers", "2", "--out", str(tmp_path)])
+    # Nothing is compiled for the first two answers; JAX's own import and tracing is most of their time.
+    assert row.programs == 0
+    assert row.second_s < row.first_s
+    assert capsys.readouterr().out.splitlines()[-1].split()[0] == "segments_50"
+    with open(tmp_path / "first_answers.csv", newline="") as file:
+        assert [saved["job"] for saved in csv.DictReader(file)] == ["segments_50"]
 
 
 def test_cold_start():

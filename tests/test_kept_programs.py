@@ -92,7 +92,7 @@ def test_code_is_kept_and_found_by_its_arguments(folder):
         np.testing.assert_array_equal(other(np.arange(4.0))["scaled"], [0, 5, 10, 15])
     assert len(list(folder.glob("*.numpy"))) == 2
     np.testing.assert_array_equal(other(np.arange(4.0))["scaled"], [0, 5, 10, 15])
-    assert len(files(folder)) == 1
+    assert len(files(folder)) == 1  # outside of `numpy_first`
 
 
 def test_a_program_is_found_by_its_arguments(folder):

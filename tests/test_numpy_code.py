@@ -185,6 +185,8 @@ def test_loops_end_in_time():
 def impatient(monkeypatch):
     """As users have it: tests are patient."""
     monkeypatch.setattr(ANSWERS, "is_patient", False)
+    with rj.numpy_first():
+        yield
 
 
 def executables(function) -> int:
@@ -192,15 +194,14 @@ def executables(function) -> int:
     return sum(program.executable is not None for program in programs.known.values())
 
 
-def test_the_second_answer_is_compiled(impatient):
+def test_the_third_answer_is_compiled(impatient):
     @compiled
     def doubled(x):
         return 2 * x
 
-    np.testing.assert_array_equal(doubled(X), 2 * X)
-    assert executables(doubled) == 0
-    np.testing.assert_array_equal(doubled(X), 2 * X)
-    assert executables(doubled) == 1
+    for expected in (0, 0, 1):
+        np.testing.assert_array_equal(doubled(X), 2 * X)
+        assert executables(doubled) == expected
 
     @one_answer
     def often():
@@ -210,10 +211,9 @@ def test_the_second_answer_is_compiled(impatient):
     def tripled(x):
         return 3 * x
 
-    often()
-    assert executables(tripled) == 0
-    often()
-    assert executables(tripled) == 1
+    for expected in (0, 0, 1):
+        often()
+        assert executables(tripled) == expected
     with rj.numpy_first(False):
         tripled(X[0])
     assert executables(tripled) == 2

@@ -32,6 +32,8 @@ _OUTSIDE = get_opaque_trace_state()
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
 SHARE_OF_MAPS = 0.5
+# So many answers get a program as NumPy code: a script that solves twice ends sooner without a compiler.
+ANSWERS_BY_NUMPY = 2
 # Compiling takes about so many seconds for a byte of the program's NumPy code; and NumPy may take this part of them.
 COMPILE_SECONDS = 2.5e-5
 PATIENCE = 0.5
@@ -54,7 +56,8 @@ class _Program:
     """What a function becomes for arguments of one structure and types: NumPy code, an executable, or one after the
     other.
 
-    `name`: on disk, `None` where it is not kept; `answer`: the number of the one for which it was made.
+    `name`: on disk, `None` where it is not kept; `answer`: the number of the one for which it was made; `asked`: the
+    last one that asked for it, and how many did.
     """
 
     def __init__(self, run: Any, tree: Any, name: str | None, is_patient: bool):
@@ -63,6 +66,7 @@ class _Program:
         self.code: AnswerCode | None = None
         self.traced: Any = None
         self.answer = ANSWERS.number
+        self.asked = ANSWERS.number, 1
         self.seconds_left = math.inf
         self.lock = threading.Lock()
 
@@ -84,12 +88,15 @@ class _Program:
         return self.executable(*given, **named)
 
     def _is_by_numpy(self, args: tuple, options: dict[str, Any]) -> bool:
-        """Within the answer for which it was made, as long as compiling would take longer."""
-        is_same = self.is_patient or ANSWERS.is_patient or self.answer == ANSWERS.number
-        if not ANSWERS.by_numpy or not is_same or self.seconds_left <= 0:
+        """For the first answers that ask for it, as long as compiling would take longer."""
+        last, count = self.asked
+        self.asked = ANSWERS.number, count + (last != ANSWERS.number)
+        is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
+        if not ANSWERS.by_numpy or not is_early or self.seconds_left <= 0:
             return False
         if self.code is None:
-            self._find_or_write_code(args, options)
+            with waiting():
+                self._find_or_write_code(args, options)
         return self.code is not None
 
     def _find_or_write_code(self, args: tuple, options: dict[str, Any]) -> None:
@@ -196,9 +203,9 @@ class _Programs:
 
 
 class _Answers:
-    """Which programs run as NumPy code: those made for the answer that is being worked on.
+    """The answers that are asked for, by which programs run as NumPy code or compiled.
 
-    `number`: of that answer; `is_patient`: whether programs made for earlier answers may run so too.
+    `number`: of the one that is being worked on; `is_patient`: whether NumPy code may serve any number of answers.
     """
 
     def __init__(self) -> None:
@@ -256,10 +263,10 @@ class numpy_first:  # noqa: N801 - called as a function
     """Whether first answers come from NumPy code, as they do unless told otherwise: `rj.numpy_first(False)` from here
     on, `with rj.numpy_first(False): ...` in a block.
 
-    A program that XLA compiles in seconds runs as NumPy code for the first answer, some fifty times as slowly, and is
-    compiled when another answer asks for it. The two agree to rounding. Without NumPy code the first answer waits for
-    the compiler, and all answers of a process are the same to the last bit. The environment variable
-    `RODJAX_NUMPY_FIRST=off` says so from the start.
+    A program that XLA compiles in seconds runs as NumPy code for the first two answers that ask for it, some fifty
+    times as slowly, and is compiled for the third. The two agree to rounding. Without NumPy code the first answer waits
+    for the compiler, and all answers of a process are the same to the last bit: ask for that before you measure run
+    times, or compare bits. The environment variable `RODJAX_NUMPY_FIRST=off` says so from the start.
     """
 
     def __init__(self, enabled: bool = True):

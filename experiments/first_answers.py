@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
             flush=True,
         )
     if options.out:
-        save_rows(options.out / "first_answers.csv", rows)
+        save_rows(rows, options.out / "first_answers.csv")
     return rows
 
 

@@ -21,7 +21,8 @@ from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, cri
 from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
 from rodjax.paths.path import solve_path
 from rodjax.paths.tracing import BranchEnd
-from rodjax.programs.compilation import enable_compilation_cache, numpy_first
+from rodjax.programs.answers import numpy_first
+from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
 from rodjax.solving.equilibrium import solve
 from rodjax.solving.guess import Guess

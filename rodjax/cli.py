@@ -26,7 +26,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.io.files import SUFFIX, load, save
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
-from rodjax.programs import compilation, kept
+from rodjax.programs import answers, kept
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
@@ -172,7 +172,7 @@ def _segments(text: str) -> int:
 def _set_up_jax() -> None:
     jax.config.update("jax_enable_x64", True)
     if sys.stderr.isatty():
-        compilation.waiting = _told
+        answers.waiting = _told
 
 
 def _warm(arguments: argparse.Namespace) -> int:

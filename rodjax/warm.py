@@ -14,7 +14,7 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clip
 from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
-from rodjax.programs.compilation import numpy_first
+from rodjax.programs.answers import numpy_first
 from rodjax.solving.equilibrium import solve
 from rodjax.solving.result import Equilibrium, describe
 

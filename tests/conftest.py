@@ -11,7 +11,7 @@ import jax
 import pytest
 
 import rodjax
-from rodjax.programs import compilation
+from rodjax.programs.answers import ANSWERS
 
 # Before JAX's first program. Most of the tests' time is compiling: without optimisation half as long, and what is
 # compiled runs half as fast. `RODJAX_TESTS_OPTIMIZED` asks for programs as users have them.
@@ -43,7 +43,7 @@ rodjax.enable_compilation_cache()
 os.environ["RODJAX_CACHE"] = "off"
 rodjax.keep_programs(False)
 # Few programs are called so often here that compiling them would pay. What is compared bit by bit is compiled.
-compilation.ANSWERS.is_patient = True
+ANSWERS.is_patient = True
 rodjax.numpy_first(not IS_OPTIMIZED)
 
 

@@ -7,8 +7,9 @@ import pytest
 from jax import lax
 
 import rodjax as rj
-from rodjax.programs import compilation, numpy_operations
-from rodjax.programs.compilation import ANSWERS, compiled, one_answer
+from rodjax.programs import answers, compilation, numpy_operations
+from rodjax.programs.answers import ANSWERS, one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
 from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
 
@@ -220,7 +221,7 @@ def test_the_third_answer_is_compiled(impatient):
 
 
 def test_what_takes_longer_than_compiling_is_compiled(impatient, monkeypatch):
-    monkeypatch.setattr(compilation, "PATIENCE", 0.0)
+    monkeypatch.setattr(answers, "PATIENCE", 0.0)
 
     @compiled
     def counted(x):

@@ -174,7 +174,7 @@ def test_distances_change_by_no_more_than_the_way(name):
     check()
 
 
-def test_points_of_any_shape_have_distances():
+def test_points_of_any_shape_have_distances(compiled_at_once):
     box = OBSTACLES["box"]
     several = POINTS[:24].reshape(2, 3, 4, 3)
     np.testing.assert_array_equal(box.distance(several).reshape(-1), box.distance(POINTS[:24]))

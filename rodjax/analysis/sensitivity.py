@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, sequence
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import solve
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium

@@ -32,7 +32,8 @@ from rodjax.identification.setup import (
 )
 from rodjax.identification.statistics import LARGEST_DEVIATION, inverse, rates
 from rodjax.identification.unknowns import Unknown
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.result import Equilibrium
 

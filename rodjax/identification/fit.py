@@ -32,7 +32,7 @@ from rodjax.identification.setup import (
 )
 from rodjax.identification.unknowns import Unknown, with_values
 from rodjax.paths.continuation import critical_point
-from rodjax.programs.compilation import one_answer
+from rodjax.programs.answers import one_answer
 from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
 from rodjax.warn import warn

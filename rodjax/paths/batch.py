@@ -22,7 +22,8 @@ from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.model.scene import Scene, slides
 from rodjax.paths.path import path_from, stack_scenes
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import (
     Discretization,
     Options,

@@ -20,7 +20,8 @@ from rodjax.paths.critical import differentiable_parameter
 from rodjax.paths.modes import Mode
 from rodjax.paths.path import stack_scenes
 from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, Solver, solve
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import not_differentiated

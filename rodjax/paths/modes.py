@@ -14,7 +14,8 @@ from rodjax.discretization.motion import Motion
 from rodjax.linalg.saddle_point import DenseSystem
 from rodjax.model.along import Along
 from rodjax.model.scene import nondimensional, slides
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium, form_and_point, over_leading_axes
 from rodjax.solving.stability import softest
 from rodjax.solving.status import Status

@@ -17,7 +17,8 @@ from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.model.scene import Scene, between, has_potential, nondimensional, slides
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import (
     Discretization,
     Options,

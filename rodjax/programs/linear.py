@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from rodjax.checks import is_known
 from rodjax.programs.compilation import compiled
-from rodjax.programs.numpy_code import INNER
+from rodjax.programs.numpy_rules import INNER
 
 # What has been done to a function: ("map", the mapped axis of each leaf) or ("transpose", shapes and types of the
 # leaves of the linear argument).
@@ -91,7 +92,7 @@ def _(*leaves: Any, program: _Linear, tree: Any, steps: Steps, kinds: Kinds) -> 
 
 @_linear.def_abstract_eval
 def _(*leaves: Any, program: _Linear, tree: Any, steps: Steps, kinds: Kinds) -> list[Any]:
-    return [jax.core.ShapedArray(shape, np.dtype(dtype)) for shape, dtype in kinds]
+    return [ShapedArray(shape, np.dtype(dtype)) for shape, dtype in kinds]
 
 
 def _inside(*leaves: Any, program: _Linear, tree: Any, steps: Steps, kinds: Kinds) -> list[Any]:

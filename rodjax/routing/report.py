@@ -14,7 +14,7 @@ import numpy as np
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
 from rodjax.model.obstacles import Obstacle, checked_obstacles
-from rodjax.programs.compilation import one_answer
+from rodjax.programs.answers import one_answer
 from rodjax.routing import records, words
 from rodjax.routing.findings import Cable, Gradients, cable
 from rodjax.routing.limits import Limits

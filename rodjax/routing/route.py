@@ -15,7 +15,7 @@ from tqdm import tqdm
 from rodjax.checks import instance, positive, whole_number
 from rodjax.model.scene import Scene, slides
 from rodjax.paths.batch import solve_first, solve_stack
-from rodjax.programs.compilation import one_answer
+from rodjax.programs.answers import one_answer
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, checked, margins, measured_margins
 from rodjax.routing.objective import Objective

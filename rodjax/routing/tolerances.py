@@ -19,7 +19,7 @@ from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, is_known, leaf, number_array, positive, sequence, shown, whole_number
 from rodjax.identification.unknowns import Unknown, known_names, target
 from rodjax.model.scene import Scene
-from rodjax.programs.compilation import one_answer
+from rodjax.programs.answers import one_answer
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples

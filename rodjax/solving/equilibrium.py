@@ -41,7 +41,8 @@ from rodjax.model.scene import (
     sliding_places,
 )
 from rodjax.model.supports import Clamp
-from rodjax.programs.compilation import compiled, one_answer
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.contact_search import find_touching
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import differentiable, not_differentiated

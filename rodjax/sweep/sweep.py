@@ -27,7 +27,7 @@ from rodjax.io.scene_file import SceneFile
 from rodjax.io.scene_keys import unit_of
 from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_batch
-from rodjax.programs.compilation import numpy_first
+from rodjax.programs.answers import numpy_first
 from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
 from rodjax.solving.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
 from rodjax.solving.result import (

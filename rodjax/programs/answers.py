@@ -1,0 +1,223 @@
+"""Answers and the programs that they ask for: as NumPy code at first, compiled where they are asked for again."""
+
+import contextlib
+import functools
+import logging
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar, cast
+
+import jax
+
+from rodjax.checks import shown
+from rodjax.programs import kept
+from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
+from rodjax.programs.numpy_operations import TookTooLongError
+
+# XLA's older generator of code for loops on a processor: half the compile time at the same run time, see
+# `docs/design.md`. jaxlib 0.12 has it no more.
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+# So many answers get a program as NumPy code: a script that solves twice ends sooner without a compiler.
+ANSWERS_BY_NUMPY = 2
+# Compiling takes about so many seconds for a byte of the program's NumPy code; and NumPy may take this part of them.
+COMPILE_SECONDS = 2.5e-5
+LEAST_SECONDS = 1.0  # for the smallest program, on a busy machine
+PATIENCE = 0.5
+# The environment variable: "off" for no NumPy code.
+VARIABLE = "RODJAX_NUMPY_FIRST"
+# Around what may take seconds; the command line says so there.
+waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+# So many programs keep what JAX traced, and so many their NumPy code (some 10 MB and 1 MB each).
+MOST_TRACED, MOST_CODES = 16, 300
+_slots = threading.BoundedSemaphore(os.cpu_count() or 1)
+F = TypeVar("F", bound=Callable)
+_log = logging.getLogger("rodjax")
+
+
+class Program:
+    """What a function becomes for arguments of one structure and types: NumPy code, an executable, or one after the
+    other.
+
+    `name`: on disk, `None` where it is not kept; `answer`: the number of the one for which it was made; `asked`: the
+    last one that asked for it, and how many did.
+    """
+
+    def __init__(self, run: Any, tree: Any, name: str | None, is_patient: bool):
+        self.run, self.tree, self.name, self.is_patient = run, tree, name, is_patient
+        self.executable: Any = None
+        self.code: AnswerCode | None = None
+        self.traced: Any = None
+        self.answer = ANSWERS.number
+        self.asked = ANSWERS.number, 1
+        self.seconds_left = math.inf
+        self.lock = threading.Lock()
+
+    def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
+        if self.executable is None and self._is_by_numpy(args, options):
+            assert self.code is not None
+            begin = time.perf_counter()
+            try:
+                return self.code(leaves, self.seconds_left)
+            except TookTooLongError:
+                pass
+            finally:
+                self.seconds_left -= time.perf_counter() - begin
+        executable = self.executable
+        if executable is None:
+            ANSWERS.compile_others(self)
+            with waiting():
+                executable = self.compile(lambda: self.run.trace(*args, **options))
+        return executable(*given, **named)
+
+    def _is_by_numpy(self, args: tuple, options: dict[str, Any]) -> bool:
+        """For the first answers that ask for it, as long as compiling would take longer."""
+        last, count = self.asked
+        self.asked = ANSWERS.number, count + (last != ANSWERS.number)
+        is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
+        if not ANSWERS.by_numpy or not is_early or self.seconds_left <= 0:
+            return False
+        if self.code is None:
+            with waiting():
+                self._find_or_write_code(args, options)
+        return self.code is not None
+
+    def _find_or_write_code(self, args: tuple, options: dict[str, Any]) -> None:
+        if self.name is not None:
+            self.code = kept.load_code(self.name)
+            if self.code is None:
+                self.executable = kept.load(self.name, self.tree)
+        if self.code is None and self.executable is None:
+            self.traced = self.run.trace(*args, **options)
+            try:
+                self.code = AnswerCode.of(self.traced)
+            except NotInNumpyError as missing:
+                _log.info("compiled at once, as NumPy code lacks %s", missing)
+                self.seconds_left = 0.0
+                return
+            if self.name is not None:
+                kept.store_code(self.name, self.code)
+        if self.code is not None:
+            self.seconds_left = PATIENCE * max(COMPILE_SECONDS * len(self.code.code), LEAST_SECONDS)
+            ANSWERS.remember(self)
+
+    def compile(self, trace: Callable[[], Any]) -> Any:
+        """The executable, made in any thread."""
+        with self.lock:
+            if self.executable is not None:
+                return self.executable
+            if self.name is not None:
+                self.executable = kept.load(self.name, self.tree)
+            if self.executable is None:
+                lowered = (self.traced or trace()).lower()
+                self.executable, is_new = kept.compile_lowered(lowered, QUICK if knows_quick() else None)
+                if is_new and self.name is not None:
+                    kept.store(self.name, self.executable)
+            self.code = self.traced = None
+            return self.executable
+
+
+class _Answers:
+    """The answers that are asked for, by which programs run as NumPy code or compiled.
+
+    `number`: of the one that is being worked on; `is_patient`: whether NumPy code may serve any number of answers.
+    """
+
+    def __init__(self) -> None:
+        self.by_numpy, self.is_patient = True, False
+        self.number = self.depth = 0
+        self.lock = threading.Lock()
+        self.written: list[Program] = []  # those with NumPy code, the latest last
+
+    @contextlib.contextmanager
+    def one(self) -> Iterator[None]:
+        """All that is called in here is one answer, also where that is part of another."""
+        with self.lock:
+            self.number += not self.depth
+            self.depth += 1
+        try:
+            yield
+        finally:
+            with self.lock:
+                self.depth -= 1
+            if not self.depth and hasattr(sys, "ps1"):
+                self.compile_others(None)
+
+    def remember(self, program: Program) -> None:
+        """Those written longest ago give up what takes room."""
+        with self.lock:
+            self.written = [*(one for one in self.written if one.code is not None and one is not program), program]
+            for old in self.written[:-MOST_TRACED]:
+                old.traced = None
+            for old in self.written[:-MOST_CODES]:
+                old.code = None
+
+    def compile_others(self, program: Program | None) -> None:
+        """Side by side with a program that another answer asks for, in other threads: those that were made for the same
+        answer, as all will be asked for. In a session with a person at the keyboard (`None`): those of the last answer.
+        """
+        number = self.number if program is None else program.answer
+        settings = kept.settings()
+        for other in self.written:
+            is_due = other.answer == number and other is not program and not other.is_patient and not self.is_patient
+            if is_due and other.executable is None and other.traced is not None:
+                threading.Thread(target=_compile_beside, args=(other, settings)).start()
+
+
+def _compile_beside(program: Program, settings: str) -> None:
+    # What a block of the user's has changed, such as the precision, other threads do not know of.
+    with contextlib.suppress(Exception), _slots:
+        if threading.main_thread().is_alive() and kept.settings() == settings:
+            program.compile(lambda: program.traced)
+
+
+ANSWERS = _Answers()
+
+
+class numpy_first:  # noqa: N801 - called as a function
+    """Whether first answers come from NumPy code, as they do unless told otherwise: `rj.numpy_first(False)` from here
+    on, `with rj.numpy_first(False): ...` in a block.
+
+    A program that XLA compiles in seconds runs as NumPy code for the first two answers that ask for it, some fifty
+    times as slowly, and is compiled for the third. The two agree to rounding. Without NumPy code the first answer waits
+    for the compiler, and all answers of a process are the same to the last bit: ask for that before you measure run
+    times, or compare bits. The environment variable `RODJAX_NUMPY_FIRST=off` says so from the start.
+    """
+
+    def __init__(self, enabled: bool = True):
+        if not isinstance(enabled, bool):
+            raise TypeError(f"enabled must be True or False, got {shown(enabled)}")
+        self._before, ANSWERS.by_numpy = ANSWERS.by_numpy, enabled
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        ANSWERS.by_numpy = self._before
+
+
+def one_answer(function: F) -> F:
+    """A function that calls the same programs many times for one answer, such as a fit."""
+
+    @functools.wraps(function)
+    def answer(*args, **options):
+        with ANSWERS.one():
+            return function(*args, **options)
+
+    return cast(F, answer)
+
+
+@functools.cache
+def knows_quick() -> bool:
+    """Whether XLA has the options `QUICK`."""
+    try:
+        jax.jit(lambda: 0, compiler_options=QUICK)()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+numpy_first(kept.said(os.environ.get(VARIABLE, "")) is not False)

@@ -31,8 +31,8 @@ PATIENCE = 0.5
 VARIABLE = "RODJAX_NUMPY_FIRST"
 # Around what may take seconds; the command line says so there.
 waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
-# So many programs keep what JAX traced, and so many their NumPy code (some 10 MB and 1 MB each).
-MOST_TRACED, MOST_CODES = 16, 300
+# So many programs keep what JAX traced, and so many their NumPy code, of some 4 MB.
+MOST_TRACED, MOST_CODES = 16, 64
 _slots = threading.BoundedSemaphore(os.cpu_count() or 1)
 F = TypeVar("F", bound=Callable)
 _log = logging.getLogger("rodjax")
@@ -57,11 +57,12 @@ class Program:
         self.lock = threading.Lock()
 
     def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
-        if self.executable is None and self._is_by_numpy(args, options):
-            assert self.code is not None
+        code = self._code(args, options) if self.executable is None else None
+        if code is not None:
+            ANSWERS.remember(self)
             begin = time.perf_counter()
             try:
-                return self.code(leaves, self.seconds_left)
+                return code(leaves, self.seconds_left)
             except TookTooLongError:
                 pass
             finally:
@@ -73,17 +74,17 @@ class Program:
                 executable = self.compile(lambda: self.run.trace(*args, **options))
         return executable(*given, **named)
 
-    def _is_by_numpy(self, args: tuple, options: dict[str, Any]) -> bool:
+    def _code(self, args: tuple, options: dict[str, Any]) -> AnswerCode | None:
         """For the first answers that ask for it, as long as compiling would take longer."""
         last, count = self.asked
         self.asked = ANSWERS.number, count + (last != ANSWERS.number)
         is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
         if not ANSWERS.by_numpy or not is_early or self.seconds_left <= 0:
-            return False
+            return None
         if self.code is None:
             with waiting():
                 self._find_or_write_code(args, options)
-        return self.code is not None
+        return self.code
 
     def _find_or_write_code(self, args: tuple, options: dict[str, Any]) -> None:
         if self.name is not None:
@@ -102,7 +103,6 @@ class Program:
                 kept.store_code(self.name, self.code)
         if self.code is not None:
             self.seconds_left = PATIENCE * max(COMPILE_SECONDS * len(self.code.code), LEAST_SECONDS)
-            ANSWERS.remember(self)
 
     def compile(self, trace: Callable[[], Any]) -> Any:
         """The executable, made in any thread."""
@@ -117,6 +117,7 @@ class Program:
                 if is_new and self.name is not None:
                     kept.store(self.name, self.executable)
             self.code = self.traced = None
+            ANSWERS.forget(self)
             return self.executable
 
 
@@ -130,7 +131,7 @@ class _Answers:
         self.by_numpy, self.is_patient = True, False
         self.number = self.depth = 0
         self.lock = threading.Lock()
-        self.written: list[Program] = []  # those with NumPy code, the latest last
+        self.written: dict[Program, None] = {}  # those with NumPy code, the one called last at the end
 
     @contextlib.contextmanager
     def one(self) -> Iterator[None]:
@@ -147,13 +148,21 @@ class _Answers:
                 self.compile_others(None)
 
     def remember(self, program: Program) -> None:
-        """Those written longest ago give up what takes room."""
+        """A program is called as NumPy code: those called longest ago give up what takes room."""
         with self.lock:
-            self.written = [*(one for one in self.written if one.code is not None and one is not program), program]
-            for old in self.written[:-MOST_TRACED]:
-                old.traced = None
-            for old in self.written[:-MOST_CODES]:
-                old.code = None
+            self.written.pop(program, None)
+            self.written[program] = None
+            if len(self.written) > MOST_TRACED:
+                list(self.written)[-MOST_TRACED - 1].traced = None
+            if len(self.written) > MOST_CODES:
+                oldest = next(iter(self.written))
+                oldest.code = None
+                del self.written[oldest]
+
+    def forget(self, program: Program) -> None:
+        """A program has been compiled."""
+        with self.lock:
+            self.written.pop(program, None)
 
     def compile_others(self, program: Program | None) -> None:
         """Side by side with a program that another answer asks for, in other threads: those that were made for the same
@@ -161,7 +170,7 @@ class _Answers:
         """
         number = self.number if program is None else program.answer
         settings = kept.settings()
-        for other in self.written:
+        for other in list(self.written):
             is_due = other.answer == number and other is not program and not other.is_patient and not self.is_patient
             if is_due and other.executable is None and other.traced is not None:
                 threading.Thread(target=_compile_beside, args=(other, settings)).start()

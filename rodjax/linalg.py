@@ -287,13 +287,20 @@ def _eliminate(
 
 def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:
     """Inverse of a small symmetric matrix by sweeps, and the number of its negative eigenvalues."""
-    negative = jnp.zeros((), int)
-    for j in range(len(matrix)):
+    number = jnp.arange(len(matrix))
+
+    def swept(matrix: Float[Array, "k k"], j: Int[Array, ""]) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
         pivot, row = matrix[j, j], matrix[j]
-        negative += jnp.where(pivot < 0, 1, 0)
-        swept = matrix - row[:, None] * (row / pivot)[None, :]
-        matrix = swept.at[j, :].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1 / pivot)
-    return -matrix, negative
+        scaled = row / pivot
+        in_row, in_column = (number == j)[:, None], (number == j)[None]
+        swept = jnp.where(in_column, scaled[:, None], matrix - row[:, None] * scaled[None])
+        swept = jnp.where(in_row, jnp.where(in_column, -1 / pivot, scaled[None]), swept)
+        return swept, pivot < 0
+
+    if not len(matrix):
+        return matrix, jnp.zeros((), int)
+    matrix, below = jax.lax.scan(swept, matrix, number)
+    return -matrix, jnp.sum(below)
 
 
 def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.blocks import short_sum
+from rodjax.blocks import partial_sums, short_sum
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
@@ -185,14 +185,16 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     def forces_of(end_force: Float[Array, "3 parts"]) -> Float[Array, "3 3 n"]:
         return form.forces(MixedPoint(tangents, end_force, torque))
 
-    def bent(tangents: Float[Array, "3 m"], forces: Float[Array, "3 3 n"], torque: Float[Array, ""]):
-        """The bending moments at both ends of the elements."""
-        by_start, by_end = field.by_end_tangents(scene, tangents, forces[:, ::2], torque)
-        nodes = tangents[:, ::2]
-        return jnp.stack([-cross(nodes[:, :-1], by_start), cross(nodes[:, 1:], by_end)], axis=1)
+    def turned_about(ends: Float[Array, "3 2 n"], by_ends: tuple[Array, Array]) -> Float[Array, "3 2 n"]:
+        """The moments of what turns the tangents at both ends of the elements."""
+        return cross(ends, jnp.stack([-by_ends[0], by_ends[1]], axis=1))
 
-    forces = forces_of(point.end_force)
-    bending_moments, bent_further = jax.linearize(bent, tangents, forces, torque)
+    def at_ends(by_point: Float[Array, "3 m"]) -> Float[Array, "3 2 n"]:
+        return jnp.stack([by_point[:, 0:-1:2], by_point[:, 2::2]], axis=1)
+
+    forces, ends = forces_of(point.end_force), at_ends(tangents)
+    by_ends, further = field.by_end_tangents_linearized(scene, tangents, forces[:, ::2], torque)
+    bending_moments = turned_about(ends, by_ends)
     moments = jnp.concatenate([bending_moments[:, 0, :1], bending_moments[:, 1]], axis=1)
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
@@ -234,7 +236,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
         lambda tangents: form.edges(MixedPoint(tangents, end_force, point.total_twist)), (tangents,), (turned,)
     )
     ways = (ways + change - form.edges(point)).T + gap
-    sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
+    sums = partial_sums(ways)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
     moved = form.moved(point, here.bases, motion.rotation, force_change)
@@ -243,15 +245,16 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     # The first multiplier is the torque, where there is one.
     torque_change = motion.multipliers[0] if form.has_torsion or not form.has_potential else jnp.zeros_like(torque)
     section_change = jnp.broadcast_to(forces_of(end_force) - forces, forces.shape)
-    bending_change = bent_further(turned, section_change, torque_change) + jnp.stack([-at_start, at_end], axis=1)
-    at_ends, turned_ends = (jnp.stack([x[:, 0:-1:2], x[:, 2::2]], axis=1) for x in (tangents, turned))
+    turned_ends = at_ends(turned)
+    bending_change = turned_about(turned_ends, by_ends) + jnp.stack([-at_start, at_end], axis=1)
+    bending_change += turned_about(ends, further(turned, section_change[:, ::2], torque_change))
     relative, scale = of_sections(
         forces,
-        bending_moments + torque * at_ends,
+        bending_moments + torque * ends,
         curvature_under(rod, bending_moments),
         (
             section_change,
-            bending_change + torque_change * at_ends + torque * turned_ends,
+            bending_change + torque_change * ends + torque * turned_ends,
             curvature_under(rod, bending_change),
         ),
         has_clips=bool(scene.clips),
@@ -314,7 +317,6 @@ def bulge(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
 
 
 def _fan(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
-    swept = jax.vmap(swept_angle, in_axes=1)
     first = tangents[0]
-    parts = [swept(b, c, first, c) for b, c in itertools.pairwise(tangents[1:])]
+    parts = [swept_angle(b, c, first, c) for b, c in itertools.pairwise(tangents[1:])]
     return sum(parts, jnp.zeros_like(first[0]))

@@ -28,7 +28,7 @@ from rodjax.discretization.twist import transport
 from rodjax.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.linalg import factor_and_solve
 from rodjax.scene import slides
-from rodjax.stability import Motion, neutral_turn
+from rodjax.stability import Motion, turn_about
 from rodjax.strain import swept_angle
 from rodjax.supports import Held
 from rodjax.vectors import components, cross, dot, root
@@ -127,21 +127,26 @@ def correction(
     here: Linearization,
     gradient: Float[Array, "b m"],
     closure: Float[Array, "k"],
-    *,
-    is_turn_held: bool,
+    axis: Float[Array, "3"],
 ) -> tuple[Motion, Bool[Array, ""]]:
     """What takes a gradient and a closure away to leading order, and whether it is so soft a motion that it may be a
     turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
-    turn the rod far. With `is_turn_held` such a turn is taken out.
+    turn the rod far. The turn about the given axis, zero for none, is taken out.
     """
     motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
     if not form.has_potential:
         return motion, jnp.array(False)
-    if is_turn_held:
-        return motion.without(neutral_turn(form, point, here)), jnp.array(False)
     places = motion.rotation.shape[1]
     work = jnp.abs(jnp.sum(motion.rotation * gradient)) * places
-    return motion, work < SOFT * jnp.sum(motion.rotation**2)
+    is_soft = work < SOFT * jnp.sum(motion.rotation**2)
+    return motion.without(turn_about(form, point, here, axis)), is_soft
+
+
+def on_elements(form: MixedForm, point: MixedPoint, at_nodes: Float[Array, "3 n+1"]) -> tuple[MixedForm, MixedPoint]:
+    """A polyline with these tangents at its nodes on elements, whose middles have those of its edges."""
+    elements = MixedForm.of(form.scene, HermiteElements(form.field.s, form.field.clip_nodes))
+    tangents = interleaved(at_nodes, point.tangents)
+    return elements, MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
 
 
 def errors_of_differences(
@@ -149,16 +154,13 @@ def errors_of_differences(
     point: MixedPoint,
     nodes: Float[Array, "n+1 3"],
     at_nodes: Float[Array, "3 n+1"],
-    *,
-    is_turn_held: bool = False,
+    axis: Float[Array, "3"],
 ) -> Errors:
-    """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
-    scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
-    elements = MixedForm.of(scene, field)
-    tangents = interleaved(at_nodes, point.tangents)
-    begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
+    """Of a polyline with these nodes, and tangents there; without what turns it about an axis (see `correction`)."""
+    scene = form.scene
+    elements, begin = on_elements(form, point, at_nodes)
     here = elements.linearized(begin)
-    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, axis)
     change = elements.layout.forces(elements.closure(motion.multipliers))
     end = elements.moved(begin, here.bases, motion.rotation, change)
     found, better = resultants(form, point), resultants(elements, end)
@@ -175,7 +177,7 @@ def errors_of_differences(
     return Errors(shift, *error.relative_to(scale), scale, is_soft, None, _axial_error(elements, form, end, point))
 
 
-def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool = False) -> Errors:
+def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3"]) -> Errors:
     field, scene, tangents = form.field, form.scene, point.tangents
     assert isinstance(field, HermiteElements)
     rod, h = scene.rod, field.h
@@ -227,7 +229,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
         closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
     elif len(here.closure) > len(closure):
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
-    motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(form, point, here, gradient, closure, axis)
 
     force_change = form.layout.forces(form.closure(motion.multipliers))
     turned = short_sum(here.bases * motion.rotation[None], axis=1)

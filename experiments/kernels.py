@@ -210,7 +210,7 @@ def joint_energy(form: MixedForm, point: MixedPoint):
 
     def energy(rotations, at: Joints, bases):
         before, after = rotated(at.before, bases[0], rotations[:2]), rotated(at.after, bases[1], rotations[2:])
-        twist = jax.vmap(swept_angle, in_axes=1)(before, after, at.before, at.after)
+        twist = swept_angle(before, after, at.before, at.after)
         return Joints(before, after, at.spacing).bending_energy(scene.rod) + torque * jnp.sum(twist)
 
     bases = tangent_bases(with_held_tangents(scene, point.tangents))

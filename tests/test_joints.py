@@ -89,8 +89,7 @@ def test_bending_derivatives_are_those_of_the_energy(bent):
 
 def test_twist_derivatives_are_those_of_the_swept_angle(bent):
     def twist(joints, reference):
-        arguments = (joints.before, joints.after, reference.before, reference.after)
-        return jax.vmap(swept_angle, in_axes=1)(*arguments)
+        return swept_angle(joints.before, joints.after, reference.before, reference.after)
 
     ours = matrices(twist_derivatives(bent, beside(bent)))
     for one, other in zip(ours, automatic(twist, bent), strict=True):

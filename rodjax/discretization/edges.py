@@ -12,12 +12,13 @@ from rodjax.discretization.joints import (
     bending_derivatives,
     joints,
     of_edges,
+    tangent_bases,
     twist_derivatives,
     with_held_tangents,
 )
 from rodjax.discretization.nodes import held_nodes, with_nodes_at_clips
 from rodjax.discretization.tangent_field import Blocks
-from rodjax.discretization.twist import angle_about, swept_twist, transport_along
+from rodjax.discretization.twist import angle_about, carried_in_bases, swept_twist, turns_of_bases
 from rodjax.geometry.vectors import dot
 from rodjax.mechanics.energy import curvature_under, density
 from rodjax.model.scene import Scene
@@ -116,7 +117,7 @@ class EdgeTangents(eqx.Module):
         between = self.joints(scene, tangents)
         derivatives = bending_derivatives(scene.rod, between, (bases[..., :-1], bases[..., 1:]))
         if self.clip_nodes is None:
-            return between.bending_energy(scene.rod), Blocks(*assembled(scene, derivatives, self.segments))
+            return between.bending_energy(scene.rod), self._blocks(*assembled(scene, derivatives, self.segments))
         parted = self._is_parted(scene)
         derivatives = jax.tree.map(lambda derivative: jnp.where(parted, 0.0, derivative), derivatives)
         gradient, diagonal, lower = assembled(scene, derivatives, self.segments)
@@ -128,11 +129,16 @@ class EdgeTangents(eqx.Module):
             gradient = gradient.at[:, edge - 1].add(half.before[:, 0]).at[:, edge].add(half.after[:, 1])
             diagonal = diagonal.at[..., edge - 1].add(half.before_before[..., 0])
             diagonal = diagonal.at[..., edge].add(half.after_after[..., 1])
-        return self._bending_energy(scene, tangents), Blocks(gradient, diagonal, lower)
+        return self._bending_energy(scene, tangents), self._blocks(gradient, diagonal, lower)
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 n"], bases: Float[Array, "3 b k"]) -> Blocks:
         derivatives = twist_derivatives(self.joints(scene, tangents), (bases[..., :-1], bases[..., 1:]))
-        return Blocks(*assembled(scene, derivatives, self.segments))
+        return self._blocks(*assembled(scene, derivatives, self.segments))
+
+    def _blocks(
+        self, gradient: Float[Array, "b n"], diagonal: Float[Array, "b b n"], lower: Float[Array, "b b n-1"]
+    ) -> Blocks:
+        return Blocks(self.of_sides(gradient), self.of_sides(diagonal), lower)
 
     def swept(self, scene: Scene, old: Float[Array, "3 n"], new: Float[Array, "3 n"]) -> Float[Array, ""]:
         return swept_twist(with_held_tangents(scene, old), with_held_tangents(scene, new))
@@ -141,7 +147,10 @@ class EdgeTangents(eqx.Module):
         assert isinstance(scene.start, Clamp)
         assert isinstance(scene.end, Clamp)
         held = with_held_tangents(scene, tangents)
-        return angle_about(held[:, -1], transport_along(scene.start.frame[:, 0], held)[:, -1], scene.end.frame[:, 0])
+        bases = tangent_bases(held)
+        turned = jnp.sum(turns_of_bases(held, bases), keepdims=True)
+        carried = carried_in_bases(scene.start.frame[:, 0], bases, turned)[:, 0]
+        return angle_about(held[:, -1], carried, scene.end.frame[:, 0])
 
     @property
     def side_weights(self) -> Float[Array, "1 n"]:

@@ -22,7 +22,8 @@ def bending_energies(
 ) -> Float[Array, "n"]:
     """Of elements of the length h, from the density of a squared curvature."""
     at_ends, middle = _squared_curvatures(chords)
-    return _by_simpson(density(at_ends / (h**2)[None]), density(middle / h**2), h)
+    per_length = 1 / h
+    return _by_simpson(density(at_ends * (per_length**2)[None]), density(middle * per_length**2), h)
 
 
 def _squared_curvatures(chords: Float[Array, "3 n"]) -> tuple[Float[Array, "2 n"], Float[Array, "n"]]:
@@ -31,12 +32,13 @@ def _squared_curvatures(chords: Float[Array, "3 n"]) -> tuple[Float[Array, "2 n"
     x = chords[:2] / 2  # squared sines of half the angles
     above = _above(x)
     ratio, rest = 1 + x * above, 1 + above
+    inverse = 1 / ratio
     squared = 4 * x * ratio  # |v_a|^2, |v_c|^2
-    root = jnp.sqrt(ratio / (1 - x))
+    root = jnp.sqrt(ratio * (1 / (1 - x)))
     product = root[0] * root[1] * (ab + bc - ac - ab * bc)  # v_a . v_c
     # v changes by 3 v_a + v_c; across v_a that moves the tangent only by sin(t)/t as much.
     whole = 9 * squared + squared[::-1] + 6 * product[None]
-    at_ends = whole - (x * rest / ratio) * squared[::-1] + rest / (4 * ratio**2) * (product**2)[None]
+    at_ends = whole - x * rest * inverse * squared[::-1] + rest / 4 * inverse**2 * (product**2)[None]
     return at_ends, squared[0] + squared[1] - 2 * product
 
 
@@ -46,7 +48,7 @@ def _by_simpson(ends: Float[Array, "2 n"], middle: Float[Array, "n"], h: Float[A
 
 def _above(x: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
     """(t^2/(4 x) - 1)/x, see `SERIES`."""
-    return SERIES[0] + x * SERIES[1] + x**2 * SERIES[2] + SERIES[3] * x**3 / (1 - x)
+    return SERIES[0] + x * SERIES[1] + x**2 * SERIES[2] + SERIES[3] * x**3 * (1 / (1 - x))
 
 
 class _OfX(NamedTuple):
@@ -61,17 +63,24 @@ class _OfX(NamedTuple):
         return _OfX(self.value, self.first / 2, self.second / 4)
 
     def over(self, other: "_OfX") -> "_OfX":
-        value = self.value / other.value
-        first = (self.first - value * other.first) / other.value
-        return _OfX(value, first, (self.second - 2 * first * other.first - value * other.second) / other.value)
+        inverse = 1 / other.value
+        value = self.value * inverse
+        first = (self.first - value * other.first) * inverse
+        return _OfX(value, first, (self.second - 2 * first * other.first - value * other.second) * inverse)
 
     def times_x(self, x: Float[Array, "2 n"]) -> "_OfX":
         return _OfX(x * self.value, self.value + x * self.first, 2 * self.first + x * self.second)
 
+    def over_rest(self, inverse: Array) -> "_OfX":
+        """Over 1 - x, of which the inverse is given."""
+        first = self.first + self.value * inverse
+        return _OfX(self.value * inverse, first * inverse, (self.second + 2 * first * inverse) * inverse)
+
     def root(self) -> "_OfX":
         value = jnp.sqrt(self.value)
-        first = self.first / (2 * value)
-        return _OfX(value, first, (self.second / 2 - first**2) / value)
+        inverse = 1 / value
+        first = self.first / 2 * inverse
+        return _OfX(value, first, (self.second / 2 - first**2) * inverse)
 
 
 def by_chords(
@@ -98,7 +107,7 @@ def by_chords(
     g, g1, g2 = rest.times_x(x).over(ratio).by_chord()
     q, q1, q2 = rest.over(ratio).over(ratio).by_chord()
     q, q1, q2 = q / 4, q1 / 4, q2 / 4
-    r, r1, r2 = ratio.over(_OfX(1 - x, -jnp.ones_like(x), jnp.zeros_like(x))).root().by_chord()
+    r, r1, r2 = ratio.over_rest(inverse).root().by_chord()
 
     # p = r r' d.
     ab, bc, ac = chords
@@ -126,10 +135,11 @@ def by_chords(
     m1, mz = s1 - 2 * p1, -2 * pz
 
     k, m = _squared_curvatures(chords)
-    ends, e, ee = _derivatives(density, k / (h**2)[None])
-    middle, f, ff = _derivatives(density, m / h**2)
-    e, f = e * (SIMPSON[0] / h)[None], f * (SIMPSON[1] / h)
-    ee, ff = ee * (SIMPSON[0] / h**3)[None], ff * (SIMPSON[1] / h**3)
+    per_length = 1 / h
+    ends, e, ee = _derivatives(density, k * (per_length**2)[None])
+    middle, f, ff = _derivatives(density, m * per_length**2)
+    e, f = e * (SIMPSON[0] * per_length)[None], f * (SIMPSON[1] * per_length)
+    ee, ff = ee * (SIMPSON[0] * per_length**3)[None], ff * (SIMPSON[1] * per_length**3)
     own1, own2, ownz = ee * k1, ee * k2, ee * kz
 
     def both(of_end: Float[Array, "2 n"]) -> Float[Array, "n"]:

@@ -22,11 +22,11 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.motion import Motion, neutral_turn
+from rodjax.discretization.motion import Motion, turn_about
 from rodjax.discretization.results import clip_moments, resultants
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
-from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.blocks import partial_sums, short_sum
 from rodjax.linalg.saddle_point import factor_and_solve
 from rodjax.mechanics.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.mechanics.strain import swept_angle
@@ -127,21 +127,26 @@ def correction(
     here: Linearization,
     gradient: Float[Array, "b m"],
     closure: Float[Array, "k"],
-    *,
-    is_turn_held: bool,
+    axis: Float[Array, "3"],
 ) -> tuple[Motion, Bool[Array, ""]]:
     """What takes a gradient and a closure away to leading order, and whether it is so soft a motion that it may be a
     turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
-    turn the rod far. With `is_turn_held` such a turn is taken out.
+    turn the rod far. The turn about the given axis, zero for none, is taken out.
     """
     motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
     if not form.has_potential:
         return motion, jnp.array(False)
-    if is_turn_held:
-        return motion.without(neutral_turn(form, point, here)), jnp.array(False)
     places = motion.rotation.shape[1]
     work = jnp.abs(jnp.sum(motion.rotation * gradient)) * places
-    return motion, work < SOFT * jnp.sum(motion.rotation**2)
+    is_soft = work < SOFT * jnp.sum(motion.rotation**2)
+    return motion.without(turn_about(form, point, here, axis)), is_soft
+
+
+def on_elements(form: MixedForm, point: MixedPoint, at_nodes: Float[Array, "3 n+1"]) -> tuple[MixedForm, MixedPoint]:
+    """A polyline with these tangents at its nodes on elements, whose middles have those of its edges."""
+    elements = MixedForm.of(form.scene, HermiteElements(form.field.s, form.field.clip_nodes))
+    tangents = interleaved(at_nodes, point.tangents)
+    return elements, MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
 
 
 def errors_of_differences(
@@ -149,16 +154,13 @@ def errors_of_differences(
     point: MixedPoint,
     nodes: Float[Array, "n+1 3"],
     at_nodes: Float[Array, "3 n+1"],
-    *,
-    is_turn_held: bool = False,
+    axis: Float[Array, "3"],
 ) -> Errors:
-    """Of a polyline with these nodes, and tangents there; those of its edges, of the `point`, are the middle ones."""
-    scene, field = form.scene, HermiteElements(form.field.s, form.field.clip_nodes)
-    elements = MixedForm.of(scene, field)
-    tangents = interleaved(at_nodes, point.tangents)
-    begin = MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
+    """Of a polyline with these nodes, and tangents there; without what turns it about an axis (see `correction`)."""
+    scene = form.scene
+    elements, begin = on_elements(form, point, at_nodes)
     here = elements.linearized(begin)
-    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, axis)
     change = elements.layout.forces(elements.closure(motion.multipliers))
     end = elements.moved(begin, here.bases, motion.rotation, change)
     found, better = resultants(form, point), resultants(elements, end)
@@ -175,7 +177,7 @@ def errors_of_differences(
     return Errors(shift, *error.relative_to(scale), scale, is_soft, None, _axial_error(elements, form, end, point))
 
 
-def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool = False) -> Errors:
+def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3"]) -> Errors:
     field, scene, tangents = form.field, form.scene, point.tangents
     assert isinstance(field, HermiteElements)
     rod, h = scene.rod, field.h
@@ -185,14 +187,16 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     def forces_of(end_force: Float[Array, "3 parts"]) -> Float[Array, "3 3 n"]:
         return form.forces(MixedPoint(tangents, end_force, torque))
 
-    def bent(tangents: Float[Array, "3 m"], forces: Float[Array, "3 3 n"], torque: Float[Array, ""]):
-        """The bending moments at both ends of the elements."""
-        by_start, by_end = field.by_end_tangents(scene, tangents, forces[:, ::2], torque)
-        nodes = tangents[:, ::2]
-        return jnp.stack([-cross(nodes[:, :-1], by_start), cross(nodes[:, 1:], by_end)], axis=1)
+    def turned_about(ends: Float[Array, "3 2 n"], by_ends: tuple[Array, Array]) -> Float[Array, "3 2 n"]:
+        """The moments of what turns the tangents at both ends of the elements."""
+        return cross(ends, jnp.stack([-by_ends[0], by_ends[1]], axis=1))
 
-    forces = forces_of(point.end_force)
-    bending_moments, bent_further = jax.linearize(bent, tangents, forces, torque)
+    def at_ends(by_point: Float[Array, "3 m"]) -> Float[Array, "3 2 n"]:
+        return jnp.stack([by_point[:, 0:-1:2], by_point[:, 2::2]], axis=1)
+
+    forces, ends = forces_of(point.end_force), at_ends(tangents)
+    by_ends, further = field.by_end_tangents_linearized(scene, tangents, forces[:, ::2], torque)
+    bending_moments = turned_about(ends, by_ends)
     moments = jnp.concatenate([bending_moments[:, 0, :1], bending_moments[:, 1]], axis=1)
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
@@ -225,7 +229,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
         closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
     elif len(here.closure) > len(closure):
         closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
-    motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(form, point, here, gradient, closure, axis)
 
     force_change = form.layout.forces(form.closure(motion.multipliers))
     turned = short_sum(here.bases * motion.rotation[None], axis=1)
@@ -234,7 +238,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
         lambda tangents: form.edges(MixedPoint(tangents, end_force, point.total_twist)), (tangents,), (turned,)
     )
     ways = (ways + change - form.edges(point)).T + gap
-    sums = jnp.concatenate([jnp.zeros_like(ways[:, :1]), jnp.cumsum(ways, axis=1)], axis=1)
+    sums = partial_sums(ways)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
     moved = form.moved(point, here.bases, motion.rotation, force_change)
@@ -243,15 +247,16 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, *, is_turn_held: bool
     # The first multiplier is the torque, where there is one.
     torque_change = motion.multipliers[0] if form.has_torsion or not form.has_potential else jnp.zeros_like(torque)
     section_change = jnp.broadcast_to(forces_of(end_force) - forces, forces.shape)
-    bending_change = bent_further(turned, section_change, torque_change) + jnp.stack([-at_start, at_end], axis=1)
-    at_ends, turned_ends = (jnp.stack([x[:, 0:-1:2], x[:, 2::2]], axis=1) for x in (tangents, turned))
+    turned_ends = at_ends(turned)
+    bending_change = turned_about(turned_ends, by_ends) + jnp.stack([-at_start, at_end], axis=1)
+    bending_change += turned_about(ends, further(turned, section_change[:, ::2], torque_change))
     relative, scale = of_sections(
         forces,
-        bending_moments + torque * at_ends,
+        bending_moments + torque * ends,
         curvature_under(rod, bending_moments),
         (
             section_change,
-            bending_change + torque_change * at_ends + torque * turned_ends,
+            bending_change + torque_change * ends + torque * turned_ends,
             curvature_under(rod, bending_change),
         ),
         has_clips=bool(scene.clips),
@@ -314,7 +319,6 @@ def bulge(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
 
 
 def _fan(tangents: list[Float[Array, "3 n"]]) -> Float[Array, "n"]:
-    swept = jax.vmap(swept_angle, in_axes=1)
     first = tangents[0]
-    parts = [swept(b, c, first, c) for b, c in itertools.pairwise(tangents[1:])]
+    parts = [swept_angle(b, c, first, c) for b, c in itertools.pairwise(tangents[1:])]
     return sum(parts, jnp.zeros_like(first[0]))

@@ -68,7 +68,9 @@ def twist_on(
     shape = begin if last.shape is None else last.shape
     old = field.with_held(before, shape.tangents)
     # A shape from another mesh meets the frames only nearly.
-    old = old.at[:, 0].set(last.start_frame[:, 2]).at[:, -1].set(last.end_frame[:, 2])
+    number = jnp.arange(old.shape[1])
+    old = jnp.where(number == 0, last.start_frame[:, 2:], old)
+    old = jnp.where(number == old.shape[1] - 1, last.end_frame[:, 2:], old)
     reference = TwistReference(FramedTangents(old, last.start_frame[:, 0], last.end_frame[:, 0]), first.total_twist)
     new = FramedTangents(field.with_held(scene, tangents), start.frame[:, 0], end.frame[:, 0])
     carried = total_twist(reference, new)

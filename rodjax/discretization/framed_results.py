@@ -232,11 +232,11 @@ class Pose(eqx.Module):
     moment: Float[Array, "3 n"]
 
 
-def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool = False) -> Errors:
+def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]) -> Errors:
     """As `error.errors_of_elements`: what the elements lack enters as strains at rest, couples and ways at rest."""
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
-        return _errors_of_joints(form, point, is_turn_held)
+        return _errors_of_joints(form, point, axis)
     ends = _end_moments(form, point)
     moments = ends[:, 0]
     if not form.scene.clips:
@@ -265,7 +265,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, *, is_turn_held: bool =
     _, (gradient, closure) = jax.jvp(lambda amount: lacking(amount).unbalanced(point), (zero,), (one,))
     gradient += jnp.zeros_like(gradient).at[:, 2::2].set(rotated(inverse(nodes[:, 1:]), couple)) * form.is_free
     here = form.linearized(point)
-    motion, is_soft = correction(form, point, here, gradient, closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(form, point, here, gradient, closure, axis)
     change = form.layout.forces(form.closure(motion.multipliers))
 
     def reached(amount: Float[Array, ""]) -> Float[Array, "3 n"]:
@@ -338,15 +338,21 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
     return last
 
 
-def _errors_of_joints(form: FrameForm, point: FramePoint, is_turn_held: bool) -> Errors:
-    """The way to the elements between the same nodes by one step of Newton's method."""
-    field, scene = form.field, form.scene
-    elements = FrameForm.of(scene, ElementCells(field.s))
-    nodes = field.at_nodes(point.quaternions)
+def framed_on_elements(form: FrameForm, point: FramePoint) -> tuple[FrameForm, FramePoint]:
+    """A rod by finite differences on elements between the same nodes."""
+    if isinstance(form.field, ElementCells):
+        return form, point
+    nodes = form.field.at_nodes(point.quaternions)
     q = jnp.stack([nodes[:, :-1], point.quaternions[:, 1:-1]], axis=2).reshape(4, -1)
     begin = FramePoint(jnp.concatenate([q, nodes[:, -1:]], axis=1), point.end_force, point.total_twist)
+    return FrameForm.of(form.scene, ElementCells(form.field.s)), begin
+
+
+def _errors_of_joints(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]) -> Errors:
+    """The way to the elements between the same nodes by one step of Newton's method."""
+    elements, begin = framed_on_elements(form, point)
     here = elements.linearized(begin)
-    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, is_turn_held=is_turn_held)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, axis)
     change = elements.layout.forces(elements.closure(motion.multipliers))
     end = elements.moved(begin, here.bases, motion.rotation, change)
     found, better = resultants_of_frames(form, point), resultants_of_frames(elements, end)

@@ -11,25 +11,26 @@ t approaches pi: an element has no way through a fold. All strains are rational 
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.element_bending import SIMPSON, bending_energies, by_chords
 from rodjax.discretization.form import Form
-from rodjax.discretization.joints import Joints, outer, twist_derivatives, twist_gradient
+from rodjax.discretization.joints import Joints, outer, tangent_bases, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed import MixedPoint
 from rodjax.discretization.nodes import held_nodes, with_nodes_at, with_nodes_at_clips
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
-from rodjax.discretization.twist import angle_about, transport_along
+from rodjax.discretization.twist import angle_about, carried_in_bases, turns_of_bases
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.vectors import components, cross, dot
-from rodjax.linalg.blocks import short_sum
+from rodjax.geometry.vectors import components, cross, dot, root
+from rodjax.linalg.blocks import partial_sums, short_sum
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import Scene
@@ -84,38 +85,31 @@ class HermiteElements(eqx.Module):
         return tangents
 
     def as_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
-        if isinstance(scene.start, Directed):
-            tangents = tangents.at[:, 0].set(scene.start.tangent)
-        if isinstance(scene.end, Directed):
-            tangents = tangents.at[:, -1].set(scene.end.tangent)
-        for point, tangent in self._directed(scene):
-            tangents = tangents.at[:, point].set(tangent)
+        for is_there, tangent in self._directed(scene):
+            tangents = jnp.where(is_there, tangent[:, None], tangents)
         return tangents
 
-    def _directed(self, scene: Scene) -> list[tuple[Int[Array, ""], Float[Array, "3"]]]:
-        """The points at which clips hold the tangent, and what it is there."""
-        return [(2 * held.node, held.tangent) for held in held_nodes(scene, self.clip_nodes)]
+    def _directed(self, scene: Scene) -> list[tuple[Bool[Array, "m"], Float[Array, "3"]]]:
+        """The points at which supports and clips hold the tangent, each marked along the rod, and what it is there."""
+        number = jnp.arange(self.points)
+        held = [(number == 2 * held.node, held.tangent) for held in held_nodes(scene, self.clip_nodes)]
+        for end, point in ((scene.end, self.points - 1), (scene.start, 0)):
+            if isinstance(end, Directed):
+                held.insert(0, (number == point, end.tangent))
+        return held
+
+    def _is_directed(self, scene: Scene) -> Bool[Array, "m"]:
+        none = jnp.zeros(self.points, bool)
+        return functools.reduce(jnp.logical_or, (is_there for is_there, _ in self._directed(scene)), none)
 
     def basis(self, scene: Scene, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
         """The directions in which each tangent may turn: none where a support holds it."""
-        if isinstance(scene.start, Directed):
-            bases = bases.at[..., 0].set(0.0)
-        if isinstance(scene.end, Directed):
-            bases = bases.at[..., -1].set(0.0)
-        for point, _ in self._directed(scene):
-            bases = bases.at[..., point].set(0.0)
-        return bases
+        return jnp.where(self._is_directed(scene), 0.0, bases)
 
     def held(self, scene: Scene, diagonal: Float[Array, "b b m"]) -> Float[Array, "b b m"]:
         """With a unit block for each tangent that does not turn."""
-        identity = jnp.eye(len(diagonal), dtype=diagonal.dtype)
-        if isinstance(scene.start, Directed):
-            diagonal = diagonal.at[..., 0].set(identity)
-        if isinstance(scene.end, Directed):
-            diagonal = diagonal.at[..., -1].set(identity)
-        for point, _ in self._directed(scene):
-            diagonal = diagonal.at[..., point].set(identity)
-        return diagonal
+        identity = np.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
+        return jnp.where(self._is_directed(scene), identity, diagonal)
 
     # --- strains -----------------------------------------------------------------------------------------------------
 
@@ -150,7 +144,10 @@ class HermiteElements(eqx.Module):
 
     def swept(self, scene: Scene, old: Float[Array, "3 m"], new: Float[Array, "3 m"]) -> Float[Array, ""]:
         """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
-        return jnp.sum(_arcs(of_elements(new), of_elements(old)))
+        half, _, whole = ARC_WEIGHTS
+        halves = swept_angle(new[:, :-1], new[:, 1:], old[:, :-1], old[:, 1:])
+        wholes = swept_angle(new[:, :-1:2], new[:, 2::2], old[:, :-1:2], old[:, 2::2])
+        return half * jnp.sum(halves) + whole * jnp.sum(wholes)
 
     def by_end_tangents(
         self, scene: Scene, tangents: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]
@@ -158,14 +155,37 @@ class HermiteElements(eqx.Module):
         """The derivatives of what each element adds to the Lagrangian by the tangents of its start and end, where
         `forces` run through the rod.
         """
-        rod = scene.rod
-        chords = _half_squared_chords(tangents)
+        _, by_chord, _ = by_chords(functools.partial(density, scene.rod), _half_squared_chords(tangents), self.h)
+        return self._by_end_tangents(scene, tangents, forces, torque, by_chord)
+
+    def by_end_tangents_linearized(
+        self, scene: Scene, tangents: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]
+    ) -> tuple[tuple[Array, Array], Callable[[Array, Array, Array], tuple[Array, Array]]]:
+        """The same, and how it changes with tangents, forces and torque: of the bending by its second derivatives."""
+        of_section = functools.partial(density, scene.rod)
+        _, by_chord, second = by_chords(of_section, _half_squared_chords(tangents), self.h)
+        ends = functools.partial(self._by_end_tangents, scene)
+        values, further = jax.linearize(ends, tangents, forces, torque, by_chord)
+
+        def change(turned: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]):
+            _, chords = jax.jvp(_half_squared_chords, (tangents,), (turned,))
+            bent = jnp.stack([_added(map(jnp.multiply, row, jnp.unstack(chords))) for row in second])
+            return further(turned, forces, torque, bent)
+
+        return values, change
+
+    def _by_end_tangents(
+        self,
+        scene: Scene,
+        tangents: Float[Array, "3 m"],
+        forces: Float[Array, "3 2 n"],
+        torque: Float[Array, ""],
+        by_chord: Float[Array, "3 n"],
+    ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
         first, last = _of_pairs(tangents)
-        of_section = functools.partial(density, rod)
-        by_chord = jax.grad(lambda chords: jnp.sum(bending_energies(of_section, chords, self.h)))(chords)
         normals = (torque * jnp.array(ARC_WEIGHTS, torque.dtype))[None, :, None] * twist_gradient(first, last)
         points = jnp.stack([tangents[:, 0:-1:2], tangents[:, 2::2]], axis=1)
-        strain = axial_strain_under(rod, dot(forces, points))
+        strain = axial_strain_under(scene.rod, dot(forces, points))
         stretching = (-SIMPSON[0] * self.h[None] * (1 + strain))[None] * forces
         by_first, by_last = normals - by_chord[None] * last, normals - by_chord[None] * first
         start = by_first[:, 0] + by_first[:, 2] + stretching[:, 0]
@@ -174,22 +194,16 @@ class HermiteElements(eqx.Module):
 
     def carried(self, d1: Float[Array, "3"], tangents: Float[Array, "3 m"]) -> Float[Array, "3 n+1"]:
         """`d1` at the first tangent carried along the curve without twist, to the nodes."""
-        along = transport_along(d1, tangents)[:, ::2]
-        nodes = tangents[:, ::2]
-        straight = nodes[:, :-1] + nodes[:, 1:]
-        straight /= jnp.sqrt(dot(straight, straight))[None]
-        # A polygon lags behind the curve by a third of the area between whole and half elements, summed.
-        a, b, c = of_elements(tangents)
-        swept = jax.vmap(swept_angle, in_axes=1)
-        bulge = swept(a, b, a, straight) + swept(b, c, straight, c)
-        angle = -jnp.concatenate([jnp.zeros_like(bulge[:1]), jnp.cumsum(bulge)]) / 3
-        return jnp.cos(angle)[None] * along + jnp.sin(angle)[None] * cross(nodes, along)
+        bases = tangent_bases(tangents)
+        return carried_in_bases(d1, bases[..., ::2], partial_sums(_turns_along(tangents, bases)))
 
     def principal_twist(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
         """The total twist between two clamps [rad], up to whole turns."""
         assert isinstance(scene.start, Clamp)
         assert isinstance(scene.end, Clamp)
-        carried = self.carried(scene.start.frame[:, 0], tangents)[:, -1]
+        bases = tangent_bases(tangents)
+        turned = jnp.sum(_turns_along(tangents, bases), keepdims=True)
+        carried = carried_in_bases(scene.start.frame[:, 0], bases, turned)[:, 0]
         return angle_about(tangents[:, -1], carried, scene.end.frame[:, 0])
 
     # --- points by elements ------------------------------------------------------------------------------------------
@@ -282,10 +296,10 @@ class Curve(Shape):
     def turned_to_ends(self, scene: Scene, places: Float[Array, "m"]) -> Float[Array, "3 m"]:
         """The tangents turned to those that the supports hold, by less and less away from them."""
         tangents = self.tangents
-        if isinstance(scene.start, Directed):
-            tangents = _turned(tangents, tangents[:, 0], scene.start.tangent, 1.0 - places)
-        if isinstance(scene.end, Directed):
-            tangents = _turned(tangents, tangents[:, -1], scene.end.tangent, places)
+        ends = [(0, scene.start, 1.0 - places), (-1, scene.end, places)]
+        for k, end, part in ends:
+            if isinstance(end, Directed):
+                tangents = _turned(tangents, tangents[:, k], end.tangent, part)
         return _turned_in_clips(scene, tangents, places) if scene.clips else tangents
 
 
@@ -305,15 +319,25 @@ def _turned(
     tangents: Float[Array, "3 m"], old: Float[Array, "3"], new: Float[Array, "3"], part: Float[Array, "m"]
 ) -> Float[Array, "3 m"]:
     """Turned by parts of the smallest rotation from one unit vector to another; the same bits where these are equal."""
-    axis = jnp.cross(old, new)
-    sine = jnp.sqrt(jnp.sum(axis**2))
-    turns = jnp.any(old != new) & (sine > 0)
-    axis /= jnp.where(turns, sine, 1.0)
-    angle = part * jnp.arctan2(sine, jnp.sum(old * new))
-    along = axis[:, None] * (axis @ tangents)[None]
-    across = cross(jnp.broadcast_to(axis[:, None], tangents.shape), tangents)
-    turned = along + jnp.cos(angle)[None] * (tangents - along) + jnp.sin(angle)[None] * across
+    axis = cross(old, new)
+    sine = root(dot(axis, axis))
+    turns = (dot(new - old, new - old) > 0) & (sine > 0)
+    axis = jnp.broadcast_to((axis / jnp.where(turns, sine, 1.0))[:, None], tangents.shape)
+    angle = part * jnp.arctan2(sine, dot(old, new))
+    along = axis * dot(axis, tangents)[None]
+    turned = along + jnp.cos(angle)[None] * (tangents - along) + jnp.sin(angle)[None] * cross(axis, tangents)
     return jnp.where(turns, turned, tangents)
+
+
+def _turns_along(tangents: Float[Array, "3 m"], bases: Float[Array, "3 2 m"]) -> Float[Array, "n"]:
+    """The angles by which the bases turn about the curve along each element [rad]."""
+    of_points = turns_of_bases(tangents, bases)
+    # A polygon lags behind the curve by a third of the area between whole and half elements.
+    a, b, c = of_elements(tangents)
+    straight = a + c
+    straight *= 1 / jnp.sqrt(dot(straight, straight))[None]
+    bulge = swept_angle(a, b, a, straight) + swept_angle(b, c, straight, c)
+    return of_points[::2] + of_points[1::2] + bulge / 3
 
 
 def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:
@@ -321,23 +345,18 @@ def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:
     return by_point[..., 0:-1:2], by_point[..., 1::2], by_point[..., 2::2]
 
 
-def _arcs(new: tuple[Array, Array, Array], old: tuple[Array, Array, Array]) -> Float[Array, "n"]:
-    """What the total twist gains in each element as its tangents move and the frames follow by smallest rotations."""
-    swept = jax.vmap(swept_angle, in_axes=1)
-    arcs = [w * swept(new[i], new[j], old[i], old[j]) for (i, j), w in zip(PAIRS, ARC_WEIGHTS, strict=True)]
-    return arcs[0] + arcs[1] + arcs[2]
-
-
 def interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) -> Float[Array, "... m"]:
-    pairs = jnp.stack([nodes[..., :-1], middles], axis=-1)
-    return jnp.concatenate([pairs.reshape(*nodes.shape[:-1], -1), nodes[..., -1:]], axis=-1)
+    pairs = jnp.stack([nodes, _padded(middles, 0, 1)], axis=-1)
+    return pairs.reshape(*nodes.shape[:-1], -1)[..., :-1]
 
 
 def assembled(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
     """Sums over the elements at each point."""
-    none = jnp.zeros_like(start[..., :1])
-    nodes = jnp.concatenate([start, none], axis=-1) + jnp.concatenate([none, end], axis=-1)
-    return interleaved(nodes, middle)
+    return interleaved(_padded(start, 0, 1) + _padded(end, 1, 0), middle)
+
+
+def _padded(x: Float[Array, "... n"], before: int, after: int) -> Float[Array, "... k"]:
+    return jax.lax.pad(x, jnp.zeros((), x.dtype), [*[(0, 0, 0)] * (x.ndim - 1), (before, after, 0)])
 
 
 def parts_before(s: Float[Array, "n+1"], at: Float[Array, ""]) -> Float[Array, "3 n"]:
@@ -377,10 +396,10 @@ def _added(terms: Iterable[Array]) -> Array:
 
 
 def _blocks(gradient: tuple[Array, Array, Array], diagonal: tuple[Array, Array, Array], below: Array) -> Blocks:
-    """Element by element -> point by point. `below`: by the last point of each pair, then by its first."""
+    """Of start, middle and end of the elements. `below`: by the last point of each pair, then by its first."""
     return Blocks(
-        gradient=assembled(*gradient),
-        diagonal=assembled(*diagonal),
+        gradient=jnp.stack(gradient, axis=-2),
+        diagonal=jnp.stack(diagonal, axis=-2),
         lower=jnp.stack([below[..., 0, :], below[..., 1, :]], axis=-1).reshape(*below.shape[:2], -1),
         across=below[..., 2, :],
     )

@@ -94,9 +94,8 @@ def tangent_bases(tangents: Float[Array, "3 n"]) -> Float[Array, "3 2 n"]:
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
     a = -1 / (sign + z)
     b = x * y * a
-    return jnp.stack(
-        [jnp.stack([1 + sign * x * x * a, b]), jnp.stack([sign * b, sign + y * y * a]), jnp.stack([-sign * x, -y])]
-    )
+    rows = [1 + sign * x * x * a, b, sign * b, sign + y * y * a, -sign * x, -y]
+    return jnp.stack(rows).reshape(3, 2, *z.shape)
 
 
 def rotated(

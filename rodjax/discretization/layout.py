@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from rodjax.linalg.blocks import partial_sums
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Held
 
@@ -145,14 +146,13 @@ def held_places(
 ) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
     """The positions that are held along the rod, and the numbers of the nodes there."""
     start, end = scene.start, scene.end
-    nodes = jnp.zeros(0, int) if clip_nodes is None else clip_nodes
+    nodes = [] if clip_nodes is None else [*clip_nodes]
     positions = [clip.position for clip in scene.clips]
     if isinstance(start, Held):
-        positions, nodes = [start.position, *positions], jnp.pad(nodes, (1, 0))
+        positions, nodes = [start.position, *positions], [0, *nodes]
     if isinstance(end, Held):
-        positions = [*positions, end.position]
-        nodes = jnp.pad(nodes, (0, 1), constant_values=len(s) - 1)
-    return jnp.stack(positions, axis=1), nodes
+        positions, nodes = [*positions, end.position], [*nodes, len(s) - 1]
+    return jnp.stack(positions, axis=1), jnp.array(nodes)
 
 
 def nodes_along(
@@ -160,16 +160,19 @@ def nodes_along(
 ) -> Float[Array, "n+1 3"]:
     """Nodes at the arclengths `s` along the edges, at held places to the last digit."""
     positions, held = held_places(scene, s, clip_nodes)
-    nodes = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-    missing = positions.T - nodes[held]
-    if len(missing) == 1:
+    nodes = partial_sums(edges.T)
+    missing = positions - jnp.stack([nodes[:, held[k]] for k in range(len(held))], axis=1)
+    if len(held) == 1:
         nodes += missing
     elif clip_nodes is None:
-        nodes += missing[:1] + s[:, None] * (missing[1:] - missing[:1])
+        nodes += missing[:, :1] + s[None] * (missing[:, 1:] - missing[:, :1])
     else:
         # Beyond the last held place all of the rod goes with it.
-        nodes += jax.vmap(lambda component: jnp.interp(s, s[held], component), 1, 1)(missing)
-    return nodes.at[held].set(positions.T)
+        nodes += jax.vmap(lambda component: jnp.interp(s, s[held], component))(missing)
+    number = jnp.arange(len(s))
+    for k in range(len(held)):
+        nodes = jnp.where(number == held[k], positions[:, k, None], nodes)
+    return nodes.T
 
 
 def force_parts(scene: Scene, segments: int) -> int:

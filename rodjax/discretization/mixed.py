@@ -26,6 +26,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.dead_loads import total_force
@@ -63,13 +64,14 @@ class MixedPoint(eqx.Module):
 class Elastic(NamedTuple):
     """Bending and torsion of a `Linearization`.
 
-    `torque_column`: by the torque; `softness`: of the rod against it where the total twist is given; else `None`.
+    `torque_column`: by the torque, by the points of each cell; `softness`: of the rod against it where the total twist
+    is given; else `None`.
     """
 
     bases: Float[Array, "3 b m"]
     energy: Float[Array, ""]
     blocks: Blocks
-    torque_column: Float[Array, "b 1 m"] | None
+    torque_column: Float[Array, "b 1 p n"] | None
     softness: Float[Array, ""] | None
 
 
@@ -79,8 +81,8 @@ class ByCells(NamedTuple):
     """
 
     energy: Float[Array, ""]
-    gradient: Float[Array, "b m"]
-    diagonal: Float[Array, "b b m"]
+    gradient: Float[Array, "b p n"]
+    diagonal: Float[Array, "b b p n"]
     lengths: Float[Array, "p n"]
     along: Float[Array, "3 p n"]
     softness: Float[Array, "p n"]
@@ -249,12 +251,16 @@ class MixedForm(Form):
         scene, tangents = self.scene, point.tangents
         assert isinstance(self.layout, SpanForces)
         bases, energy, blocks, torque_column, softness = self._elastic(point)
-        cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
-        energy, gradient = energy + cells.energy, cells.gradient
-        columns, closure, compliance, rows = [], [], [], None
+        cells = self._by_cells(point, bases, blocks)
+        border = [self.layout.columns(cells.by_force)] if self.layout.size else []
+        if torque_column is not None:
+            border = [torque_column, *border]
+        by_point = map(self.field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *border))
+        gradient, diagonal, lengths, *border = by_point
+        energy += cells.energy
+        columns, closure, compliance, rows = border, [], [], None
         if softness is not None:
-            assert torque_column is not None
-            columns, closure, compliance = [torque_column], [jnp.zeros(1, energy.dtype)], [softness[None, None]]
+            closure, compliance = [jnp.zeros(1, energy.dtype)], [softness[None, None]]
         moment = dead_end_moment(scene)
         if moment is not None:
             n = tangents.shape[1]
@@ -266,8 +272,7 @@ class MixedForm(Form):
             sign = -1 if edge == 0 else 1
             spin = jnp.sum(moment * tangent) / 2 * jnp.array([[1.0, 0.0], [0.0, -1.0]], energy.dtype)
             at_edge = jnp.zeros((2, 2, n), energy.dtype).at[:, :, edge]
-            assert torque_column is not None
-            columns = [torque_column, at_edge.set(spin)]
+            columns = [border[0], at_edge.set(spin), *border[1:]]
             torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
             rows = [torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))]
             closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
@@ -275,18 +280,16 @@ class MixedForm(Form):
             energy += jnp.sum(point.end_force * self.spans)
             ways = short_sum(cells.lengths[None] * cells.along, axis=1)
             lacking = self.layout.components(self.spans - self.layout.sums(ways))
-            border = self.field.of_points(self.layout.columns(cells.by_force))
-            columns, closure = [*columns, border], [*closure, lacking]
+            closure = [*closure, lacking]
             compliance.append(self.layout.compliance(cells.compliance))
-            rows = None if rows is None else [*rows, border]
+            rows = None if rows is None else [*rows, border[-1]]
         nothing = jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1]), energy.dtype)
-        lengths = self.field.of_points(cells.lengths)
         return Linearization(
             bases=bases,
             gradient=gradient,
             closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
-                self.field.held(scene, cells.diagonal),
+                self.field.held(scene, diagonal),
                 blocks.lower,
                 jnp.concatenate(columns, axis=1) if columns else nothing,
                 jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
@@ -312,13 +315,7 @@ class MixedForm(Form):
             return Elastic(bases, energy, blocks, torque_column, None)
         return Elastic(bases, energy + torsion, blocks, torque_column, 1 / stiffness)
 
-    def _by_cells(
-        self,
-        point: MixedPoint,
-        bases: Float[Array, "3 b m"],
-        gradient: Float[Array, "b m"],
-        diagonal: Float[Array, "b b m"],
-    ) -> ByCells:
+    def _by_cells(self, point: MixedPoint, bases: Float[Array, "3 b m"], blocks: Blocks) -> ByCells:
         """With what stretch and the forces through the cells add to the derivatives of bending and torsion."""
         rod, field = self.scene.rod, self.field
         weights = field.side_weights
@@ -329,10 +326,10 @@ class MixedForm(Form):
         lengths, softness = weights * (1 + strain), weights * softness
         along, directions = field.of_sides(point.tangents), field.of_sides(bases)
         across = short_sum(directions * forces[:, None], axis=0)
-        gradient -= field.of_points(lengths[None] * across)
-        identity = jnp.eye(bases.shape[1], dtype=gradient.dtype)[..., None]
-        diagonal += field.of_points(lengths * tension)[None, None] * identity
-        diagonal -= field.of_points(softness[None, None] * across[:, None] * across[None])
+        gradient = blocks.gradient - lengths[None] * across
+        identity = np.eye(bases.shape[1], dtype=gradient.dtype)[..., None, None]
+        diagonal = blocks.diagonal + (lengths * tension)[None, None] * identity
+        diagonal -= softness[None, None] * across[:, None] * across[None]
         by_force = -lengths[None, None] * jnp.swapaxes(directions, 0, 1)
         by_force -= softness[None, None] * across[:, None] * along[None]
         energy = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
@@ -356,22 +353,29 @@ class MixedForm(Form):
         if not layout.size:
             return zero[None][:0], zero[None][:0], zero, zero
         spans = self.spans
+        along = self.field.of_sides(point.tangents)
+        turning = self.field.of_sides(short_sum(here.bases * rotation[None], axis=1))
 
-        def parts(tangents: Float[Array, "3 m"], force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
-            _, tension = self.forces_and_tensions(MixedPoint(tangents, force, point.total_twist))
-            strain = axial_strain_under(rod, tension)
-            stretching = weights * (density(rod, axial_strain=strain) - tension * (1 + strain))
-            ways = short_sum((weights * (1 + strain))[None] * self.field.of_sides(tangents), axis=1)
-            return jnp.sum(stretching) + jnp.sum(force * spans), layout.components(spans - layout.sums(ways))
+        def stretched(force: Float[Array, "3 parts"]):
+            """Strains with their rates as the rod begins to turn, and by points what they add to L and to its rate,
+            which knows nothing of the strains' own, as L is stationary by them.
+            """
+            forces = self.layout.of_cells(force)[:, None] + self.loads_beyond
+            tension, rate = dot(forces, along), dot(forces, turning)
+            strain, strain_rate = jax.jvp(lambda tension: axial_strain_under(rod, tension), (tension,), (rate,))
+            added = density(rod, axial_strain=strain) - tension * (1 + strain)
+            return strain, strain_rate, added, -(1 + strain) * rate
 
-        turning = short_sum(here.bases * rotation[None], axis=1)
-
-        def rates(force: Float[Array, "3 parts"]):
-            return jax.jvp(lambda tangents: parts(tangents, force), (point.tangents,), (turning,))
-
-        (energy, closure), (rate, closure_rate) = rates(point.end_force + change)
-        (before, _), (rate_before, _) = rates(point.end_force)
-        return closure, closure_rate, energy - before, rate - rate_before
+        strain, strain_rate, added, rate = stretched(point.end_force + change)
+        _, _, added_before, rate_before = stretched(point.end_force)
+        ways = short_sum((weights * (1 + strain))[None] * along, axis=1)
+        way_rates = short_sum((weights * (1 + strain))[None] * turning + (weights * strain_rate)[None] * along, axis=1)
+        return (
+            layout.components(spans - layout.sums(ways)),
+            -layout.components(layout.sums(way_rates)),
+            jnp.sum(weights * (added - added_before)) + jnp.sum(change * spans),
+            jnp.sum(weights * (rate - rate_before)),
+        )
 
     def rounding_floor(self, point: MixedPoint) -> Float[Array, ""]:
         largest = jnp.max(jnp.abs(self.forces(point)))

@@ -26,19 +26,29 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
 
     So turns a rod between coaxial clamps, or between pins without weight, about the line through its ends.
     """
+    return turn_about(form, point, here, neutral_axis(form, point, here))
 
-    def turn(axis: Float[Array, "3"]) -> tuple[Motion, Float[Array, "b m"], Float[Array, "k"]]:
-        rotation = form.turn(point, here.bases, axis)
-        motion = Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
-        return motion, *here.system.times(motion.rotation, motion.multipliers)
+
+def turn_about(form: Form, point: Point, here: Linearization, axis: Float[Array, "3"]) -> Motion:
+    """The turn of the whole rod about an axis, none where that is zero."""
+    rotation = form.turn(point, here.bases, axis)
+    return Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
+
+
+def neutral_axis(form: Form, point: Point, here: Linearization) -> Float[Array, "3"]:
+    """The axis of the `neutral_turn`, zero where there is none."""
+
+    def turn(axis: Float[Array, "3"]) -> tuple[Float[Array, "b m"], Float[Array, "b m"], Float[Array, "k"]]:
+        motion = turn_about(form, point, here, axis)
+        return motion.rotation, *here.system.times(motion.rotation, motion.multipliers)
 
     # One after another: XLA would otherwise compute the system again for each number made of it.
     turns = jax.lax.map(turn, jnp.eye(3, dtype=point.tangents.dtype))
     _, moments, gaps = turns
     missing = jnp.concatenate([moments.reshape(3, -1), gaps], axis=1)
     axis = jnp.linalg.eigh(missing @ missing.T)[1][:, 0]
-    motion, moments, gaps = jax.tree.map(lambda x: jnp.tensordot(axis, x, 1), turns)
-    size = jnp.max(jnp.abs(motion.rotation))
+    rotation, moments, gaps = (jnp.tensordot(axis, x, 1) for x in turns)
+    size = jnp.max(jnp.abs(rotation))
     least = NEUTRAL * size / point.tangents.shape[1]
     is_neutral = (size > jnp.sqrt(NEUTRAL)) & (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)
-    return jax.tree.map(lambda x: jnp.where(is_neutral, x, jnp.zeros_like(x)), motion)
+    return jnp.where(is_neutral, axis, 0.0)

@@ -48,14 +48,15 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     torque = torque_at(rod, point.total_twist)
     section_forces = form.forces(point)[:, ::2]
     by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
-    moments = jnp.concatenate([-cross(nodes[:, :1], by_start[:, :1]), cross(nodes[:, 1:], by_end)], axis=1)
+    moments = cross(nodes, jnp.concatenate([-by_start[:, :1], by_end], axis=1))
     curvatures = curvature_under(rod, moments)
     curvature = root(dot(curvatures, curvatures))
     moments += torque * nodes
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
-    ends = [jnp.sum(force * nodes[:, k])[None] for k, force in zip((0, -1), forces, strict=True)]
-    tension = jnp.concatenate([ends[0], tension[1:-1], ends[1]])
+    number = jnp.arange(len(tension))
+    for k, force in zip((0, len(tension) - 1), forces, strict=True):
+        tension = jnp.where(number == k, dot(force[:, None], nodes), tension)
     start_d1 = scene.start.frame[:, 0] if isinstance(scene.start, Clamp) else _any_normal(nodes[:, 0])
     return Resultants(
         frames=_turning_frames(scene, nodes, field.carried(start_d1, tangents), point.total_twist * field.s),

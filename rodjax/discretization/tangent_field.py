@@ -11,12 +11,13 @@ from rodjax.model.scene import Scene
 class Blocks(eqx.Module):
     """First and second derivatives of an energy by rotations of the tangents at m points along the rod.
 
-    `diagonal[..., i]`: block (i, i) of the second derivatives; `lower[..., i]`: (i + 1, i); `across[..., i]`:
-    (2 i + 2, 2 i), between the ends of an element with a point in its middle.
+    `gradient` and `diagonal`, the blocks (i, i) of the second derivatives: what each of n cells adds at its p points,
+    to be summed by `of_points`; `lower[..., i]`: block (i + 1, i); `across[..., i]`: (2 i + 2, 2 i), between the ends
+    of an element with a point in its middle.
     """
 
-    gradient: Float[Array, "b m"]
-    diagonal: Float[Array, "b b m"]
+    gradient: Float[Array, "b p n"]
+    diagonal: Float[Array, "b b p n"]
     lower: Float[Array, "b b m-1"]
     across: Float[Array, "b b (m-1)/2"] | None = None
 

@@ -54,21 +54,23 @@ class TouchingTangents(TouchingForm, MixedForm):
         assert isinstance(field, HermiteElements)
         bases, energy, blocks, torque_column, softness = self._elastic(point)
         assert blocks.across is not None
-        cells = self._by_cells(point, bases, blocks.gradient, blocks.diagonal)
+        cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         balance, second = self._balance(edges, point.end_force)
         closure = [balance.reshape(-1), self._gaps(edges).reshape(-1)]
         dtype = energy.dtype
+        columns = [] if torque_column is None else [torque_column]
+        by_point = map(field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *columns))
+        gradient, diagonal, lengths, *columns = by_point
         if softness is None:
-            border, compliance = jnp.zeros((len(bases[0]), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
+            border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
-            assert torque_column is not None
-            border, compliance = torque_column, softness[None, None]
+            border, compliance = columns[0], softness[None, None]
             closure = [jnp.zeros(1, dtype), *closure]
-        forces = short_sum(bases * cells.gradient[None], axis=1)
-        residual = field.residual(self.scene, forces, field.of_points(cells.lengths))
+        forces = short_sum(bases * gradient[None], axis=1)
+        residual = field.residual(self.scene, forces, lengths)
         system = ChainSystem(
-            field.held(self.scene, cells.diagonal),
+            field.held(self.scene, diagonal),
             blocks.lower,
             blocks.across,
             border,
@@ -81,7 +83,7 @@ class TouchingTangents(TouchingForm, MixedForm):
         )
         return Linearization(
             bases=bases,
-            gradient=cells.gradient,
+            gradient=gradient,
             closure=jnp.concatenate(closure),
             system=system,
             energy=energy + self._stretching(tangents, point.end_force)[0],

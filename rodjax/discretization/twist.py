@@ -6,12 +6,12 @@ Arrays along the rod have the components first.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.joints import tangent_bases
-from rodjax.geometry.vectors import components, cross, dot
+from rodjax.geometry.vectors import components, dot, triple_product
+from rodjax.linalg.blocks import partial_sums
 from rodjax.mechanics.energy import twist_under
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import Scene, dead_end_moment
@@ -48,8 +48,7 @@ def total_twist(reference: TwistReference, state: FramedTangents) -> Float[Array
 
 def swept_twist(old: Float[Array, "3 k"], new: Float[Array, "3 k"]) -> Float[Array, ""]:
     """What the total twist gains as the tangents move while the end frames follow by smallest rotations [rad]."""
-    swept = jax.vmap(swept_angle, in_axes=1)(new[:, :-1], new[:, 1:], old[:, :-1], old[:, 1:])
-    return jnp.sum(swept)
+    return jnp.sum(swept_angle(new[:, :-1], new[:, 1:], old[:, :-1], old[:, 1:]))
 
 
 def transport(
@@ -63,21 +62,31 @@ def transport(
 def transport_along(vector: Float[Array, "3"], tangents: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
     """`vector`, at right angles to the first tangent, carried along all of them without twist."""
     bases = tangent_bases(tangents)
-    d1, d2 = bases[:, 0], bases[:, 1]
+    return carried_in_bases(vector, bases, partial_sums(turns_of_bases(tangents, bases)))
+
+
+def turns_of_bases(tangents: Float[Array, "3 k"], bases: Float[Array, "3 2 k"]) -> Float[Array, "k-1"]:
+    """The angles by which the bases turn about the tangents from one to the next [rad]."""
+    d1 = bases[:, 0]
     carried = transport(d1[:, :-1], tangents[:, :-1], tangents[:, 1:])
-    # The angles by which the bases turn from one tangent to the next, and so those at which `vector` lags behind.
-    turned = angle_about(tangents[:, 1:], carried, d1[:, 1:])
-    first = components(bases[:, :, :1], vector[:, None])
-    angle = jnp.concatenate([jnp.zeros_like(turned[:1]), -jnp.cumsum(turned)])
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    return (first[0] * cosine - first[1] * sine)[None] * d1 + (first[0] * sine + first[1] * cosine)[None] * d2
+    return angle_about(tangents[:, 1:], carried, d1[:, 1:])
+
+
+def carried_in_bases(
+    vector: Float[Array, "3"], bases: Float[Array, "3 2 k"], turned: Float[Array, "j"]
+) -> Float[Array, "3 j"]:
+    """`vector`, at right angles to the first tangent, in the last j bases, which have turned so far about it."""
+    x, y = components(bases[..., 0], vector)
+    d1, d2 = bases[..., -len(turned) :].swapaxes(0, 1)
+    cosine, sine = jnp.cos(turned), jnp.sin(turned)
+    return (x * cosine + y * sine)[None] * d1 + (y * cosine - x * sine)[None] * d2
 
 
 def angle_about(
     axis: Float[Array, "3 *k"], vector: Float[Array, "3 *k"], other: Float[Array, "3 *k"]
 ) -> Float[Array, "*k"]:
     """Right-handed angle about the unit `axis` from `vector` to `other` [rad], both at right angles to it."""
-    return jnp.arctan2(dot(axis, cross(vector, other)), dot(vector, other))
+    return jnp.arctan2(triple_product(axis, vector, other), dot(vector, other))
 
 
 def nearest_twist(

@@ -19,6 +19,12 @@ def cross(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"]) -> Float[Array, "3 *
     return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1])
 
 
+def triple_product(a: Float[Array, "3 *k"], b: Float[Array, "3 *k"], c: Float[Array, "3 *k"]) -> Float[Array, "*k"]:
+    """a . (b x c)"""
+    (a1, a2, a3), (b1, b2, b3), (c1, c2, c3) = map(jnp.unstack, (a, b, c))
+    return a1 * (b2 * c3 - b3 * c2) + a2 * (b3 * c1 - b1 * c3) + a3 * (b1 * c2 - b2 * c1)
+
+
 def root(x: Float[Array, "*k"]) -> Float[Array, "*k"]:
     """Square root, with the derivative 0 at 0."""
     is_zero = x == 0

@@ -18,6 +18,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
@@ -26,6 +27,8 @@ from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
 # square of this, and what they differ by is about 10 times this.
 LEAST_PIVOT = 1e-7
+# So few blocks are eliminated one after another in a loop: a level is as many kernels to compile, however short it is.
+IN_TURN = 4
 
 
 class SaddlePointSystem(eqx.Module):
@@ -61,10 +64,10 @@ class SaddlePointSystem(eqx.Module):
         below = product(self.lower, columns[..., :-1])[:, 0]
         above = transpose_product(self.lower, columns[..., 1:])[:, 0]
         f = product(self.diagonal, columns)[:, 0] + jnp.sum(self.border * y[None, :, None], axis=1)
-        f = f.at[:, 1:].add(below).at[:, :-1].add(above)
+        f += _spread(below, 1, 0) + _spread(above, 0, 1)
         if self.across is not None:
-            f = f.at[:, 2::2].add(product(self.across, columns[..., 0:-1:2])[:, 0])
-            f = f.at[:, 0:-1:2].add(transpose_product(self.across, columns[..., 2::2])[:, 0])
+            f += _spread(product(self.across, columns[..., 0:-1:2])[:, 0], 2, 0, between=1)
+            f += _spread(transpose_product(self.across, columns[..., 2::2])[:, 0], 0, 2, between=1)
         rows = self.border if self.rows is None else self.rows
         return f, jnp.sum(rows * x[:, None], axis=(0, 2)) - self.compliance @ y
 
@@ -182,7 +185,7 @@ def _factor(
     solution = x[:, :k]
     if system.rows is None:
         rows = system.border
-        complement, below = _symmetric_inverse(-system.compliance - _dots(rows[:, :, None], solution))
+        complement, below = _inverse_in_turn(-system.compliance - _dots(rows[:, :, None], solution), 1)
         negative += below - k
     else:
         rows = system.rows
@@ -223,8 +226,10 @@ class _Level(eqx.Module):
 
 
 class _Elimination(eqx.Module):
+    """`last_inverse`: of the matrix that the levels leave, of few blocks."""
+
     levels: tuple[_Level, ...]
-    last_inverse: Float[Array, "b b 1"]
+    last_inverse: Float[Array, "bk bk"]
 
     def solve(self, f: Float[Array, "b j n"]) -> Float[Array, "b j n"]:
         """H^-1 f for j right sides."""
@@ -234,9 +239,13 @@ class _Elimination(eqx.Module):
             eliminated.append(product(level.inverse, goes))
             beside = transpose_product(level.before, goes), transpose_product(level.after, goes)
             f -= level.added(*beside, f.shape[-1])
-        return self.back_substituted(product(self.last_inverse, f), eliminated)
+        return self.back_substituted(f, eliminated)
 
-    def back_substituted(self, x: Float[Array, "b j 1"], eliminated: list[Array]) -> Float[Array, "b j n"]:
+    def back_substituted(self, f: Float[Array, "b j k"], eliminated: list[Array]) -> Float[Array, "b j n"]:
+        b, j, k = f.shape
+        columns = jnp.moveaxis(f, -1, 0).reshape(k * b, j)
+        last = jnp.matmul(self.last_inverse, columns, precision=jax.lax.Precision.HIGHEST)
+        x = jnp.moveaxis(last.reshape(k, b, j), 0, -1)
         for level, goes in zip(reversed(self.levels), reversed(eliminated), strict=True):
             before, after = level.around(x)
             x = level.joined(goes - product(level.before, before) - product(level.after, after), x)
@@ -260,7 +269,7 @@ def _eliminate(
     rows = jnp.concatenate([diagonal, right_sides], axis=1)
     levels, eliminated = [], []
     negative = jnp.zeros((), int)
-    while rows.shape[-1] > 1:
+    while rows.shape[-1] > (IN_TURN if across is None else 1):
         first = 0 if across is None else 1
         goes, stays = rows[..., first::2], rows[..., 1 - first :: 2]
         m, k = goes.shape[-1], stays.shape[-1]
@@ -279,21 +288,44 @@ def _eliminate(
         lower = -_shifted(transpose_product(after, level.before), first - 1)[..., : k - 1]
         if across is not None:
             lower, across = lower + across, None
-    last_inverse, below = inverse_of_blocks(rows[:, :b])
+    last_inverse, below = _inverse_in_turn(_whole(rows[:, :b], lower), b, least)
     elimination = _Elimination(tuple(levels), last_inverse)
-    x = elimination.back_substituted(product(last_inverse, rows[:, b:]), eliminated)
-    return elimination, negative + below, x
+    return elimination, negative + below, elimination.back_substituted(rows[:, b:], eliminated)
 
 
-def _symmetric_inverse(matrix: Float[Array, "k k"]) -> tuple[Float[Array, "k k"], Int[Array, ""]]:
-    """Inverse of a small symmetric matrix by sweeps, and the number of its negative eigenvalues."""
-    negative = jnp.zeros((), int)
-    for j in range(len(matrix)):
-        pivot, row = matrix[j, j], matrix[j]
-        negative += jnp.where(pivot < 0, 1, 0)
-        swept = matrix - row[:, None] * (row / pivot)[None, :]
-        matrix = swept.at[j, :].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1 / pivot)
-    return -matrix, negative
+def _whole(diagonal: Float[Array, "b b k"], lower: Float[Array, "b b k-1"]) -> Float[Array, "kb kb"]:
+    """The matrix of these blocks."""
+    b, _, k = diagonal.shape
+    row, column = np.arange(k)[:, None, None, None], np.arange(k)[None, None, :, None]
+    matrix = jnp.zeros((), diagonal.dtype)
+    before, after = _spread(lower, 1, 0), _spread(jnp.swapaxes(lower, 0, 1), 0, 1)
+    for offset, blocks in ((0, diagonal), (1, before), (-1, after)):
+        matrix = jnp.where(row - column == offset, jnp.moveaxis(blocks, -1, 0)[:, :, None], matrix)
+    return matrix.reshape(k * b, k * b)
+
+
+def _inverse_in_turn(
+    matrix: Float[Array, "kb kb"], b: int, least: Float[Array, ""] | None = None
+) -> tuple[Float[Array, "kb kb"], Int[Array, ""]]:
+    """Inverse of a small symmetric matrix by sweeps over its k blocks on the diagonal, and the number of its negative
+    eigenvalues. `least`: as of `blocks.inverse_of_blocks`, but for the last block, for which no other waits.
+    """
+    k = len(matrix) // b
+    if not k:
+        return matrix, jnp.zeros((), int)
+
+    def swept(matrix: Float[Array, "kb kb"], j: Int[Array, ""]) -> tuple[Float[Array, "kb kb"], Int[Array, ""]]:
+        row = jax.lax.dynamic_slice_in_dim(matrix, j * b, b)
+        pivot = jax.lax.dynamic_slice_in_dim(row, j * b, b, axis=1)
+        inverse, below = inverse_of_blocks(pivot[..., None], None if least is None else jnp.where(j < k - 1, least, 0))
+        scaled = product(inverse[..., 0], row)
+        is_there = np.arange(k * b) // b == j
+        others = jnp.where(is_there[None], jnp.tile(scaled.T, (1, k)), matrix - transpose_product(row, scaled))
+        corner = jnp.where(is_there[None], jnp.tile(-inverse[..., 0], (k, k)), jnp.tile(scaled, (k, 1)))
+        return jnp.where(is_there[:, None], corner, others), below
+
+    matrix, below = jax.lax.scan(swept, matrix, jnp.arange(k))
+    return -matrix, jnp.sum(below)
 
 
 def _dots(border: Float[Array, "b k *j n"], x: Float[Array, "b *j n"]) -> Array:
@@ -314,3 +346,9 @@ def _padded(x: Array, length: int) -> Array:
     return (
         x[..., :length] if missing <= 0 else jnp.concatenate([x, jnp.zeros((*x.shape[:-1], missing), x.dtype)], axis=-1)
     )
+
+
+def _spread(x: Float[Array, "*c m"], before: int, after: int, between: int = 0) -> Float[Array, "*c n"]:
+    """With so many zeros before, between and after the entries."""
+    others = [(0, 0, 0)] * (x.ndim - 1)
+    return jax.lax.pad(x, jnp.zeros((), x.dtype), [*others, (before, after, between)])

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.geometry.vectors import dot, triple_product
+
 
 def axial_strain(dphi: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """|phi'| - 1 [1], eq. (5) of Linn & Stephan (2008)."""
@@ -21,11 +23,11 @@ def squared_curvature_between(
 
 
 def swept_angle(
-    tangent: Float[Array, "3"],
-    next_tangent: Float[Array, "3"],
-    reference: Float[Array, "3"],
-    next_reference: Float[Array, "3"],
-) -> Float[Array, ""]:
+    tangent: Float[Array, "3 *k"],
+    next_tangent: Float[Array, "3 *k"],
+    reference: Float[Array, "3 *k"],
+    next_reference: Float[Array, "3 *k"],
+) -> Float[Array, "*k"]:
     """Area on the unit sphere swept by the arc from `tangent` to `next_tangent` as it comes from that of the reference.
 
     By so much [rad] the twist between two neighbouring cross sections grows when the tangents move from the
@@ -39,7 +41,6 @@ def swept_angle(
 
 
 def _half_solid_angle(
-    a: Float[Array, "3"], b: Float[Array, "3"], c: Float[Array, "3"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    ab, bc, ca = (jnp.sum(x * y) for x, y in ((a, b), (b, c), (c, a)))
-    return 1 + ab + bc + ca, jnp.sum(a * jnp.cross(b, c))
+    a: Float[Array, "3 *k"], b: Float[Array, "3 *k"], c: Float[Array, "3 *k"]
+) -> tuple[Float[Array, "*k"], Float[Array, "*k"]]:
+    return 1 + dot(a, b) + dot(b, c) + dot(c, a), triple_product(a, b, c)

@@ -81,6 +81,7 @@ class NewtonState(eqx.Module):
     point: Point
     bases: Float[Array, "3 b n"]
     residual: Float[Array, ""]
+    floor: Float[Array, ""]  # what rounding leaves of the residual
     shift: Float[Array, ""]
     rotation: Float[Array, "b n"]
     force_change: Float[Array, "3 parts"]
@@ -141,9 +142,12 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
     state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
+    # Out of the branches XLA computes once for all turns what does not change.
+    floor = form.rounding_floor(trial)
+    pattern = generic_field(trial.tangents, scene_axes(form.scene))
     return jax.lax.cond(
         state.restart | form.accepts(state.point, trial, state.is_pushed | (merit <= bound)),
-        lambda: _advanced(form, state, trial, linearization, solver, find),
+        lambda: _advanced(form, state, trial, linearization, floor, pattern, solver, find),
         lambda: _shortened(form, state, find),
     )
 
@@ -158,12 +162,18 @@ def _half_square(form: Form, here: Linearization) -> Float[Array, ""]:
 
 
 def _advanced(
-    form: Form, state: NewtonState, point: Point, here: Linearization, solver: Newton, find: Find
+    form: Form,
+    state: NewtonState,
+    point: Point,
+    here: Linearization,
+    floor: Float[Array, ""],
+    pattern: Float[Array, "3 m"],
+    solver: Newton,
+    find: Find,
 ) -> NewtonState:
     dtype = point.tangents.dtype
     h = 1 / point.tangents.shape[1]
     iterations = state.iterations + jnp.where(state.restart, 0, 1)
-    floor = form.rounding_floor(point)
     balanced = jnp.where(here.residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
     balanced = jnp.where(here.residual <= solver.tolerance, Status.CONVERGED, balanced)
     # Just above the floor, steps that no longer help show that it is reached.
@@ -178,10 +188,10 @@ def _advanced(
     shift = jnp.where(state.tries == 0, first, jnp.maximum(SHIFT_GROWTH * state.shift, FIRST_SHIFT))
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near
-    pattern = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
+    sought = push * components(here.bases, pattern) - here.gradient
     factors, rotation, multipliers = factor_and_solve(
-        here.system.shifted(h * shift), push * pattern - here.gradient, -here.closure, is_regularized=True
+        here.system.shifted(h * shift), sought, -here.closure, is_regularized=True
     )
     is_definite = factors.is_minimum
     is_finite = jnp.isfinite(here.residual + here.energy)
@@ -223,6 +233,7 @@ def _advanced(
         point=point,
         bases=here.bases,
         residual=jnp.where(again, state.residual, here.residual),
+        floor=floor,
         shift=shift,
         rotation=rotation,
         force_change=force_change,
@@ -245,7 +256,7 @@ def _advanced(
 def _shortened(form: Form, state: NewtonState, find: Find) -> NewtonState:
     halvings = state.halvings + 1
     failed = halvings > MAX_HALVINGS
-    stagnated = state.residual <= STAGNATION * form.rounding_floor(state.point)
+    stagnated = state.residual <= STAGNATION * state.floor
     reason = jnp.where(stagnated, Status.ROUNDING_FLOOR, Status.LINE_SEARCH_FAILED)
     # On the way to a minimum a larger shift gives a shorter step in a direction that goes down more surely.
     again = failed & ~stagnated & (state.shift < MAX_SHIFT) & _descends(form, find)
@@ -274,6 +285,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         point=point,
         bases=bases,
         residual=zero,
+        floor=zero,
         shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),

@@ -22,6 +22,7 @@ from rodjax.discretization.error import (
     errors_of_differences,
     errors_of_elements,
     longest,
+    on_elements,
 )
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import NEUTRAL, Form, Point
@@ -30,10 +31,12 @@ from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import (
     errors_of_frames,
+    framed_on_elements,
     strains_beside_nodes,
 )
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.motion import neutral_axis
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
 from rodjax.geometry.interpolation import cubic
@@ -308,44 +311,61 @@ def over_leading_axes(function: Callable, *, is_patient: bool = True) -> Callabl
 def estimated_errors(equilibrium: Equilibrium) -> Errors:
     """How far the equilibrium is from the continuum; of the continuum itself not a number."""
     if is_known(equilibrium):
-        errors = _errors(equilibrium)
+        errors = _errors(equilibrium, np.zeros((*equilibrium.status.shape, 3), equilibrium.s.dtype))
         # Few rods can turn as a whole: the program that looks for such a turn is theirs.
         if not np.asarray(errors.is_soft).any():
             return errors
-    return _errors_beside_turns(equilibrium)
+    return _errors(equilibrium, _neutral_axis(equilibrium))
 
 
 def _moment_error(errors: Errors) -> Float[Array, "..."]:
     return errors.moment if errors.misplaced is None else errors.moment + errors.misplaced
 
 
-# These two are parts of solves without `segments`.
+# This and the next are parts of solves without `segments`.
 @functools.partial(over_leading_axes, is_patient=False)
-def _errors(equilibrium: Equilibrium) -> Errors:
-    return _errors_of(equilibrium, is_turn_held=False)
+def _neutral_axis(equilibrium: Equilibrium) -> Float[Array, "3"]:
+    """About which the whole rod can turn and stays in equilibrium, on the elements that errors are estimated on."""
+    if equilibrium.discretization == "continuum":
+        return jnp.zeros(3, equilibrium.s.dtype)
+    form, point = _on_elements(equilibrium)
+    if not form.has_potential:
+        return jnp.zeros(3, equilibrium.s.dtype)
+    return neutral_axis(form, point, form.linearized(point))
 
 
-@functools.partial(over_leading_axes, is_patient=False)
-def _errors_beside_turns(equilibrium: Equilibrium) -> Errors:
-    return _errors_of(equilibrium, is_turn_held=True)
+def _on_elements(equilibrium: Equilibrium) -> tuple[Form, Any]:
+    form, point = form_and_point(equilibrium)
+    if isinstance(form, FrameForm):
+        return framed_on_elements(form, point)
+    if isinstance(form, MixedForm) and not isinstance(equilibrium.state.shape, Curve):
+        return on_elements(form, point, equilibrium.tangents.T)
+    return form, point
 
 
-def _errors_of(equilibrium: Equilibrium, *, is_turn_held: bool) -> Errors:
+@compiled
+def _errors(equilibrium: Equilibrium, axis: Float[Array, "... 3"]) -> Errors:
+    """Without what turns the whole rod about an axis that is not zero."""
+    mapped = _errors_of
+    for _ in range(equilibrium.s.ndim - 1):
+        mapped = jax.vmap(mapped)
+    return mapped(equilibrium, axis)
+
+
+def _errors_of(equilibrium: Equilibrium, axis: Float[Array, "3"]) -> Errors:
     state = equilibrium.state
     if equilibrium.discretization == "continuum":
         unknown = Sizes(*[jnp.full((), jnp.nan, equilibrium.nodes.dtype)] * 3)
         return Errors(jnp.full_like(equilibrium.nodes, jnp.nan), *unknown, unknown, jnp.array(False), None)
     form, point = form_and_point(equilibrium)
     if isinstance(form, FrameForm):
-        errors = errors_of_frames(form, point, is_turn_held=is_turn_held)
+        errors = errors_of_frames(form, point, axis)
     elif isinstance(state.shape, Curve):
         assert isinstance(form, MixedForm)
-        errors = errors_of_elements(form, point, is_turn_held=is_turn_held)
+        errors = errors_of_elements(form, point, axis)
     else:
         assert isinstance(form, MixedForm)
-        errors = errors_of_differences(
-            form, point, state.shape.nodes, equilibrium.tangents.T, is_turn_held=is_turn_held
-        )
+        errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T, axis)
     if isinstance(form, TouchingForm):
         errors = with_contacts(errors, form, point)
     if errors.axial is None:

@@ -1,7 +1,9 @@
 """Compiled programs: the persistent cache, and as many in memory as a process has room for."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,3 +48,22 @@ def test_programs_are_dropped_before_the_process_has_too_many_maps(monkeypatch, 
 def test_programs_are_kept_where_there_is_room(caplog):
     rj.solve(rj.problems.cantilever(0.1), segments=5, discretization="finite_difference")
     assert not caplog.records
+
+
+@pytest.mark.exhaustive
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux alone tells the memory of a process so")
+def test_five_hundred_meshes_in_one_process():
+    """Compiled, some 90 would crash it; as NumPy code they take memory that is bounded but for half a MB each."""
+    code = """
+import sys, jax; jax.config.update("jax_enable_x64", True)
+import rodjax as rj
+scene = rj.problems.hanging_cable()
+def resident(): return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
+for segments in range(4, 504):
+    assert rj.solve(scene, segments=segments).converged
+    if segments == 100: early = resident()
+print(resident() - early)
+"""
+    settings = {**os.environ, "RODJAX_NUMPY_FIRST": "on", "RODJAX_CACHE": "off"}
+    run = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
+    assert float(run.stdout) < 500

@@ -46,8 +46,8 @@ class Program:
     last one that asked for it, and how many did.
     """
 
-    def __init__(self, run: Any, tree: Any, name: str | None, is_patient: bool):
-        self.run, self.tree, self.name, self.is_patient = run, tree, name, is_patient
+    def __init__(self, trace: Callable[[tuple, dict[str, Any]], Any], tree: Any, name: str | None, is_patient: bool):
+        self.trace, self.tree, self.name, self.is_patient = trace, tree, name, is_patient
         self.executable: Any = None
         self.code: AnswerCode | None = None
         self.traced: Any = None
@@ -71,7 +71,7 @@ class Program:
         if executable is None:
             ANSWERS.compile_others(self)
             with waiting():
-                executable = self.compile(lambda: self.run.trace(*args, **options))
+                executable = self.compile(lambda: self.trace(args, options))
         return executable(*given, **named)
 
     def _code(self, args: tuple, options: dict[str, Any]) -> AnswerCode | None:
@@ -92,7 +92,7 @@ class Program:
             if self.code is None:
                 self.executable = kept.load(self.name, self.tree)
         if self.code is None and self.executable is None:
-            self.traced = self.run.trace(*args, **options)
+            self.traced = self.trace(args, options)
             try:
                 self.code = AnswerCode.of(self.traced)
             except NotInNumpyError as missing:

@@ -39,6 +39,7 @@ class _Programs:
     """
 
     def __init__(self, function: Callable, static_argnames: Sequence[str], is_patient: bool):
+        self.function = function
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.part: Any = jax.jit(function, static_argnames=static_argnames)
         self.quick: Any = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
@@ -48,6 +49,15 @@ class _Programs:
         self.static_places = frozenset(names.index(name) for name in static_argnames)
         self.is_patient = is_patient
         self.last_call = 0
+
+    def trace(self, args: tuple, options: dict[str, Any]) -> Any:
+        """By a function of its own, with which JAX forgets what it traced."""
+
+        @functools.wraps(self.function)
+        def anew(*args, **options):
+            return self.function(*args, **options)
+
+        return jax.jit(anew, static_argnames=tuple(self.static)).trace(*args, **options)
 
     @property
     def count(self) -> int:
@@ -88,7 +98,7 @@ class _Programs:
                 name = None
                 if kept.is_keeping():
                     name = kept.name_of(self.name, QUICK, statics, tree, kinds)
-                program = self.known[key] = Program(self.part, tree, name, self.is_patient)
+                program = self.known[key] = Program(self.trace, tree, name, self.is_patient)
             known = program.executable
             result = program(args, options, leaves, given, named)
         if known is None and program.executable is not None:

@@ -52,6 +52,10 @@ OPERATIONS = {
         lax.select_n((abs(2 * x)).astype(jnp.int32) % 3, x, 2 * x, 3 * x),
     ],
     "sums": lambda x: [x.sum(), x.sum((0, 1)), x.prod(0), x.max(1), x.min(), jnp.argmax(x, 0), jnp.argmin(x, 1)],
+    "sums of none": lambda x: (
+        [f(x[:0], 0) for f in (jnp.sum, jnp.prod, jnp.any, jnp.all)]
+        + [lax.reduce_max(x[:0], (0,)), lax.reduce_min((7 * x[:0]).astype(jnp.int32), (0,))]
+    ),
     "running sums": lambda x: [jnp.cumsum(x, 0), lax.cumsum(x, 1, reverse=True), lax.cummax(x, 0), jnp.cumprod(x, 1)],
     "shapes": lambda x: [x.T, x.reshape(2, 10), x[::-1, 1:4:2], x[None, :, None], jnp.tile(x, (2, 1)), x.ravel()[3]],
     "parts": lambda x: [*jnp.unstack(x), *jnp.unstack(x, axis=1), *jnp.split(x, [1, 3], axis=1)],

@@ -77,12 +77,26 @@ def _round(body: Any, equation: Any, x: str) -> str:
 
 def _reduce(ufunc: str) -> Rule:
     def rule(body: Any, equation: Any, x: str) -> str:
+        if not equation.invars[0].aval.size:
+            result = equation.outvars[0].aval
+            return body.writer.constant(np.full(result.shape, _of_none(ufunc, np.dtype(result.dtype)), result.dtype))
         axes = body.writer.constant(tuple(equation.params["axes"]))
         # NumPy adds whole numbers up as longer ones.
         is_whole = equation.outvars[0].aval.dtype.kind in "iu"
         return f"{ufunc}.reduce({x}, {axes}, {_dtype(body, equation)})" if is_whole else f"{ufunc}.reduce({x}, {axes})"
 
     return rule
+
+
+def _of_none(ufunc: str, kind: np.dtype) -> Any:
+    """What a reduction of no numbers gives."""
+    if ufunc not in ("np.maximum", "np.minimum"):
+        return getattr(np, ufunc.removeprefix("np.")).identity
+    if kind.kind == "f":
+        return -np.inf if ufunc == "np.maximum" else np.inf
+    limits = np.iinfo(kind) if kind.kind in "iu" else None
+    least, most = (False, True) if limits is None else (limits.min, limits.max)
+    return least if ufunc == "np.maximum" else most
 
 
 def _extreme(function: str) -> Rule:

@@ -5,8 +5,8 @@ middle of each edge and at both ends, of second order; and `ElementCells`, with 
 an element, of fourth order. Both see only rotations between neighbours, so that no parametrisation has a pole.
 
 A cell is strained by what its strains exceed those of the stress-free rod by, where these come from the same formula
-at the frames of the stress-free rod, and its way by what that misses there. So a rod at rest has no residual on any
-mesh.
+at the frames of the stress-free rod, and its way is made up by what that misses there (`rest_ways`). So a rod at rest
+has no residual on any mesh.
 Arrays have the components first, then the frames of a cell or its strain points, then the cells.
 """
 
@@ -99,6 +99,10 @@ class Cells(Protocol):
 
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
         """The rests of ways from node to node as those of the cells."""
+        ...
+
+    def of_segments(self, by_segment: Float[Array, "segments"]) -> Float[Array, "p n"]:
+        """At each strain point what is given for the way between nodes to which it belongs; zero without such."""
         ...
 
     def sections(self, rod: Rod) -> Sections:
@@ -236,6 +240,9 @@ class JointCells(eqx.Module):
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
         return jnp.pad(by_segment, ((0, 0), (0, 1)))
 
+    def of_segments(self, by_segment: Float[Array, "segments"]) -> Float[Array, "2 n"]:
+        return jnp.stack([jnp.pad(by_segment, (1, 0)), jnp.pad(by_segment, (0, 1))])
+
     def sections(self, rod: Rod) -> Sections:
         a, b = self.places[:-1], self.places[1:]
         *of_joints, of_edges = rod.stiffnesses
@@ -331,6 +338,9 @@ class ElementCells(eqx.Module):
 
     def rest_of(self, by_segment: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return by_segment
+
+    def of_segments(self, by_segment: Float[Array, "n"]) -> Float[Array, "3 n"]:
+        return jnp.stack([by_segment] * 3)
 
     def sections(self, rod: Rod) -> Sections:
         s = self.strain_places

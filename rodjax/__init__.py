@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from rodjax import problems
 from rodjax.analysis.clearance import Clearance, clearance
+from rodjax.analysis.curvature import most_curved
 from rodjax.analysis.sensitivity import end_stiffness, sensitivities
 from rodjax.io.files import load, save
 from rodjax.io.scene_file import SceneFileError, read_scene
@@ -132,6 +133,7 @@ __all__ = [
     "load",
     "lowest_mode",
     "margins",
+    "most_curved",
     "numpy_first",
     "orthographic",
     "pinhole",

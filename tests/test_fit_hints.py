@@ -4,6 +4,7 @@ import dataclasses
 import math
 import types
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,6 +105,35 @@ def test_a_torsional_stiffness_of_a_wrong_whole_turn_is_told():
     assert "+1 turn would make it 0.8" in told
     assert remarks(right, twist) == []
     assert remarks(right * 19, twist - 2 * math.pi, "rod.mass_per_length") == []
+
+
+def taken_turns(GJ, twists, error, **options):
+    """What a fit that found this GJ, with this standard error, at these twists tells of turns that nobody stated."""
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(twists)), scene(GJ))
+    stack = eqx.tree_at(lambda scene: scene.turns, stack, options.get("turns"), is_leaf=lambda x: x is None)
+    fields = dict.fromkeys(field.name for field in dataclasses.fields(rj.Fit))
+    fields |= {
+        "setup": Setup((), (), (rj.Unknown("rod.GJ"),), (), (), True),
+        "found": types.SimpleNamespace(
+            evaluation=types.SimpleNamespace(
+                results=(types.SimpleNamespace(scene=stack, total_twist=np.array(twists)),)
+            )
+        ),
+        "estimate": {"rod.GJ": GJ},
+        "standard_error": {"rod.GJ": error},
+    }
+    return report._of_taken_turns(rj.Fit(**fields))
+
+
+def test_another_whole_turn_that_fits_as_well_is_told():
+    GJ = 0.8 * 4.9e-3
+    (told,) = taken_turns(GJ, [3 * math.pi], 0.02 * GJ)
+    assert "known to 0.03 of a turn" in told
+    assert f"one turn more would make it {0.6 * GJ:.3g}, one turn less would make it {3 * GJ:.3g} and fit" in told
+    # Two twists tell the turns, where their torques are known better than these differ.
+    assert taken_turns(GJ, [3 * math.pi, -1.5 * math.pi], 0.02 * GJ) == []
+    assert len(taken_turns(GJ, [3 * math.pi, -1.5 * math.pi], 0.2 * GJ)) == 1
+    assert taken_turns(GJ, [3 * math.pi], 0.02 * GJ, turns=jnp.ones(1)) == []
 
 
 def test_a_frame_is_told_from_the_nominal():

@@ -304,6 +304,25 @@ def test_a_curve_without_stress_stays_where_it_is_and_comes_back(discretization)
     np.testing.assert_allclose(path.nodes[-1], path.nodes[0], rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize(
+    ("discretization", "curvature", "most"),
+    [
+        ("hermite", (2.0, 0.0), 1e-8),  # 1.36 before the ways at rest counted by the curvature there is
+        ("hermite", (1.0, 1.5), 1e-8),  # 0.90
+        ("hermite", (rj.Smooth((0, 0.5, 1.0), (-1.0, 1.0, 3.0)), 0.0), 1e-4),  # 3.04
+        ("finite_difference", (2.0, 0.0), 0.1),  # 2600
+    ],
+)
+def test_a_curved_rod_held_straight_has_the_tension_of_a_straight_one(discretization, curvature, most):
+    """EA (d - 1), constant along the rod: its way is that of its straight tangents, for which no quadrature errs."""
+    rod = rj.Rod(1.0, (1.0, 1.3), 0.7, 1e6, rest_curvature=curvature)
+    for span in (1.0, 1.001):
+        ends = [rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, span)]
+        found = rj.solve(rj.Scene(rod, *ends), segments=8, discretization=discretization)
+        assert found.converged
+        np.testing.assert_allclose(found.tension, 1e6 * (span - 1), rtol=0, atol=most)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("discretization", ["hermite", pytest.param("finite_difference", marks=pytest.mark.exhaustive)])
 def test_derivatives_by_rest_shape_stiffnesses_and_jumps(discretization):

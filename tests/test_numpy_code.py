@@ -200,14 +200,6 @@ def executables(function) -> int:
 
 
 def test_the_third_answer_is_compiled(impatient):
-    @compiled
-    def doubled(x):
-        return 2 * x
-
-    for expected in (0, 0, 1):
-        np.testing.assert_array_equal(doubled(X), 2 * X)
-        assert executables(doubled) == expected
-
     @one_answer
     def often():
         return [tripled(X) for _ in range(3)]
@@ -217,7 +209,9 @@ def test_the_third_answer_is_compiled(impatient):
         return 3 * x
 
     for expected in (0, 0, 1):
-        often()
+        np.testing.assert_array_equal(often()[-1], 3 * X)
+        # What is asked for outside belongs to the last answer.
+        tripled(X)
         assert executables(tripled) == expected
     with rj.numpy_first(False):
         tripled(X[0])

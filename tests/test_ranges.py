@@ -107,6 +107,21 @@ def test_traced_numbers_are_told_by_the_status_of_the_case():
     assert "2 not converged: a number of the scene makes no sense" in rj.describe(result)
 
 
+def test_jumps_too_near_for_the_mesh_are_told_by_the_status_of_the_case():
+    """Outside `jit` they are refused; inside two of them shared a node without a word."""
+
+    def layered(jump, at):
+        rod = rj.Rod(1.0, (rj.Steps(jnp.array([0.5, 1.0]) * jnp.array([1.0, jump]), (1.0, 2.0, 3.0)), 1.0), 0.7, 1e4)
+        ends = rj.Clamp((0, 0, 0), LEVEL), rj.Free(force=(0, 0, 0.1))
+        return rj.Scene(rod, *ends, point_forces=[rj.PointForce(at, (0, 0, 0.1))])
+
+    # 0.05 of one of 8 elements is 0.00625; what coincides is one place.
+    cases = jnp.array([[0.51, 0.3], [0.505, 0.3], [0.7, 0.703], [0.7, 0.7], [0.999, 0.3]])
+    result = jax.vmap(lambda case: rj.solve(layered(*case), **MESH))(cases)
+    np.testing.assert_array_equal(result.status == rj.Status.OUT_OF_RANGE, [False, True, True, False, True])
+    np.testing.assert_array_equal(result.converged, [True, False, False, True, False])
+
+
 def test_what_a_derivative_is_taken_by_is_checked(monkeypatch):
     """There the numbers become known where the solve begins."""
     monkeypatch.setattr("rodjax.solving.equilibrium._solve", lambda *_: pytest.fail("solved"))

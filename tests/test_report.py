@@ -96,6 +96,9 @@ def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
     assert f"{told['smallest inside bend radius'].value / (2 * RADIUS):.3g} times" in (
         told["smallest inside bend radius"].note
     )
+    first, last = 1e3 * np.asarray(rj.most_curved(equilibrium))
+    assert f"by its error anywhere from s = {first:.4g} to {last:.4g} mm" in told["smallest inside bend radius"].note
+    assert first <= 1e3 * told["smallest inside bend radius"].s <= last
     clearance = rj.clearance(equilibrium, OBSTACLES)
     nearest = int(np.argmin(clearance.distance))
     # Margins look between places too, which are 10 mm apart: h^2/8 by a curvature of 20 1/m.

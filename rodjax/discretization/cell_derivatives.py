@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import REFERENCE, Cells, Strains
+from rodjax.discretization.rest_ways import RestWays, part
 from rodjax.geometry.rotations import columns, rotated
 from rodjax.geometry.vectors import cross, diagonal, dot, skew
 from rodjax.linalg.blocks import short_sum
@@ -33,7 +34,11 @@ class CellStates(NamedTuple):
     quaternions: Float[Array, "4 p n"]
     forces: Float[Array, "3 p n"]
     rest_strains: Float[Array, "3 p n"] | None
-    rest_ways: Float[Array, "3 n"] | None
+    rest_ways: RestWays | None
+
+    @property
+    def turning(self) -> Float[Array, "3 n"] | None:
+        return None if self.rest_ways is None else self.rest_ways.turning
 
 
 class CellDerivatives(NamedTuple):
@@ -72,7 +77,11 @@ def density(cells: CellStates, strains: Float[Array, "4 p n"]) -> Float[Array, "
     sections, (*curvature, twist, tension) = cells.sections, jnp.unstack(strains)
     bent = (curvature[0], curvature[1])
     axial = sections.axial_strain_under(tension, bent, twist)
-    return cells.field.lengths * (sections.density(bent, twist, axial) - tension * (1 + axial))
+    value = cells.field.lengths * (sections.density(bent, twist, axial) - tension * (1 + axial))
+    if cells.rest_ways is not None and cells.rest_ways.along is not None:
+        assert cells.rest_strains is not None
+        value -= cells.rest_ways.along * part(strains[:2], cells.rest_strains[:2]) * tension
+    return value
 
 
 def _at_points(cells: CellStates, here: Coordinates, strains: Strains) -> Float[Array, "4 p n"]:
@@ -119,8 +128,8 @@ def derivatives(cells: CellStates) -> CellDerivatives:
     by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3])
     way = -short_sum(stresses[3][:, None] * forcing[3], axis=0)
     value = jnp.sum(density(cells, values), axis=0)
-    if cells.rest_ways is not None:
-        rest = rotated(cells.quaternions[:, REFERENCE], cells.rest_ways)
+    if cells.turning is not None:
+        rest = rotated(cells.quaternions[:, REFERENCE], cells.turning)
         way += rest
         value -= dot(cells.forces[:, REFERENCE], rest)
     first = _by_rotations(cells, here, stresses, of_strains)
@@ -161,9 +170,9 @@ def _by_rotations(
     _, p, n = stresses.shape
     first = short_sum((stresses[:, :, None] * rows).reshape(4 * p, 3 * p, n), axis=0)
     first = jnp.moveaxis(first.reshape(p, 3, n), 0, 1)
-    if cells.rest_ways is None:
+    if cells.turning is None:
         return first
-    return first.at[:, REFERENCE].add(-cross(cells.rest_ways, here.own_forces[:, REFERENCE]))
+    return first.at[:, REFERENCE].add(-cross(cells.turning, here.own_forces[:, REFERENCE]))
 
 
 def _curving(
@@ -176,8 +185,8 @@ def _curving(
     of_tensions = by_tension[None, None] * _of_turned(here.own_forces, tangents)
     for k in range(p):
         blocks[k][k] = of_tensions[:, :, k]
-    if cells.rest_ways is not None:
-        blocks[REFERENCE][REFERENCE] -= _of_turned(here.own_forces[:, REFERENCE], cells.rest_ways)
+    if cells.turning is not None:
+        blocks[REFERENCE][REFERENCE] -= _of_turned(here.own_forces[:, REFERENCE], cells.turning)
     first, _, _ = cells.field.coordinates.indices(4)
     (w, r), by_r = (here.seen[0], here.seen[1:]), slopes[1 - first :]
     by_w = jnp.zeros_like(w) if first else slopes[0]
@@ -199,11 +208,11 @@ def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "p n"]) 
     """
     by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])
     tilting = slopes[None, None] * by_turns
-    if cells.rest_ways is None:
+    if cells.turning is None:
         return tilting
     directors = here.directors[:, :, REFERENCE]
     # [c, a]: the directors times e_a x way.
-    turned = short_sum(directors[:, :, None] * -skew(cells.rest_ways)[None], axis=1)
+    turned = short_sum(directors[:, :, None] * -skew(cells.turning)[None], axis=1)
     return tilting.at[:, :, REFERENCE].add(-jnp.swapaxes(turned, 0, 1))
 
 

@@ -5,21 +5,20 @@ middle of each edge and at both ends, of second order; and `ElementCells`, with 
 an element, of fourth order. Both see only rotations between neighbours, so that no parametrisation has a pole.
 
 A cell is strained by what its strains exceed those of the stress-free rod by, where these come from the same formula
-at the frames of the stress-free rod, and its way by what that misses there. So a rod at rest has no residual on any
-mesh.
+at the frames of the stress-free rod, and its way is made up by what that misses there (`rest_ways`). So a rod at rest
+has no residual on any mesh.
 Arrays have the components first, then the frames of a cell or its strain points, then the cells.
 """
 
-import math
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rodjax.checks import Numbers, namespace
 from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
@@ -99,6 +98,10 @@ class Cells(Protocol):
 
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
         """The rests of ways from node to node as those of the cells."""
+        ...
+
+    def of_segments(self, by_segment: Float[Array, "segments"]) -> Float[Array, "p n"]:
+        """At each strain point what is given for the way between nodes to which it belongs; zero without such."""
         ...
 
     def sections(self, rod: Rod) -> Sections:
@@ -236,6 +239,9 @@ class JointCells(eqx.Module):
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
         return jnp.pad(by_segment, ((0, 0), (0, 1)))
 
+    def of_segments(self, by_segment: Float[Array, "segments"]) -> Float[Array, "2 n"]:
+        return jnp.stack([jnp.pad(by_segment, (1, 0)), jnp.pad(by_segment, (0, 1))])
+
     def sections(self, rod: Rod) -> Sections:
         a, b = self.places[:-1], self.places[1:]
         *of_joints, of_edges = rod.stiffnesses
@@ -332,6 +338,9 @@ class ElementCells(eqx.Module):
     def rest_of(self, by_segment: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return by_segment
 
+    def of_segments(self, by_segment: Float[Array, "n"]) -> Float[Array, "3 n"]:
+        return jnp.stack([by_segment] * 3)
+
     def sections(self, rod: Rod) -> Sections:
         s = self.strain_places
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
@@ -363,24 +372,23 @@ def varying(scene: Scene) -> list[Float[Array, "k"]]:
     return [value.jumps for value in values if isinstance(value, Steps)]
 
 
-def segments_for_jumps(scene: Scene) -> tuple[int, float] | None:
-    """The fewest elements of a mesh that has a node at each jump of a rod, of known numbers, and how near to another
+def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbers, "..."]] | None:
+    """The fewest elements of a mesh that has a node at each jump of a rod, a whole number, and how near to another
     place with a node such a jump lies, as a part of the length; `None` where nothing jumps. Also of stacked scenes.
     """
-    jumps = [np.asarray(steps) for steps in varying(scene)]
+    jumps = varying(scene)
     if not jumps:
         return None
-    length = np.asarray(scene.rod.length)[..., None]
-    others = [np.asarray(held.at)[..., None] for held in (*scene.clips, *scene.point_forces)]
-    places = np.concatenate([np.zeros_like(length), length, *others, *jumps], axis=-1) / length
-    is_jump = np.arange(places.shape[-1]) >= 2 + len(others)
-    order = np.argsort(places, axis=-1, kind="stable")
-    gaps = np.diff(np.take_along_axis(places, order, axis=-1), axis=-1)
-    is_apart = gaps > SAME_PLACE
-    of_jumps = is_jump[order[..., 1:]] | is_jump[order[..., :-1]]
-    gap = float(np.min(np.where(is_apart & of_jumps, gaps, 1.0)))
-    spans = int(np.max(np.sum(is_apart, axis=-1)))
-    return max(spans, math.ceil(LEAST_ELEMENT / gap * (1 + 1e-9))), gap
+    xp = namespace(scene)
+    length = xp.asarray(scene.rod.length)[..., None]
+    others = [xp.asarray(held.at)[..., None] for held in (*scene.clips, *scene.point_forces)]
+    jumps = xp.concatenate([xp.asarray(steps) for steps in jumps], axis=-1) / length
+    places = xp.concatenate([xp.zeros_like(length), xp.ones_like(length), *(at / length for at in others), jumps], -1)
+    is_apart = xp.diff(xp.sort(places, axis=-1), axis=-1) > SAME_PLACE
+    spans = xp.sum(is_apart.astype(places.dtype), axis=-1)
+    gaps = xp.abs(jumps[..., :, None] - places[..., None, :])
+    gap = xp.min(xp.where(gaps > SAME_PLACE, gaps, 1.0), axis=(-2, -1))
+    return xp.maximum(spans, xp.ceil(LEAST_ELEMENT / gap * (1 + 1e-9))), gap
 
 
 # Arclengths that differ by less, as parts of the length, are the same but for rounding.

@@ -2,9 +2,10 @@
 
 The mixed form of `mixed`, with a frame R in the place of each tangent. An equilibrium is a saddle point of
 
-    L(R, F) = sum h [w(strains(R), e) - n . t (1 + e)] - sum n . R rest + sum F . span,
+    L(R, F) = sum h w(strains(R), e) - n . t [h (1 + e) + g rest] - sum n . R rest + sum F . span,
 
-a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t.
+a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t, and
+both `rest` are what ways at rest have beyond h t (`rest_ways`).
 A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
 frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
 rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
@@ -28,6 +29,7 @@ from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearizatio
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
+from rodjax.discretization.rest_ways import RestWays, part
 from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import product as block_product
@@ -68,7 +70,7 @@ class FramePoint(eqx.Module):
 
 class Strained(eqx.Module):
     """At the strain points, first along the frames of a cell: what strains exceed those at rest by, axial strains under
-    the tension, and tangents.
+    the tension, tangents, and the lengths along these to the next node.
     """
 
     curvature: Float[Array, "2 p n"]
@@ -76,16 +78,22 @@ class Strained(eqx.Module):
     axial: Float[Array, "p n"]
     tension: Float[Array, "p n"]
     tangents: Float[Array, "3 p n"]
+    lengths: Float[Array, "p n"]
+
+    @property
+    def ways(self) -> Float[Array, "3 p n"]:
+        return self.lengths[None] * self.tangents
 
 
 class Kinematics(NamedTuple):
-    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and what turns with
-    the reference frames of the ways at rest.
+    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the ways at
+    rest what turns with the reference frames, and what lies along the tangents.
     """
 
     strains: Float[Array, "3 p n"]
     tangents: Float[Array, "3 p n"]
     rests: Float[Array, "3 n"]
+    along: Float[Array, "p n"] | None
 
 
 class HeldFrame(NamedTuple):
@@ -108,7 +116,7 @@ class FrameForm(Form):
     field: Cells
     sections: Sections
     rest_strains: Float[Array, "3 k n"] | None
-    rest_ways: Float[Array, "3 n"] | None
+    rest_ways: RestWays | None
     loads: Float[Array, "3 k n"]
     layout: ForceLayout
     across: Float[Array, "3"] | None = eqx.field(kw_only=True, default=None)
@@ -281,13 +289,20 @@ class FrameForm(Form):
         if self.rest_strains is not None:
             strains -= self.rest_strains
         rests = self._rest_of_ways(quaternions, jnp.zeros_like(strains[:, 0]))
-        return Kinematics(strains, tangent(quaternions), rests)
+        along = None
+        if self.rest_ways is not None and self.rest_ways.along is not None:
+            assert self.rest_strains is not None
+            along = self.rest_ways.along * part(strains[:2], self.rest_strains[:2])
+        return Kinematics(strains, tangent(quaternions), rests, along)
 
     def _strained(self, here: Kinematics, forces: Float[Array, "3 p n"]) -> Strained:
         strains, tangents = here.strains, here.tangents
         tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-        return Strained(strains[:2], strains[2], axial, tension, tangents)
+        lengths = self.field.lengths * (1 + axial)
+        if here.along is not None:
+            lengths += here.along
+        return Strained(strains[:2], strains[2], axial, tension, tangents, lengths)
 
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)
@@ -297,14 +312,11 @@ class FrameForm(Form):
     def edges(self, point: Any) -> Float[Array, "segments 3"]:
         """From node to node."""
         of_cells = self.field.of_cells(point.quaternions)
-        ways = self._ways(self.strained(point))
+        ways = self.strained(point).ways
         return self.field.ways(ways, self._rest_of_ways(of_cells, jnp.zeros_like(ways[:, 0]))).T
 
-    def _ways(self, here: Strained) -> Float[Array, "3 p n"]:
-        return (self.field.lengths * (1 + here.axial))[None] * here.tangents
-
     def _rest_of_ways(self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        return nothing if self.rest_ways is None else rotated(quaternions[:, REFERENCE], self.rest_ways)
+        return nothing if self.rest_ways is None else rotated(quaternions[:, REFERENCE], self.rest_ways.turning)
 
     # --- energies ----------------------------------------------------------------------------------------------------
 
@@ -316,7 +328,7 @@ class FrameForm(Form):
     def load_energy(self, point: FramePoint) -> Float[Array, ""]:
         """The potential of dead forces, zero at the origin; other loads have none."""
         here = self.strained(point)
-        work = jnp.sum((self.field.lengths * (1 + here.axial)) * dot(self.loads, here.tangents))
+        work = jnp.sum(here.lengths * dot(self.loads, here.tangents))
         rest = self._rest_of_ways(self.field.of_cells(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
@@ -479,9 +491,9 @@ class FrameForm(Form):
         forces = self.through(end_force) + self.loads
         here = self._strained(of_frames, forces)
         densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
-        value = jnp.sum(self.field.lengths * (densities - here.tension * (1 + here.axial)))
+        value = jnp.sum(self.field.lengths * densities - here.tension * here.lengths)
         value -= jnp.sum(forces[:, REFERENCE] * of_frames.rests)
-        return value, short_sum(self._ways(here), axis=1) + of_frames.rests
+        return value, short_sum(here.ways, axis=1) + of_frames.rests
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.layout import SpanForces
-from rodjax.geometry.rotations import inverse, rotated, tangent
+from rodjax.discretization.rest_ways import RestWays
 from rodjax.model.along import Along
 from rodjax.model.loads import DistributedForce
 from rodjax.model.scene import Scene
@@ -28,7 +28,7 @@ def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     }
 
 
-def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, Float[Array, "3 n"] | None]:
+def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
     """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
     rest = scene.rod.rest_shape
     if rest is None:
@@ -40,9 +40,7 @@ def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, 
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
     strains = strains_between(cells, frames)
-    ways = cells.lengths[None] * tangent(cells.of_cells(frames))
-    missing = jnp.diff(poses.positions[:, ::2], axis=1) - cells.ways(ways, jnp.zeros_like(ways[:, 0]))
-    return strains, cells.rest_of(rotated(inverse(q[:, 1::2]), missing))
+    return strains, RestWays.of(cells, frames, strains, jnp.diff(poses.positions[:, ::2], axis=1), q[:, 1::2])
 
 
 def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:

@@ -17,10 +17,12 @@ from rodjax.discretization.error import (
     of_sections,
 )
 from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.rest_ways import RestWays
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.rotations import columns, inverse, product, rotated, tangent, unit
 from rodjax.geometry.vectors import cross, dot, root
+from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
 from rodjax.model.scene import slides
 from rodjax.model.supports import Directed, Free, Held
@@ -208,7 +210,8 @@ def positions_between_frames(
     a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
     ways = field.h[None] * (5 * a + 8 * b - c) / 24
     if form.rest_ways is not None:
-        ways += rotated(q[:, 1::2], form.rest_ways) / 2
+        whole = short_sum(field.lengths[None] * slopes, axis=1)
+        ways += (form.edges(point).T - whole) / 2
     middles = nodes[:-1] + ways.T
     places = jnp.stack([field.s[:-1], (field.s[:-1] + field.s[1:]) / 2], axis=1).reshape(-1)
     points = jnp.stack([nodes[:-1], middles], axis=1).reshape(-1, 3)
@@ -255,10 +258,12 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
 
     strains = jnp.broadcast_to((rotated(inverse(middles), turn) / field.h[None])[:, None], form.loads.shape)
     ways = rotated(inverse(middles), gap)
-    at_rest = [jnp.zeros_like(x) if y is None else y for x, y in ((strains, form.rest_strains), (ways, form.rest_ways))]
+    rest_strains = jnp.zeros_like(strains) if form.rest_strains is None else form.rest_strains
+    rest_ways = RestWays(jnp.zeros_like(ways), None) if form.rest_ways is None else form.rest_ways
 
     def lacking(amount: Float[Array, ""] | float) -> FrameForm:
-        values = at_rest[0] + amount * strains, at_rest[1] + amount * ways
+        more = rest_ways._replace(turning=rest_ways.turning + amount * ways)
+        values = rest_strains + amount * strains, more
         return eqx.tree_at(lambda form: (form.rest_strains, form.rest_ways), form, values, is_leaf=lambda x: x is None)
 
     zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from rodjax.identification.setup import name_of
 from rodjax.model.supports import Clamp
@@ -22,6 +23,8 @@ CORRELATED = 0.95
 USUAL_RATIO = 0.1, 2.0
 OTHER_TURNS = (-1, 1, -2, 2, -3, 3)
 MOST_UNUSUAL = 3
+# Stiffnesses that experiments imply are the same within so many standard errors.
+TOLD_APART = 4.0
 # Rows of the table of experiments; of more the worst.
 MOST_ROWS = 30
 LEVEL = 0.95
@@ -110,7 +113,7 @@ def _remarks(fit: "Fit") -> list[str]:
                     f"{fit.labels[k]} and {fit.labels[j]} are hardly told apart: correlation {correlation[j, k]:+.3f}"
                 )
     told += fit.held
-    told += _of_turns(fit) + _of_frames(fit)
+    told += _of_turns(fit) + _of_taken_turns(fit) + _of_frames(fit)
     lost = [name for name, status in zip(_names(fit), fit.statuses, strict=True) if status not in CONVERGED]
     if lost:
         told.append(f"not solved: {', '.join(lost[:10])}{', ...' if len(lost) > 10 else ''}")
@@ -134,11 +137,45 @@ def _of_turns(fit: "Fit") -> list[str]:
         for result in results
         for _ in np.asarray(result.total_twist)
     ]
-    is_unusual = ~((ratios >= USUAL_RATIO[0]) & (ratios <= USUAL_RATIO[1]))
+    is_unusual = ~_is_usual(ratios)
     unusual = [row for row in np.flatnonzero(is_unusual) if fit.statuses[fit.setup.order[row]] in CONVERGED]
     return [
         _of_ratio(name_of(fit.setup, fit.setup.order[row]), float(ratios[row]), float(twists[row]), are_clamps[row])
         for row in unusual[:MOST_UNUSUAL]
+    ]
+
+
+def _is_usual(ratios: Float[np.ndarray, "e"]) -> Bool[np.ndarray, "e"]:
+    return (ratios >= USUAL_RATIO[0]) & (ratios <= USUAL_RATIO[1])
+
+
+def _of_taken_turns(fit: "Fit") -> list[str]:
+    """Which other torsional stiffness fits as well with another whole turn between clamps, where none was stated."""
+    labels = [unknown.label for unknown in fit.setup.shared if unknown.names == ("rod.GJ",)]
+    results = fit.found.evaluation.results
+    scenes = [result.scene for result in results]
+    if not labels or not all(
+        scene.rod.is_plain and isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp) and scene.turns is None
+        for scene in scenes
+    ):
+        return []
+    ratios = np.concatenate([np.asarray(scene.rod.GJ) / np.asarray(scene.rod.EI) for scene in scenes])
+    twists = np.concatenate([np.asarray(result.total_twist) for result in results])
+    if not np.all(_is_usual(ratios)) or not np.all(twists):
+        return []
+    value, error = (numbers[labels[0]] for numbers in (fit.estimate, fit.standard_error))
+    possible = []
+    for turns, words in ((1, "more"), (-1, "less")):
+        # Of each experiment the stiffness that has the same torque.
+        implied = value * twists / (twists + 2 * math.pi * turns * np.sign(twists))
+        if np.all(implied > 0) and np.ptp(implied) / np.mean(implied) <= TOLD_APART * error / value:
+            possible.append(f"one turn {words} would make it {np.mean(implied):.3g}")
+    if not possible:
+        return []
+    turn = np.max(np.abs(twists)) / (2 * math.pi) * error / value
+    return [
+        f"whole turns between the clamps were taken from the guess, as no scene states turns: shapes tell the torque, "
+        f"which is known to {turn:.2g} of a turn at {labels[0]} = {value:.3g}; {', '.join(possible)} and fit as well"
     ]
 
 

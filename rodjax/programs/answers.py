@@ -135,7 +135,9 @@ class _Answers:
 
     @contextlib.contextmanager
     def one(self) -> Iterator[None]:
-        """All that is called in here is one answer, also where that is part of another."""
+        """All that is called in here is one answer, also where that is part of another. What is read off its result
+        afterwards still belongs to it.
+        """
         with self.lock:
             self.number += not self.depth
             self.depth += 1

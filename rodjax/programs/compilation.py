@@ -17,7 +17,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from rodjax.checks import is_known
 from rodjax.programs import kept
-from rodjax.programs.answers import ANSWERS, QUICK, Program, knows_quick
+from rodjax.programs.answers import QUICK, Program, knows_quick
 
 _OUTSIDE = get_opaque_trace_state()
 
@@ -91,16 +91,15 @@ class _Programs:
         if None in kinds:
             return self._by_jax(args, options)
         key = tree, kinds, statics, getattr(jax.config, PRECISION)
-        with ANSWERS.one():
-            try:
-                program = self.known[key]
-            except KeyError:
-                name = None
-                if kept.is_keeping():
-                    name = kept.name_of(self.name, QUICK, statics, tree, kinds)
-                program = self.known[key] = Program(self.trace, tree, name, self.is_patient)
-            known = program.executable
-            result = program(args, options, leaves, given, named)
+        try:
+            program = self.known[key]
+        except KeyError:
+            name = None
+            if kept.is_keeping():
+                name = kept.name_of(self.name, QUICK, statics, tree, kinds)
+            program = self.known[key] = Program(self.trace, tree, name, self.is_patient)
+        known = program.executable
+        result = program(args, options, leaves, given, named)
         if known is None and program.executable is not None:
             _make_room()
         return result

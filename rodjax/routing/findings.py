@@ -7,11 +7,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from rodjax.analysis.curvature import curvature_along, most_curved
+from rodjax.model.along import Along
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import has_potential, slides
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import Margins, curvature_along, margins
+from rodjax.routing.margins import Margins, margins
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
 from rodjax.solving.result import Equilibrium, describe
@@ -148,13 +150,15 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         radius, place = measured["bend radius"]
         diameter = float(found.limit[found.names.index("bend radius")]) / multiple
         note = f"{radius / diameter:.3g} times the outer diameter" if np.isfinite(radius) else "straight"
+        # Where the radius varies, the place goes with it as much as with the curvature.
+        note += _somewhere(equilibrium) if np.isfinite(radius) and not isinstance(rod.radius, Along) else ""
         facts.append(Fact("smallest inside bend radius", *_finite(radius, "m", place), note=note))
     else:
         places, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
         most = int(np.argmax(curvature))
         is_straight = curvature[most] * length <= STRAIGHT
         radius = np.inf if is_straight else 1 / float(curvature[most])
-        note = "straight" if is_straight else "of the centerline"
+        note = "straight" if is_straight else f"of the centerline{_somewhere(equilibrium)}"
         facts.append(Fact("smallest bend radius", *_finite(radius, "m", places[most]), note=note))
     clearances = {name: at for name, at in measured.items() if _limit_of(name) == "clearance"}
     if clearances:
@@ -179,6 +183,14 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         _error(equilibrium),
     ]
     return facts
+
+
+def _somewhere(equilibrium: Equilibrium) -> str:
+    """Where the largest curvature may be within its error."""
+    first, last = np.asarray(most_curved(equilibrium))
+    if not (bool(equilibrium.converged) and np.isfinite(first)):
+        return ""
+    return f", by its error anywhere from s = {1e3 * first:.4g} to {1e3 * last:.4g} mm"
 
 
 def _finite(value: float, unit: str, s: float) -> tuple[float | None, str, float | None]:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.analysis.clearance import POINTS, places, radius_at
+from rodjax.analysis.curvature import at_nodes, curvature_within, has_sides, within_elements
 from rodjax.checks import instance, sequence
-from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Value, value_at
@@ -182,7 +182,7 @@ def measured(
             for end, s in (("start", equilibrium.s[0]), ("end", equilibrium.s[-1])):
                 vector = getattr(equilibrium, f"{end}_{kind}")
                 found.append(_size(f"{kind} of {end}", unit, vector, limit, s))
-    along = beside_nodes(equilibrium) if _has_sides(equilibrium) else equilibrium
+    along = beside_nodes(equilibrium) if has_sides(equilibrium) else equilibrium
     for name, unit, limit, values in (
         ("twist", "rad/m", limits.twist, along.twist),
         ("strain", "", limits.strain, along.axial_strain),
@@ -235,12 +235,12 @@ def _largest(
 
 def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], everywhere: bool) -> Measured:
     is_of_elements = isinstance(equilibrium.state.shape, Curve)
-    s = _both_sides(equilibrium) if is_of_elements else _along(equilibrium)[0]
+    s = within_elements(equilibrium) if is_of_elements else at_nodes(equilibrium)[0]
     radius = radius_at(equilibrium.scene.rod, s)
     limit = 2 * multiple.astype(radius.dtype) * radius
 
     def curvature_at(equilibrium: Equilibrium, at: Int[Array, "w"]) -> Float[Array, "w"]:
-        return _curvature(equilibrium, s[at]) if is_of_elements else _along(equilibrium)[1][at]
+        return curvature_within(equilibrium, s[at]) if is_of_elements else at_nodes(equilibrium)[1][at]
 
     if everywhere:
         at = jnp.arange(len(s))
@@ -254,34 +254,6 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], everywher
     inside = jnp.where(is_straight, jnp.inf, 1 / jnp.where(is_straight, 1.0, curvature) - radius)
     slack = 1 - curvature * (limit + radius)
     return Measured("bend radius", "m", True, inside, limit, slack, s[at])
-
-
-def _has_sides(equilibrium: Equilibrium) -> bool:
-    """Whether strains are looked at on both sides of the nodes by the frames there."""
-    return bool(equilibrium.scene.clips) and isinstance(equilibrium.state.shape, FramedCurve)
-
-
-def _along(equilibrium: Equilibrium) -> tuple[Float[Array, "... k"], Float[Array, "... k"]]:
-    """Arclengths and curvature, at nodes or beside them."""
-    along = beside_nodes(equilibrium) if _has_sides(equilibrium) else equilibrium
-    return along.s, along.curvature
-
-
-def _both_sides(equilibrium: Equilibrium) -> Float[Array, "k"]:
-    """Places of elements, just beside the nodes too: at a clip that holds a direction the curvature jumps."""
-    inset = float(jnp.finfo(equilibrium.s.dtype).eps) ** 0.5
-    fractions = np.array([inset, *(np.arange(1, POINTS + 1) / (POINTS + 1)), 1 - inset])
-    return places(equilibrium, fractions)[:-1]
-
-
-def _curvature(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k"]:
-    def slope(s: Float[Array, "k"]) -> Float[Array, "k 3"]:
-        return jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))[1]
-
-    first, second = jax.jvp(slope, (s,), (jnp.ones_like(s),))
-    across = jnp.cross(first, second)
-    squared = jnp.sum(first**2, axis=1)
-    return root(jnp.sum(across**2, axis=1)) / squared**1.5
 
 
 def _clearances(
@@ -358,12 +330,3 @@ def _nearest_in_pieces(
 def _decisive(values: Float[Array, "k"], everywhere: bool) -> Int[Array, "w"]:
     """All places, or the one where the values are least."""
     return jnp.arange(len(values)) if everywhere else jnp.argmin(values)[None]
-
-
-@over_leading_axes
-def curvature_along(equilibrium: Equilibrium) -> tuple[Float[Array, "... k"], Float[Array, "... k"]]:
-    """Arclengths [m] one after another, as close as limits are looked at, and the curvature there [1/m]."""
-    if not isinstance(equilibrium.state.shape, Curve):
-        return _along(equilibrium)
-    s = _both_sides(equilibrium)
-    return s, _curvature(equilibrium, s)

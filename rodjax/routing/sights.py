@@ -9,10 +9,10 @@ from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
+from rodjax.analysis.curvature import curvature_along
 from rodjax.model.obstacles import Obstacle, Plane
 from rodjax.plot import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.routing.limits import Limits
-from rodjax.routing.margins import curvature_along
 from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.surfaces import Faces, parts_of, round_faces, surfaces
 from rodjax.solving.result import Equilibrium

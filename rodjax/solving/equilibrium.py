@@ -399,9 +399,11 @@ def checked_options(
 def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
     """The fewest elements, or more where a rod whose numbers are known has `Steps` near to one another."""
     needed = segments_for_jumps(scene) if is_known(scene) else None
-    if needed is None or needed[0] <= (SIZES["hermite"][-1] if segments is None else segments):
-        return least if needed is None else max(least, needed[0])
-    count, gap = needed
+    if needed is None:
+        return least
+    count, gap = int(np.max(needed[0])), float(np.min(needed[1]))
+    if count <= (SIZES["hermite"][-1] if segments is None else segments):
+        return max(least, count)
     where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
     given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
     raise ValueError(

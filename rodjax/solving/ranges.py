@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
+from rodjax.discretization.cells import segments_for_jumps
 from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
 from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene
@@ -48,7 +49,12 @@ def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
     """The result of scenes whose numbers are traced: `OUT_OF_RANGE` where they make no sense."""
     if is_known(scenes):
         return result
-    is_wrong = _is_wrong(jax.lax.stop_gradient(scenes))
+    scenes = jax.lax.stop_gradient(scenes)
+    is_wrong = _is_wrong(scenes)
+    # What is told by an error where numbers are known, as the mesh is chosen.
+    needed = segments_for_jumps(scenes) if result.discretization == "hermite" else None
+    if needed is not None:
+        is_wrong |= needed[0] > result.s.shape[-1] - 1
     flags = (
         jnp.where(is_wrong, Status.OUT_OF_RANGE, result.status),
         result.converged & ~is_wrong,

@@ -39,7 +39,7 @@ class Status(enum.IntEnum):
             Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
             Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
-            "positive or an arclength beyond the rod",
+            "positive, an arclength beyond the rod, or jumps of `Steps` too near to one another for the mesh",
             Status.PASSED_THROUGH: "not converged: from its start the rod came through an obstacle, or lies within one",
         }[self]
 

@@ -67,7 +67,7 @@ JOBS = {
     "follower": "rj.solve(follower(d), segments=32).nodes",
     "contact": "rj.solve(scene(d, obstacles=[floor])).nodes",
     "contact_gradient": "jax.grad(lambda d: rj.solve(traced(d, obstacles=[floor]), segments=32).end_force[0])(d)",
-    "fit": "rj.fit([measured(d)], ['rod.EI', 'rod.GJ', 'rod.mass_per_length']).report()",
+    "fit": "rj.fit([measured(d)], ['rod.EI', 'rod.length', 'rod.mass_per_length']).report()",
     "route": "str(rj.route(scene(0.8, clips=[clip]), ranges, limits=limits(d), objective=short, starts=4))",
     "tolerances": "rj.tolerances(rj.solve(scene(d, clips=[clip])), scatter, limits=limits(0))",
 }

@@ -26,7 +26,7 @@ LARGEST_CONSTANT = 4096
 
 
 class NotInNumpyError(Exception):
-    """An operation for which there is no NumPy code; the message is its name."""
+    """An operation for which there is no NumPy code; the message tells which."""
 
 
 class AnswerCode:
@@ -48,7 +48,10 @@ class AnswerCode:
         if any(kind.weak_type for kind in program.out_avals):
             raise NotInNumpyError("a result of a weak type")
         writer = _Writer()
-        writer.function(program, "main")
+        try:
+            writer.function(program, "main")
+        except (AttributeError, KeyError) as error:
+            raise NotInNumpyError(f"an operation as this version of JAX has it ({error!r})") from error
         code = compile("\n".join(writer.lines), "<rodjax program>", "exec")
         kinds = [np.dtype(kind.dtype) for kind in program.in_avals]
         return AnswerCode(marshal.dumps(code), writer.constants, kinds, jax.tree.structure(traced.out_info))

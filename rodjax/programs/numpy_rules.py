@@ -270,6 +270,17 @@ def _tuple(names: Iterable[str]) -> str:
     return "(" + "".join(f"{name}, " for name in names) + ")"
 
 
+def _high_level(body: Any, equation: Any, *given: str) -> str:
+    """An operation of JAX 0.12 that consists of others, such as `searchsorted`."""
+    operation = equation.params["_prim"]
+
+    def expanded(*leaves: Any) -> Any:
+        return operation.expand(*jax.tree.unflatten(operation.in_tree, leaves))
+
+    program = jax.make_jaxpr(expanded)(*(v.aval for v in equation.invars))
+    return f"{body.writer.function(program)}({', '.join(given)})"
+
+
 def _while(body: Any, equation: Any, *given: str) -> str:
     params = equation.params
     of_condition, of_body = params["cond_nconsts"], params["body_nconsts"]
@@ -281,7 +292,10 @@ def _while(body: Any, equation: Any, *given: str) -> str:
 
 def _scan(body: Any, equation: Any, *given: str) -> str:
     params = equation.params
-    constants, carry = params["num_consts"], params["num_carry"]
+    if "ft_in" in params:  # from JAX 0.12 on
+        constants, carry, _ = (len(list(part)) for part in params["ft_in"].unpack())
+    else:
+        constants, carry = params["num_consts"], params["num_carry"]
     step = params["jaxpr"]
     kinds = tuple((v.shape, np.dtype(v.dtype)) for v in step.out_avals[carry:])
     return "op.scan({}, {}, {}, {}, {}, {}, {})".format(
@@ -366,6 +380,7 @@ INNER: dict[str, Rule] = {
     "custom_jvp_call": _inner("call_jaxpr"),
     "custom_vjp_call": _inner("call_jaxpr"),
     "checkpoint": _inner("jaxpr"),
+    "call_hi_primitive": _high_level,
     "while": _while,
     "scan": _scan,
     "cond": _cond,

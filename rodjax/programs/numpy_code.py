@@ -195,8 +195,7 @@ class _Body:
             if equation.primitive.multiple_results:
                 targets += ","
             self.lines.append(f" {targets} = {expression}" if results else f" {expression}")
-        else:
-            # Line by line where a name would be given away before it is used.
+        else:  # one expression for each result
             self.lines.append(f" {targets}, = {', '.join(expression)}," if results else " pass")
 
     def fold(self, equation: Any, expression: Any) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 import rodjax as rj
-from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain import ChainSystem, ContactRows, NodeBlocks
 from rodjax.linalg.saddle_point import DenseSystem, SaddlePointSystem, factor, factor_and_solve
 from rodjax.solving.result import form_and_point
 
@@ -224,42 +224,53 @@ def test_wrong_shapes_are_named(shapes):
 
 
 def random_chain(elements: int, seed: int = 0) -> ChainSystem:
-    """Of elements between nodes of which three are held; every second one is pushed."""
+    """Of elements between nodes of which three are held; two obstacles touch it at nodes and within elements."""
     rng = np.random.default_rng(seed)
     m = 2 * elements + 1
     diagonal = rng.normal(size=(2, 2, m))
     compliance = rng.normal(size=(3, 3, elements))
-    stiffness = rng.normal(size=(elements + 1, 3, 3))
-    stiffness = stiffness @ stiffness.transpose(0, 2, 1)
-    stiffness[::2] = 0
-    stiffness[1] *= 1e8  # a contact
     held = np.isin(np.arange(elements + 1), (0, elements // 2, elements))
+    free = np.concatenate([np.ones((elements + 1, 2)), np.repeat(~held[:, None], 3, axis=1)], axis=1)
+    stiffness = rng.normal(size=(elements + 1, 5, 5)) * free[:, :, None] * free[:, None]
+    below = rng.normal(size=(elements, 5, 5)) * free[1:, :, None] * free[:-1, None]
+    within = rng.normal(size=(2, 3, elements, 10)) * np.concatenate([free[:-1], free[1:]], axis=1)
+    closed = rng.random((2, elements + 1 + 3 * elements)) < 0.08
+    contacts = ContactRows(
+        jnp.asarray(rng.normal(size=(2, elements + 1, 5)) * free),
+        jnp.asarray(within),
+        jnp.asarray(1e-6),
+        jnp.asarray(closed),
+    )
     return ChainSystem(
         jnp.asarray(diagonal + diagonal.transpose(1, 0, 2)),
         *(jnp.asarray(rng.normal(size=shape)) for shape in ((2, 2, m - 1), (2, 2, elements), (2, 1, m))),
         jnp.full((1, 1), 0.3),
         jnp.asarray(rng.normal(size=(2, 3, 3, elements))),
         jnp.asarray(np.einsum("ijn,kjn->ikn", compliance, compliance) / 10),
-        jnp.asarray(stiffness),
+        NodeBlocks(jnp.asarray(stiffness + stiffness.transpose(0, 2, 1)), jnp.asarray(below)),
+        contacts,
         jnp.asarray(held),
     )
 
 
 @pytest.mark.parametrize("elements", [4, 7])
-def test_chains_are_solved_and_their_signs_counted(elements):
-    system = random_chain(elements)
-    m, multipliers = 2 * elements + 1, 1 + 3 * (elements + 1) + 3 * elements
+@pytest.mark.parametrize("is_backward", [False, True])
+def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
+    system = dataclasses.replace(random_chain(elements), is_backward=is_backward)
+    pressures = system.contacts.is_closed.size
+    m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 
     def column(unit):
         f, c = system.times(unit[: 2 * m].reshape(2, m), unit[2 * m :])
         return jnp.concatenate([f.reshape(-1), c])
 
     matrix = np.asarray(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
-    np.testing.assert_array_equal(matrix, matrix.T)
+    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-15, atol=0)
     right = np.random.default_rng(1).normal(size=len(matrix))
     factors = factor(system)
     x, y = factors.solve(jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :]))
-    # The contact, of 1e8, costs the dense solve some digits.
-    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(matrix, right), rtol=1e-8, atol=1e-10)
-    assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - 3 * elements
+    # The contacts, of 1e6, cost both solves some digits.
+    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(matrix, right), rtol=1e-7, atol=1e-7)
+    # A pressure is one negative eigenvalue, whether its contact is closed or open.
+    assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - pressures - 3 * elements
     assert int(factors.negative) > 0

@@ -1,15 +1,18 @@
 """Saddle-point systems of a rod whose nodes have positions of their own, by block elimination from node to node.
 
-The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in `linalg`,
-and the positions of the nodes, at which something may push: its stiffness stands on their diagonal. The force of an
-element is the multiplier of its way from node to node. The points in the middle of elements go first; then a node has
-b + 6 unknowns, rotation, force of the element before it and displacement, coupled with those of its neighbours only:
-O(n).
+The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in
+`saddle_point`, and the positions of the nodes, and the pressures of contact points. The force of an element is the
+multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first, each by itself, then
+the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
+displacement, coupled with those of its neighbours only: O(n).
 
-    rotation     H theta + B F + border y = f
+    rotation     H theta + B F + border y + (S v - N p) = f
     gap          B^T theta - C F + u_after - u_before = gap,    for each element
-    balance      S u + F_before - F_after = balance,            for each node that is not held
+    balance      (S v - N p) + F_before - F_after = balance,    for each node that is not held
     border       border^T theta - compliance y = c
+    pressure     -N^T v - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
+
+v: rotation and displacement of the nodes, v = (theta, u) there.
 """
 
 import dataclasses
@@ -17,18 +20,92 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
+
+
+class NodeBlocks(eqx.Module):
+    """A symmetric matrix by rotation and displacement of the nodes: the blocks of each, and those below, that couple a
+    node with the one before it.
+    """
+
+    diagonal: Float[Array, "n+1 d d"]
+    below: Float[Array, "n d d"]
+
+    def __add__(self, other: "NodeBlocks") -> "NodeBlocks":
+        return NodeBlocks(self.diagonal + other.diagonal, self.below + other.below)
+
+    def times(self, v: Float[Array, "n+1 d"]) -> Float[Array, "n+1 d"]:
+        found = jnp.einsum("nij,nj->ni", self.diagonal, v)
+        found = found.at[1:].add(jnp.einsum("nij,nj->ni", self.below, v[:-1]))
+        return found.at[:-1].add(jnp.einsum("nji,nj->ni", self.below, v[1:]))
+
+    def mirrored(self) -> "NodeBlocks":
+        return NodeBlocks(self.diagonal[::-1], jnp.swapaxes(self.below, 1, 2)[::-1])
+
+
+class ContactRows(eqx.Module):
+    """How the gaps of contact points, k at a place, grow as nodes turn and move: of points at the nodes, and of q within
+    each element by its two nodes. `softness`: of the pressures; `is_closed`: where there is one.
+    """
+
+    at_nodes: Float[Array, "k n+1 d"]
+    within: Float[Array, "k q n 2d"]
+    softness: Float[Array, ""]
+    is_closed: Bool[Array, "k p"]
+
+    def closed_where(self, is_closed: Bool[Array, "k p"]) -> "ContactRows":
+        return dataclasses.replace(self, is_closed=is_closed)
+
+    def rates(self, v: Float[Array, "n+1 d"]) -> Float[Array, "k p"]:
+        """Of the gaps, as nodes go by v."""
+        at_nodes = jnp.einsum("knd,nd->kn", self.at_nodes, v)
+        if not self.within.shape[1]:
+            return at_nodes
+        ends = jnp.concatenate([v[:-1], v[1:]], axis=1)
+        within = jnp.einsum("kqnd,nd->kqn", self.within, ends)
+        return jnp.concatenate([at_nodes, within.reshape(len(within), -1)], axis=1)
+
+    def pushed(self, pressures: Float[Array, "k p"]) -> Float[Array, "n+1 d"]:
+        """The work of pressures, by v."""
+        nodes, d = self.at_nodes.shape[1:]
+        found = jnp.einsum("knd,kn->nd", self.at_nodes, pressures[:, :nodes])
+        if not self.within.shape[1]:
+            return found
+        of_ends = jnp.einsum("kqnd,kqn->nd", self.within, pressures[:, nodes:].reshape(self.within.shape[:-1]))
+        return found.at[:-1].add(of_ends[:, :d]).at[1:].add(of_ends[:, d:])
+
+    def condensed(self) -> NodeBlocks:
+        """What closed contacts add to the stiffness."""
+        nodes, d = self.at_nodes.shape[1:]
+        weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
+        diagonal = jnp.einsum("knd,kne,kn->nde", self.at_nodes, self.at_nodes, weights[:, :nodes])
+        if not self.within.shape[1]:
+            return NodeBlocks(diagonal, jnp.zeros((nodes - 1, d, d), diagonal.dtype))
+        weights = weights[:, nodes:].reshape(self.within.shape[:-1])
+        return NodeBlocks(diagonal, jnp.zeros((nodes - 1, d, d), diagonal.dtype)) + of_elements(
+            jnp.einsum("kqnd,kqne,kqn->nde", self.within, self.within, weights)
+        )
+
+
+def of_elements(blocks: Float[Array, "n 2d 2d"]) -> NodeBlocks:
+    """The same matrix, of what each element adds by its two nodes."""
+    d = blocks.shape[1] // 2
+    none = jnp.zeros_like(blocks[:1, :d, :d])
+    diagonal = jnp.concatenate([blocks[:, :d, :d], none]) + jnp.concatenate([none, blocks[:, d:, d:]])
+    return NodeBlocks(diagonal, blocks[:, d:, :d])
 
 
 class ChainSystem(eqx.Module):
     """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
 
     `diagonal`, `lower`, `across`: the blocks of H, as in `saddle_point.SaddlePointSystem`; `by_force`: those of B at
-    start, middle and end of each element; `cell_compliance`: C; `stiffness`: S; `held`: the nodes whose place is given.
-    What is no rotation comes as one vector: border, then the nodes, then the elements. `is_backward`: elimination
-    begins at the end, for a free start: a first node that nothing holds or touches has no pivot.
+    start, middle and end of each element; `cell_compliance`: C; `at_nodes`: S; `contacts`: N, of which rows and columns
+    of what is held are zero, as those of S; `held`: the nodes whose place is given. What is no rotation comes as one
+    vector: border, contacts, then the nodes, then the elements. `is_backward`: elimination begins at the end, for a free
+    start: a first node that nothing holds or touches has no pivot.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -38,12 +115,16 @@ class ChainSystem(eqx.Module):
     compliance: Float[Array, "k k"]
     by_force: Float[Array, "b 3 3 n"]
     cell_compliance: Float[Array, "3 3 n"]
-    stiffness: Float[Array, "n+1 3 3"]
+    at_nodes: NodeBlocks
+    contacts: ContactRows
     held: Bool[Array, "n+1"]
     is_backward: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> "ChainSystem":
-        """The same system of the rod counted from its end: the forces through the elements have the other sign."""
+        """The same system of the rod counted from its end: the forces through the elements have the other sign.
+
+        Without contacts, which are eliminated before.
+        """
         return dataclasses.replace(
             self,
             diagonal=self.diagonal[..., ::-1],
@@ -52,7 +133,7 @@ class ChainSystem(eqx.Module):
             border=self.border[..., ::-1],
             by_force=-self.by_force[:, :, ::-1, ::-1],
             cell_compliance=self.cell_compliance[..., ::-1],
-            stiffness=self.stiffness[::-1],
+            at_nodes=self.at_nodes.mirrored(),
             held=self.held[::-1],
         )
 
@@ -62,31 +143,49 @@ class ChainSystem(eqx.Module):
         shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
 
+    def closed_where(self, is_closed: Bool[Array, "k p"]) -> "ChainSystem":
+        """With these contacts closed."""
+        return dataclasses.replace(self, contacts=self.contacts.closed_where(is_closed))
+
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
-        first, u, force = self.parted(y)
-        u = jnp.where(self.held[:, None], 0.0, u)
+        first, pressures, u, force = self.parted(y)
+        v = self.of_nodes(x, u)
         f = jnp.einsum("ijm,jm->im", self.diagonal, x) + jnp.einsum("ikm,k->im", self.border, first)
         f = f.at[:, 1:].add(jnp.einsum("ijm,jm->im", self.lower, x[:, :-1]))
         f = f.at[:, :-1].add(jnp.einsum("jim,jm->im", self.lower, x[:, 1:]))
         f = f.at[:, 2::2].add(jnp.einsum("ijm,jm->im", self.across, x[:, :-1:2]))
         f = f.at[:, :-1:2].add(jnp.einsum("jim,jm->im", self.across, x[:, 2::2]))
-        gap = jnp.diff(u, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
+        gap = jnp.diff(v[:, len(x) :], axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
         for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
             f = f.at[:, at].add(jnp.einsum("icn,nc->in", self.by_force[:, :, point], force))
             gap += jnp.einsum("icn,in->nc", self.by_force[:, :, point], x[:, at])
+        is_closed = self.contacts.is_closed
+        by_nodes = self.at_nodes.times(v) - self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
+        f = f.at[:, ::2].add(by_nodes[:, : len(x)].T)
         none = jnp.zeros_like(force[:1])
-        balance = jnp.concatenate([none, force]) - jnp.concatenate([force, none])
-        balance = jnp.where(
-            self.held[:, None], self.parted(y)[1], balance + jnp.einsum("kij,kj->ki", self.stiffness, u)
-        )
+        balance = by_nodes[:, len(x) :] + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
+        balance = jnp.where(self.held[:, None], u, balance)
+        gaps = -jnp.where(is_closed, self.contacts.rates(v) + self.contacts.softness * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
-        return f, jnp.concatenate([first, balance.reshape(-1), gap.reshape(-1)])
+        return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
 
-    def parted(self, y: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "n+1 3"], Float[Array, "n 3"]]:
-        """What belongs to the border, the nodes and the elements."""
-        k, nodes = len(self.compliance), len(self.held)
-        return y[:k], y[k : k + 3 * nodes].reshape(nodes, 3), y[k + 3 * nodes :].reshape(nodes - 1, 3)
+    def of_nodes(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "n+1 d"]:
+        """Rotations and displacements of the nodes; held ones stay."""
+        return jnp.concatenate([x[:, ::2].T, jnp.where(self.held[:, None], 0.0, u)], axis=1)
+
+    def parted(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+        """What belongs to the border (k,), the contacts (k, p), the nodes (n+1, 3) and the elements (n, 3)."""
+        nodes, is_closed = len(self.held), self.contacts.is_closed
+        first, contacts, places, forces = jnp.split(
+            y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes])
+        )
+        return first, contacts.reshape(is_closed.shape), places.reshape(nodes, 3), forces.reshape(nodes - 1, 3)
+
+    def condensed(self) -> "ChainSystem":
+        """Without the pressures, as elimination goes along the rod."""
+        system = dataclasses.replace(self, at_nodes=self.at_nodes + self.contacts.condensed())
+        return system.mirrored() if self.is_backward else system
 
 
 class _Middles(eqx.Module):
@@ -99,14 +198,15 @@ class _Middles(eqx.Module):
 class ChainFactors(eqx.Module):
     """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`.
 
-    Where elimination begins at the end, `system` and all else is mirrored.
+    `system`: that without pressures. Where elimination begins at the end, it and all else is mirrored.
     """
 
+    contacts: ContactRows
     system: ChainSystem
     middles: _Middles
     inverses: Float[Array, "n+1 c c"]
     below: Float[Array, "n c c"]
-    border_solution: tuple[Float[Array, "b k m"], Float[Array, "k j"]]
+    border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
     complement: Float[Array, "k k"]
     negative: Int[Array, ""]
 
@@ -116,24 +216,29 @@ class ChainFactors(eqx.Module):
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        first, nodes, gaps = self.system.parted(c)
-        if self.system.is_backward:
+        system, contacts, b = self.system, self.contacts, len(f)
+        first, given, nodes, gaps = system.parted(c)
+        pressing = -contacts.pushed(jnp.where(contacts.is_closed, given / contacts.softness, 0.0))
+        f, nodes = f.at[:, ::2].add(pressing[:, :b].T), nodes + pressing[:, b:]
+        if system.is_backward:
             f, nodes, gaps = f[:, ::-1], nodes[::-1], -gaps[::-1]
-        x, y = self._without_border(f[:, None], nodes[None], gaps[None])
-        x, y = x[:, 0], y[0]
-        by_border, of_border = self.border_solution
-        multipliers = self.complement @ (first - jnp.einsum("ikm,im->k", self.system.border, x))
+        x, displacements, forces = self._without_border(f[:, None], nodes[None], gaps[None])
+        x, displacements, forces = x[:, 0], displacements[0], forces[0]
+        by_border, u_by_border, force_by_border = self.border_solution
+        multipliers = self.complement @ (first - jnp.einsum("ikm,im->k", system.border, x))
         x -= jnp.einsum("ikm,k->im", by_border, multipliers)
-        y = jnp.concatenate([multipliers, y - multipliers @ of_border])
-        if self.system.is_backward:
-            _, displacements, forces = self.system.parted(y)
-            y = jnp.concatenate([multipliers, displacements[::-1].reshape(-1), -forces[::-1].reshape(-1)])
-            x = x[:, ::-1]
-        return x, y
+        displacements -= jnp.tensordot(multipliers, u_by_border, 1)
+        forces -= jnp.tensordot(multipliers, force_by_border, 1)
+        if system.is_backward:
+            x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
+        v = jnp.concatenate([x[:, ::2].T, displacements], axis=1)
+        pressures = jnp.where(contacts.is_closed, -(given + contacts.rates(v)) / contacts.softness, -given)
+        parts = (multipliers, pressures, displacements, forces)
+        return x, jnp.concatenate([part.reshape(-1) for part in parts])
 
     def _without_border(
         self, f: Float[Array, "b r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
-    ) -> tuple[Float[Array, "b r m"], Float[Array, "r j"]]:
+    ) -> tuple[Float[Array, "b r m"], Float[Array, "r n+1 3"], Float[Array, "r n 3"]]:
         middles, b = self.middles, len(f)
         of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
         moved = jnp.einsum("npq,npr->nqr", middles.solved, of_middles)
@@ -165,14 +270,12 @@ class ChainFactors(eqx.Module):
         of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)
         x = jnp.zeros_like(f).at[..., ::2].set(z[:, :b].transpose(1, 2, 0))
         x = x.at[..., 1::2].set(of_middles.transpose(1, 2, 0))
-        r = f.shape[1]
-        displacements, forces = z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
-        return x, jnp.concatenate([displacements.reshape(r, -1), forces.reshape(r, -1)], axis=1)
+        return x, z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
 
 
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
-    system = system.mirrored() if system.is_backward else system
+    contacts, system = system.contacts, system.condensed()
     b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
     middles, coupled, negative = _eliminated(system)
@@ -185,20 +288,24 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, force, force]
     turn, pull, place = slice(0, b), slice(b, b + 3), slice(b + 3, None)  # of the unknowns of a node
     blocks = jnp.zeros((n + 1, b + 6, b + 6), dtype)
-    blocks = blocks.at[:, turn, turn].set(of_nodes)
+    on_nodes, beside = system.at_nodes.diagonal, system.at_nodes.below
+    blocks = blocks.at[:, turn, turn].set(of_nodes + on_nodes[:, :b, :b])
+    blocks = blocks.at[:, place, turn].set(on_nodes[:, b:, :b]).at[:, turn, place].set(on_nodes[:, :b, b:])
     blocks = blocks.at[1:, pull, turn].set(by_end).at[1:, turn, pull].set(by_end.transpose(0, 2, 1))
     # The first node has no element before it.
     blocks = blocks.at[1:, pull, pull].set(of_force).at[0, pull, pull].set(-identity)
     pushed = free[1:, None, None] * identity[None]
     blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
-    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
+    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], on_nodes[:, b:, b:]))
     below = jnp.zeros((n, b + 6, b + 6), dtype)
-    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start])
+    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start] + beside[:, :b, :b])
+    below = below.at[:, place, turn].set(beside[:, b:, :b]).at[:, turn, place].set(beside[:, :b, b:])
+    below = below.at[:, place, place].set(beside[:, b:, b:])
     below = below.at[:, pull, turn].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, force, start])
     below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])
 
     # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
-    stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
+    stiffness = jnp.trace(on_nodes[:, b:, b:], axis1=1, axis2=2) / 3
     unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
     scale = jnp.concatenate(
         [jnp.ones((n + 1, b), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1
@@ -221,14 +328,15 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     negative += jnp.sum(signs < 0) - 3 * (n + 1)
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
-    blank = jnp.zeros((b, k, 2 * n + 1), dtype), jnp.zeros((k, 6 * n + 3), dtype)
-    factors = ChainFactors(system, middles, inverses, below, blank, jnp.zeros((k, k), dtype), negative)
+    blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
+    factors = ChainFactors(contacts, system, middles, inverses, below, blank, jnp.zeros((k, k), dtype), negative)
     if not k:
         return factors
-    by_border, of_border = factors._without_border(system.border, *nothing)
-    matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, by_border)
+    solution = factors._without_border(system.border, *nothing)
+    matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, solution[0])
     negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
-    return ChainFactors(system, middles, inverses, below, (by_border, of_border), jnp.linalg.inv(matrix), negative)
+    complement = jnp.linalg.inv(matrix)
+    return ChainFactors(contacts, system, middles, inverses, below, solution, complement, negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n d d"], Int[Array, ""]]:

@@ -42,7 +42,7 @@ def depths_of_elements(form: TouchingForm, point: Any) -> Float[Array, "n"]:
     """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
     beside a held place so much more than it is held there.
     """
-    s, nodes = form.field.s, form.positions(form.edges(point))
+    s, nodes = form.field.s, point.touching.places
     at_nodes = form.depths_at(nodes, form.radius)
     held = jnp.where(form.is_held, at_nodes, 0.0)
     parts = jnp.array(DEPTH_PLACES, s.dtype)

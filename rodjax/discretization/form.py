@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
+from rodjax.discretization.touching_point import Touching
 from rodjax.geometry.vectors import dot
-from rodjax.linalg.saddle_point import AnySystem
+from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Free
 
@@ -31,7 +32,8 @@ class Linearization(eqx.Module):
     """First and second derivatives of L at a point, by rotations in `bases`, by F and by a torque.
 
     `gradient`: by the rotations; `closure`: by F, what the rod lacks of the span, before it a zero for the torque;
-    `residual`: largest force left on a node; `energy`: L, without the work of a dead moment.
+    `residual`: largest force left on a node; `energy`: L, without the work of a dead moment; `gaps`: of contacts,
+    which `energy` leaves out.
     """
 
     bases: Float[Array, "3 b n"]
@@ -40,6 +42,7 @@ class Linearization(eqx.Module):
     system: AnySystem
     energy: Float[Array, ""]
     residual: Float[Array, ""]
+    gaps: Float[Array, "k p"] | None = None
 
 
 class Point(Protocol):
@@ -57,6 +60,9 @@ class Point(Protocol):
     def total_twist(self) -> Float[Array, ""]:
         """In radians, zero where there is no torsion."""
         ...
+
+    @property
+    def touching(self) -> Touching | None: ...
 
 
 class Form(eqx.Module):
@@ -97,8 +103,21 @@ class Form(eqx.Module):
         bases: Float[Array, "3 b m"],
         rotation: Float[Array, "b m"],
         force_change: Float[Array, "3 parts"],
+        others: Any = None,
     ) -> Any:
-        """The point turned by rotations in its bases, and under another force."""
+        """The point turned by rotations in its bases, and under another force; `others`: as of `others`."""
+
+    def touching_held(self, touching: Any) -> Any:
+        """With held nodes where the supports are."""
+        return touching
+
+    def touching_moved(self, point: Any, others: Any) -> Any:
+        """Of a step."""
+        return point.touching
+
+    def others(self, multipliers: Float[Array, "k"]) -> Any:
+        """What a step changes beside rotations and forces; `None` where that is all."""
+        return None
 
     @abstractmethod
     def in_plane(self, point: Any, normal: Float[Array, "3"], axes: Float[Array, "3 2"]) -> tuple["Form", Any]:
@@ -119,6 +138,20 @@ class Form(eqx.Module):
     @abstractmethod
     def linearized(self, point: Any) -> Linearization: ...
 
+    def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
+        """What a step from a point brings down, where it leads to."""
+        return here.energy
+
+    def sought(
+        self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
+    ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
+        """Whether a system, that of a linearisation and stiffer, is one of a minimum; the rotations and multipliers that
+        lead there, pushed aside.
+        """
+        found = factor_and_solve(system, push - here.gradient, -here.closure, is_regularized=True)
+        factors, rotation, multipliers = found
+        return factors.is_minimum, rotation, multipliers
+
     def unbalanced(self, point: Any) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         """The gradient and the closure of the linearisation alone."""
         here = self.linearized(point)
@@ -126,7 +159,12 @@ class Form(eqx.Module):
 
     @abstractmethod
     def under_force(
-        self, point: Any, here: Linearization, rotation: Float[Array, "b m"], change: Float[Array, "3 parts"]
+        self,
+        point: Any,
+        here: Linearization,
+        rotation: Float[Array, "b m"],
+        change: Float[Array, "3 parts"],
+        others: Any,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         """At a point and its linearisation, under other forces: what the rod lacks of its spans and the rate of that as
         it begins to turn; by how much L differs, and by how much the rate of L does.
@@ -164,6 +202,13 @@ class Form(eqx.Module):
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
         """Nodes along the edges, at held places to the last digit."""
         return nodes_along(self.scene, self.field.s, self.clip_nodes, edges)
+
+    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k p"] | None) -> Any:
+        """The point with what it has beside obstacles, of nodes and pressures."""
+        return point
+
+    def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
+        return self.nodes(self.edges(point)) if point.touching is None else point.touching.places
 
     def loads_on_all(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """All loads together, and the given force on an end that is free."""

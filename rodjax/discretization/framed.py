@@ -30,6 +30,7 @@ from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.rest_ways import RestWays, part
+from rodjax.discretization.touching_point import Touching
 from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import product as block_product
@@ -46,11 +47,14 @@ OUT_OF_PLANE = 1e-5
 
 
 class FramePoint(eqx.Module):
-    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known."""
+    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known; with
+    obstacles where the nodes lie and what pushes.
+    """
 
     quaternions: Float[Array, "4 m"]
     end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
+    touching: Touching | None = None
 
     @property
     def tangents(self) -> Float[Array, "3 m"]:
@@ -65,7 +69,8 @@ class FramePoint(eqx.Module):
         seen = rotated(inverse(swung_into), jnp.broadcast_to(normal[:, None], tangents.shape))
         turn = jnp.arctan2(seen[1], seen[0]) - jnp.arctan2(across[1], across[0])
         force = self.end_force - normal[:, None] * (normal @ self.end_force)[None]
-        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist))
+        touching = None if self.touching is None else self.touching.without(normal)
+        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist), touching)
 
 
 class Strained(eqx.Module):
@@ -202,10 +207,11 @@ class FrameForm(Form):
         for k, direction, frame in self.held_frames:
             held = swung(q[:, k], direction) if frame is None else nearer(from_frame(frame), q[:, k])
             q = q.at[:, k].set(held)
-        return FramePoint(q, point.end_force, point.total_twist)
+        return FramePoint(q, point.end_force, point.total_twist, self.touching_held(point.touching))
 
     def settled(self, point: FramePoint) -> FramePoint:
-        return FramePoint(point.quaternions, point.end_force, self.total_twist(point.quaternions))
+        twist = self.total_twist(point.quaternions)
+        return FramePoint(point.quaternions, point.end_force, twist, point.touching)
 
     def total_twist(self, quaternions: Float[Array, "4 m"]) -> Float[Array, ""]:
         return jnp.sum(self.field.lengths * strains_between(self.field, quaternions)[2])
@@ -216,10 +222,12 @@ class FrameForm(Form):
         bases: Float[Array, "3 3 m"],
         rotation: Float[Array, "3 m"],
         force_change: Float[Array, "3 parts"],
+        others: Any = None,
     ) -> FramePoint:
         # Rounding would grow with every step.
         quaternions = unit(turned(point.quaternions, rotation))
-        return FramePoint(quaternions, point.end_force + force_change, point.total_twist)
+        touching = self.touching_moved(point, others)
+        return FramePoint(quaternions, point.end_force + force_change, point.total_twist, touching)
 
     # --- forces, and what the spans lack -----------------------------------------------------------------------------
 
@@ -458,7 +466,12 @@ class FrameForm(Form):
         return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))
 
     def under_force(
-        self, point: FramePoint, here: Linearization, rotation: Float[Array, "3 m"], change: Float[Array, "3 parts"]
+        self,
+        point: FramePoint,
+        here: Linearization,
+        rotation: Float[Array, "3 m"],
+        change: Float[Array, "3 parts"],
+        others: Any,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         zero = jnp.zeros((), change.dtype)
         if not self.layout.size:

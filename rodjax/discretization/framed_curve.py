@@ -44,7 +44,7 @@ class FramedCurve(Shape):
         return FramedCurve(self.nodes * scale + shift[None], self.quaternions, self.s)
 
     def reached(self, form: Form, point: FramePoint) -> "FramedCurve":
-        return FramedCurve(form.nodes(form.edges(point)), point.quaternions, form.field.s)
+        return FramedCurve(form.nodes_of(point), point.quaternions, form.field.s)
 
     def change_to(self, other: Any) -> Float[Array, ""]:
         # A straight rod may twist in its place.

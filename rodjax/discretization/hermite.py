@@ -270,7 +270,7 @@ class Curve(Shape):
         return Curve(self.nodes * scale + shift[None], self.tangents, self.s)
 
     def reached(self, form: Form, point: MixedPoint) -> "Curve":
-        return Curve(form.nodes(form.edges(point)), point.tangents, form.field.s)
+        return Curve(form.nodes_of(point), point.tangents, form.field.s)
 
     def change_to(self, other: Any) -> Float[Array, ""]:
         return jnp.max(jnp.abs(other.nodes - self.nodes))

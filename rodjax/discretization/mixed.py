@@ -21,7 +21,7 @@ share, are a border of a few columns (`saddle_point.SaddlePointSystem`). Arrays 
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +35,7 @@ from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearizatio
 from rodjax.discretization.joints import rotated, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.touching_point import Touching
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.geometry.vectors import components, dot
@@ -47,18 +48,22 @@ from rodjax.model.supports import Clamp, Free
 
 
 class MixedPoint(eqx.Module):
-    """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero."""
+    """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero; with
+    obstacles where the nodes lie and what pushes.
+    """
 
     tangents: Float[Array, "3 m"]
     end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
+    touching: Touching | None = None
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "MixedPoint":
         """The point without what leaves the plane of these two axes, and without twist."""
         in_plane = axes.T @ self.tangents
         sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
         in_plane = jnp.where(sizes > 0, in_plane / jnp.where(sizes > 0, sizes, 1.0), jnp.eye(2, 1, dtype=sizes.dtype))
-        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist))
+        touching = None if self.touching is None else self.touching.flattened(axes)
+        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist), touching)
 
 
 class Elastic(NamedTuple):
@@ -145,7 +150,8 @@ class MixedForm(Form):
     def holding(self, point: MixedPoint) -> MixedPoint:
         """The point with the tangents that supports hold, and the total twist of the scene."""
         tangents = self.field.as_held(self.scene, point.tangents)
-        return MixedPoint(tangents, point.end_force, self.twist_near(tangents, point.total_twist))
+        twist = self.twist_near(tangents, point.total_twist)
+        return MixedPoint(tangents, point.end_force, twist, self.touching_held(point.touching))
 
     def settled(self, point: MixedPoint) -> MixedPoint:
         """The point where a solver stopped, with all that is known of it."""
@@ -236,6 +242,7 @@ class MixedForm(Form):
         bases: Float[Array, "3 b n"],
         rotation: Float[Array, "b n"],
         force_change: Float[Array, "3 parts"],
+        others: Any = None,
     ) -> MixedPoint:
         tangents = rotated(point.tangents, bases, rotation)
         twist = point.total_twist
@@ -243,7 +250,7 @@ class MixedForm(Form):
             twist += self.field.swept(self.scene, point.tangents, tangents)
         elif not self.has_potential:
             twist = twist_under_moment(self.scene, tangents)
-        return MixedPoint(tangents, point.end_force + force_change, twist)
+        return MixedPoint(tangents, point.end_force + force_change, twist, self.touching_moved(point, others))
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
@@ -346,6 +353,7 @@ class MixedForm(Form):
         here: Linearization,
         rotation: Float[Array, "b m"],
         change: Float[Array, "3 parts"],
+        others: Any,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         rod, weights, layout = self.scene.rod, self.field.side_weights, self.layout
         assert isinstance(layout, SpanForces)

@@ -1,19 +1,22 @@
-"""A rod that touches obstacles: the forms with a force of its own in each element, and pressure on its nodes.
+"""A rod that touches obstacles: the forms with a force of its own in each element, and pressures at contact points.
 
-Where a node is nearer to an obstacle than the rod is thick, it is pushed back by a force in proportion to how deep it
-is, straight out of the obstacle, so that the energy stays a smooth function: without friction. The stiffness is so
-high that loads of the size of those on the rod press it in by a small part of its radius only.
+No contact point, a node or a place within an element, is nearer to an obstacle than the rod is thick: gap g >= 0. The
+pressure p >= 0 [a force, for each obstacle and point] is the multiplier of that, without friction:
 
-The force through an element is that of all loads and contacts beyond it: unknown, one for each element, as the position
-of each node is. At a node the forces on its two sides differ by the contact; from node to node the way is that of the
-element (`chain.ChainSystem`). Positions follow from the elements, so that tangents or frames and forces alone make a
-point. Elements only. Contact acts at the nodes; between them the rod is not looked at.
+    L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
+
+The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
+unknowns of their own: so a gap depends on what is local, and a step of Newton's method moves nodes along straight lines.
+A step is the minimum of a model, L to second order with each gap to first: every point stays on its side of the tangent
+plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which contacts
+are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
+
+A rod that begins within an obstacle has its gaps seen larger by so much, and by half of that from step to step.
 """
 
 import dataclasses
-import functools
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,62 +24,73 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.form import FLOOR_SAFETY, Form
+from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
+from rodjax.discretization.touching_point import PARTS, Touching, TouchingChange, contact_points
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
+from rodjax.linalg.chain import ChainSystem, ContactRows, NodeBlocks, of_elements
+from rodjax.linalg.saddle_point import AnySystem
+from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.loads import DistributedForce
-from rodjax.model.obstacles import Obstacle, least
 from rodjax.model.supports import Free
 
-# A contact as strong as all loads together, and bending of BENDING [EI/L^2], goes so deep, in parts of the radius.
-PENETRATION = 3e-5
+# Of contacts: as strong as all loads together and bending of BENDING [EI/L^2], one would give way by so much in each
+# step of the search, of L, before its pressure is corrected.
+SOFTNESS = 1e-7
 BENDING = 100.0
-# The most of a contact that counts as it curves, in terms of that which the elements know of: beside one another in a
-# corner each of two obstacles may push as much as both together.
-MOST_CURVING = 2.0
-# A step takes no place deeper than this, in parts of the radius, into an obstacle; one that is there already so much
-# deeper. Its way is looked at at most so often, further on each time by its distance, or so much at least.
-DEEPEST = 0.5
-DEEPER = 0.125
-LEAST_WAY = 0.05
-MOST_LOOKS = 24
-# Places on the line to a held node that the rod does not reach yet.
-BETWEEN = 7
+# A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
+GAP_WEIGHT = 1e4
+# Of a start within an obstacle: less than this is given up at once [L].
+LEAST_RELAXED = 1e-3
+# A start as deep as this within an obstacle lies on it [L].
+LEAST_DEPTH = 1e-6
+# A start touches where its gap is below this part of the radius.
+TOUCHES = 1e-3
+
+
+class Contacts(NamedTuple):
+    """At a point: gaps, and by the motion of the nodes, those of `rows`, first and second derivatives of what L has of
+    them.
+    """
+
+    gaps: Float[Array, "k p"]
+    rows: ContactRows
+    first: Float[Array, "n+1 d"]
+    second: NodeBlocks
 
 
 class TouchingForm(Form):
-    """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element.
-
-    `softening`: by how much the contacts are softer than those of a result, 1 or less; `is_cautious`: an obstacle that
-    curves away counts only by the forces that the elements know of. On the way to an equilibrium a contact may be far
-    too deep for its stiffness, and would throw the rod off a round obstacle.
+    """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element, and
+    their `touching` is there.
     """
-
-    softening: Float[Array, ""] = eqx.field(kw_only=True)
-    is_cautious: bool = eqx.field(kw_only=True, static=True, default=False)
 
     @abstractmethod
     def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
         """The derivative of the centerline by arclength at the nodes."""
 
     @abstractmethod
-    def largest_force(self, point: Any) -> Float[Array, ""]:
-        """The largest component of a force through the rod."""
+    def tangent_rates(self, point: Any, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
+        """Of the tangents, by rotations in bases."""
 
-    def softened(self, softening: Float[Array, ""]) -> "TouchingForm":
-        """On the way to an equilibrium."""
-        return dataclasses.replace(self, softening=softening, is_cautious=True)
+    @abstractmethod
+    def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
+        """What stretch and forces add to L under other forces, and the ways of the elements; `elements`: as of
+        `turning_elements`.
+        """
+
+    @abstractmethod
+    def turning_elements(self, point: Any, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]) -> Any:
+        """What `in_elements` needs, and its rate as the rod begins to turn."""
 
     # --- what is unknown ---------------------------------------------------------------------------------------------
 
     def multipliers_turned(
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
-        positions = self.positions(self.edges(point))
         places, _ = self.held_places
-        arms = jnp.where(self.is_held[:, None], 0.0, positions - places[:, 0][None])
+        arms = jnp.where(self.is_held[:, None], 0.0, point.touching.places - places[:, 0][None])
         by_node = jnp.cross(axis[None], arms).reshape(-1)
         of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
@@ -89,6 +103,47 @@ class TouchingForm(Form):
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return super().is_closed(self.closure(closure), tolerance)
+
+    def others(self, multipliers: Float[Array, "k"]) -> TouchingChange:
+        nodes = len(self.field.s)
+        count = len(self.scene.obstacles) * self.contact_points
+        of_nodes = multipliers[-3 * (2 * nodes - 1) : -3 * (nodes - 1)].reshape(nodes, 3)
+        pressures = multipliers[-3 * (2 * nodes - 1) - count : -3 * (2 * nodes - 1)]
+        return TouchingChange(of_nodes, pressures.reshape(-1, self.contact_points))
+
+    def touching_moved(self, point: Any, others: TouchingChange | None) -> Touching:
+        touching = point.touching
+        if others is None:
+            return touching
+        relaxed = jnp.where(touching.relaxed < LEAST_RELAXED, 0.0, touching.relaxed / 2)
+        return Touching(touching.places + others.displacements, touching.pressures + others.pressures, relaxed)
+
+    def touching_held(self, touching: Touching | None) -> Touching | None:
+        if touching is None:
+            return None
+        positions, held = self.held_places
+        return dataclasses.replace(touching, places=touching.places.at[held].set(positions.T))
+
+    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k p"] | None) -> Any:
+        """Pressures that are not known, not numbers, are those of the forces through the elements."""
+        count = len(self.scene.obstacles)
+        nothing = jnp.zeros((count, self.contact_points), nodes.dtype)
+        touching = self.touching_held(Touching(nodes, nothing, nothing[:, 0]))
+        assert touching is not None
+        gaps, normals = self.gaps_and_normals(self.contact_positions(touching.places, point.tangents))
+        at_nodes = jnp.einsum("cn,knc->kn", self.at_nodes(point.end_force), normals[:, : len(nodes)])
+        pushing = jnp.pad(at_nodes, ((0, 0), (0, self.contact_points - len(nodes))))
+        pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.contact_radius), pushing, 0.0)
+        known = nothing + jnp.nan if pressures is None else pressures
+        deepest = -jnp.min(gaps, axis=1)
+        return dataclasses.replace(
+            point,
+            touching=Touching(
+                touching.places,
+                jnp.where(jnp.isnan(known), pushing, known),
+                jnp.where(deepest > LEAST_DEPTH, deepest, 0.0),
+            ),
+        )
 
     # --- places and contacts -----------------------------------------------------------------------------------------
 
@@ -103,17 +158,21 @@ class TouchingForm(Form):
         _, nodes = self.held_places
         return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
 
-    def positions(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
-        """Nodes along the edges, each from the last held one before it, or from the first."""
-        places, held = self.held_places
-        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        last = jnp.maximum(jnp.searchsorted(held, jnp.arange(len(sums)), side="right") - 1, 0)
-        return places.T[last] + (sums - sums[held[last]])
+    @property
+    def contact_points(self) -> int:
+        return contact_points(len(self.field.s) - 1)
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
         """At the nodes; of a radius that jumps, the larger one beside the node."""
         return largest_beside(self._radius, self.field.s)
+
+    @property
+    def contact_radius(self) -> Float[Array, "p"]:
+        if not PARTS:
+            return self.radius
+        within = self.radius_in_elements(jnp.asarray(PARTS, self.field.s.dtype))
+        return jnp.concatenate([self.radius, within.T.reshape(-1)])
 
     def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
         """At places in each element, as parts of it."""
@@ -128,8 +187,8 @@ class TouchingForm(Form):
         return radius
 
     @property
-    def stiffness(self) -> Float[Array, ""]:
-        """Of a contact [EI/L^3]."""
+    def softness(self) -> Float[Array, ""]:
+        """Of the contacts in the model of a step [L^3/EI]."""
         scene = self.scene
         forces = [load.force for load in scene.point_forces]
         forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
@@ -138,62 +197,183 @@ class TouchingForm(Form):
         load = jnp.asarray(BENDING, self.field.s.dtype)
         for force in forces:
             load += jnp.sqrt(1.0 + jnp.sum(force**2))
-        radius = self.radius
-        return self.softening * load / (PENETRATION * radius[jnp.argmin(radius)])
+        return SOFTNESS / load
 
-    def depths(self, positions: Float[Array, "n+1 3"]) -> Float[Array, "obstacles n+1"]:
-        """How far the rod is within each obstacle, at the nodes that are free to move; 0 outside."""
-        return jnp.stack([self._depths(obstacle, positions) for obstacle in self.scene.obstacles])
+    @property
+    def _weights(self) -> tuple[Array, Array]:
+        """Of the contact points in elements: by the positions of both nodes and by the tangents there, (q, 2)."""
+        x = np.array(PARTS)[:, None]
+        of_places = np.concatenate([(1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)], axis=1)
+        of_tangents = np.concatenate([x * (1 - x) ** 2, -(x**2) * (1 - x)], axis=1)
+        dtype = self.field.s.dtype
+        return jnp.asarray(of_places, dtype), jnp.asarray(of_tangents, dtype)
 
-    def _depths(self, obstacle: Obstacle, positions: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
-        depths = self.radius - jax.vmap(obstacle.at)(positions)
-        return jnp.where((depths > 0) & ~self.is_held, depths, 0.0)
+    def contact_positions(self, places: Float[Array, "n+1 3"], tangents: Float[Array, "3 m"]) -> Float[Array, "p 3"]:
+        if not PARTS:
+            return places
+        of_places, of_tangents = self._weights
+        slopes, h = tangents[:, ::2].T, jnp.diff(self.field.s)[:, None]
+        within = [
+            a[0] * places[:-1] + a[1] * places[1:] + h * (b[0] * slopes[:-1] + b[1] * slopes[1:])
+            for a, b in zip(of_places, of_tangents, strict=True)
+        ]
+        return jnp.concatenate([places, *within])
+
+    def gaps_and_normals(self, positions: Float[Array, "p 3"]) -> tuple[Float[Array, "k p"], Float[Array, "k p 3"]]:
+        """Gaps of L at nodes that are held, whose place is given."""
+        found = [jax.vmap(jax.value_and_grad(obstacle.at))(positions) for obstacle in self.scene.obstacles]
+        gaps = jnp.stack([distance - self.contact_radius for distance, _ in found])
+        return jnp.where(self._is_given[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
+
+    @property
+    def _is_given(self) -> Bool[Array, "p"]:
+        return jnp.pad(self.is_held, (0, self.contact_points - len(self.field.s)))
+
+    def contacts(self, point: Any, bases: Float[Array, "3 b m"]) -> Contacts:
+        touching, nodes, b = point.touching, len(self.field.s), bases.shape[1]
+        dtype = bases.dtype
+        positions = self.contact_positions(touching.places, point.tangents)
+        gaps, normals = self.gaps_and_normals(positions)
+        # How contact points move as nodes turn and move.
+        is_free = jnp.where(self.is_held, 0.0, 1.0).astype(dtype)
+        moving = is_free[:, None, None] * jnp.eye(3, dtype=dtype)[None]
+        at_nodes = jnp.concatenate([jnp.zeros((nodes, b, 3), dtype), moving], axis=1)
+        rates = self.tangent_rates(point, bases)[..., ::2].transpose(2, 1, 0)
+        h = jnp.diff(self.field.s)[:, None, None]
+        within = jnp.zeros((0, nodes - 1, 2 * (b + 3), 3), dtype)
+        if PARTS:
+            within = jnp.stack([
+                jnp.concatenate(
+                    [v[0] * h * rates[:-1], w[0] * moving[:-1], v[1] * h * rates[1:], w[1] * moving[1:]], axis=1
+                )
+                for w, v in zip(*self._weights, strict=True)
+            ])
+        of_elements_shape = (len(PARTS), nodes - 1)
+        rows = ContactRows(
+            jnp.einsum("knc,ndc->knd", normals[:, :nodes], at_nodes),
+            jnp.einsum("kqnc,qndc->kqnd", normals[:, nodes:].reshape(len(gaps), *of_elements_shape, 3), within),
+            self.softness,
+            touching.pressures * self.softness > gaps + touching.relaxed[:, None],
+        )
+        curving = self._curving(positions, touching.pressures)
+        blocks = NodeBlocks(
+            jnp.einsum("ndc,nce,nfe->ndf", at_nodes, curving[:nodes], at_nodes),
+            jnp.zeros((nodes - 1, b + 3, b + 3), dtype),
+        )
+        if PARTS:
+            curving = curving[nodes:].reshape(*of_elements_shape, 3, 3)
+            blocks += of_elements(jnp.einsum("qndc,qnce,qnfe->ndf", within, curving, within))
+            # The tangents turn on an arc.
+            pushing = jnp.einsum("kp,kpc->pc", touching.pressures, normals)[nodes:].reshape(*of_elements_shape, 3)
+            _, of_tangents = self._weights
+            first, second = (h[..., 0] * jnp.einsum("q,qnc->nc", weights, pushing) for weights in of_tangents.T)
+            none = jnp.zeros_like(first[:1])
+            on_tangents = jnp.concatenate([first, none]) + jnp.concatenate([none, second])
+            axes, tangents = bases[..., ::2], point.tangents[:, ::2]
+            along, across = jnp.einsum("cbn,cn->nb", axes, tangents), jnp.einsum("cbn,nc->nb", axes, on_tangents)
+            arcs = along[:, :, None] * across[:, None] + across[:, :, None] * along[:, None]
+            tension = jnp.einsum("cn,nc->n", tangents, on_tangents)
+            arcs = arcs / 2 - tension[:, None, None] * jnp.einsum("cbn,can->nba", axes, axes)
+            blocks = eqx.tree_at(lambda blocks: blocks.diagonal, blocks, blocks.diagonal.at[:, :b, :b].add(-arcs))
+        return Contacts(gaps, rows, -rows.pushed(touching.pressures), blocks)
+
+    def _curving(self, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"]) -> Float[Array, "p 3 3"]:
+        """Second derivatives of what L has of the contacts, by the positions of contact points."""
+        total = jnp.zeros((len(positions), 3, 3), positions.dtype)
+        for obstacle, pressure in zip(self.scene.obstacles, pressures, strict=True):
+            # Where the rod touches nothing of an obstacle, its curvature is not computed.
+            total = jax.lax.cond(
+                jnp.any(pressure != 0),
+                lambda total, obstacle=obstacle, pressure=pressure: total - pressure[:, None, None]
+                * jax.vmap(jax.hessian(obstacle.at))(positions),
+                lambda total: total,
+                total,
+            )
+        return total
+
+    def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
+        """The closure of contacts and nodes, and what is out of balance there."""
+        b = contacts.first.shape[1] - 3
+        balance = contacts.first[:, b:] + self.at_nodes(point.end_force).T
+        balance = jnp.where(self.is_held[:, None], 0.0, balance)
+        pressures = point.touching.pressures
+        rows = -jnp.where(contacts.rows.is_closed, contacts.gaps, pressures)
+        # Of a gap and a pressure one is zero, none is negative.
+        weighted = GAP_WEIGHT * contacts.gaps
+        amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)))
+        return rows.reshape(-1), balance, amiss
+
+    def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """What the elements lack of the ways between their nodes."""
+        return jnp.diff(point.touching.places, axis=0) - ways
+
+    # --- the search --------------------------------------------------------------------------------------------------
+
+    def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
+        """L with the contacts as of the model, with the pressures of a point."""
+        assert here.gaps is not None
+        softness = self.softness
+        pressures = point.touching.pressures - (here.gaps + point.touching.relaxed[:, None]) / softness
+        return here.energy + softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+
+    def sought(
+        self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
+    ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
+        assert isinstance(system, ChainSystem)
+        assert here.gaps is not None
+        touching = point.touching
+        first, _, balance, gaps = system.parted(-here.closure)
+        b = len(push)
+        # Without the pressures, which the model has.
+        pushed = system.contacts.pushed(touching.pressures)
+        balance = balance - jnp.where(self.is_held[:, None], 0.0, pushed[:, b:])
+        f = (push - here.gradient).at[:, ::2].add(-pushed[:, :b].T)
+        c = jnp.concatenate(
+            [part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)]
+        )
+        contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
+        found = minimized(system, f, c, contacts)
+        return found.is_minimum, found.x, found.y
+
+    def under_force(
+        self,
+        point: Any,
+        here: Linearization,
+        rotation: Float[Array, "b m"],
+        change: Float[Array, "3 n"],
+        others: TouchingChange,
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        elements, rates = self.turning_elements(point, rotation, here.bases)
+
+        def parts(elements: Any, places: Float[Array, "n+1 3"], change: Float[Array, "3 n"]) -> tuple[Array, Array]:
+            value, ways = self.in_elements(point, elements, change)
+            gap = jnp.diff(places, axis=0) - ways
+            # Of L the elements have sum -F . way.
+            force = point.end_force + change
+            return value + jnp.sum(force.T * jnp.diff(places, axis=0)), gap
+
+        places = point.touching.places
+        (energy, gaps), (rate, gap_rates) = jax.jvp(
+            lambda elements, places: parts(elements, places, change),
+            (elements, places),
+            (rates, others.displacements),
+        )
+        before, _ = parts(elements, places, jnp.zeros_like(change))
+        # Of the gradient by rotations, which has the forces and pressures as they are.
+        assert here.gaps is not None
+        contacts, touching = here.system.contacts, point.touching
+        v = here.system.of_nodes(rotation, others.displacements)
+        seen = touching.pressures - (here.gaps + touching.relaxed[:, None]) / self.softness
+        rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(v))
+        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - jnp.sum(rotation * here.gradient)
+
+    def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+        return is_better
 
     def depths_at(self, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
         """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
-
-    def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        """Only where all places go straight from one to the other without getting too deep into an obstacle."""
-        before, after = self._looked_at(point), self._looked_at(trial)
-        ways = after - before
-        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
-        radius = self.radius
-        rim = jnp.append(radius, jnp.repeat(radius[self.held_places[1][1:]], BETWEEN))
-
-        def distances(positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
-            return least(*(jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles))
-
-        first = distances(before)
-        bound = least(DEEPEST * rim, first - DEEPER * rim)
-
-        # No place is nearer than its distance: so far each may go, and is looked at again.
-        def ahead(gone: Float[Array, "k"], gaps: Float[Array, "k"]) -> Float[Array, "k"]:
-            return gone + jnp.maximum(gaps, LEAST_WAY * rim)
-
-        def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            gone, _, count = state
-            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
-            gaps = distances(before + parts[:, None] * ways) - bound
-            return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
-
-        def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
-            gone, is_blocked, count = state
-            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
-
-        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
-        gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
-        return is_better & ~is_blocked & jnp.all(gone >= lengths)
-
-    def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
-        """The nodes, and places on what the rod lacks of the way to each held one: else it would pass there."""
-        nodes = self.positions(self.edges(point))
-        _, held = self.held_places
-        lacking = nodes[held[1:]] - nodes[held[1:] - 1]
-        parts = jnp.linspace(0.0, 1.0, BETWEEN + 2, dtype=nodes.dtype)[1:-1]
-        across = nodes[held[1:] - 1][:, None] + parts[None, :, None] * lacking[:, None]
-        return jnp.concatenate([nodes, across.reshape(-1, 3)])
 
     def places(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
         """At equal steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
@@ -207,57 +387,6 @@ class TouchingForm(Form):
         beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
         return points, radius, jnp.where(self.is_held[cell][:, None], nodes[cell], beside)
 
-    def _contact_energy(self, positions: Float[Array, "n+1 3"]) -> Float[Array, ""]:
-        return self.stiffness / 2 * jnp.sum(self.depths(positions) ** 2)
-
-    def _contacts(
-        self, positions: Float[Array, "n+1 3"], forces: Float[Array, "n+1 3"]
-    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
-        """First and second derivatives of the energy of the contacts by the positions of the nodes.
-
-        `forces`: of the contacts, as those through the elements have them.
-        """
-        nothing = jnp.zeros_like(positions), jnp.zeros((*positions.shape, 3), positions.dtype)
-        most = MOST_CURVING * jnp.sqrt(jnp.sum(forces**2, axis=1)) if self.is_cautious else None
-        first, second = nothing
-        for obstacle in self.scene.obstacles:
-            # Where the rod is far from all of an obstacle, the distance is all that is computed of it.
-            touches = jnp.any(self._depths(obstacle, positions) > 0)
-            one, two = jax.lax.cond(
-                touches, functools.partial(self._contacts_with, obstacle, most), lambda _: nothing, positions
-            )
-            first, second = first + one, second + two
-        return first, second
-
-    def _contacts_with(
-        self, obstacle: Obstacle, most: Float[Array, "n+1"] | None, positions: Float[Array, "n+1 3"]
-    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
-        depths = self._depths(obstacle, positions)
-        normals, curvatures = jax.vmap(lambda x: (jax.grad(obstacle.at)(x), jax.hessian(obstacle.at)(x)))(positions)
-        pressures = self.stiffness * depths
-        curving = pressures if most is None else jnp.where(pressures > most, most, pressures)
-        stiffnesses = jnp.where(depths > 0, self.stiffness, 0.0)
-        second = stiffnesses[:, None, None] * normals[:, :, None] * normals[:, None]
-        return -pressures[:, None] * normals, second - curving[:, None, None] * curvatures
-
-    def _balance(
-        self, edges: Float[Array, "n 3"], end_force: Float[Array, "3 n"]
-    ) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1 3 3"]]:
-        """What is out of balance at the nodes, and the stiffness of the contacts there."""
-        pushing = self.at_nodes(end_force).T
-        first, second = self._contacts(self.positions(edges), pushing)
-        return jnp.where(self.is_held[:, None], 0.0, first + pushing), second
-
-    def _gaps(self, edges: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """What the elements lack of the ways between their nodes: those before held nodes."""
-        places, held = self.held_places
-        sums = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        missing = jnp.diff(places, axis=1).T - jnp.diff(sums[held], axis=0)
-        return jnp.zeros_like(edges).at[held[1:] - 1].set(missing)
-
-    def load_energy(self, point: Any) -> Float[Array, ""]:
-        return super().load_energy(point) + self._contact_energy(self.positions(self.edges(point)))  # pyright: ignore
-
     def rounding_floor(self, point: Any) -> Float[Array, ""]:
         floor = super().rounding_floor(point)  # pyright: ignore
-        return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * self.stiffness
+        return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT

@@ -5,7 +5,6 @@ Both differ from those of rods that touch nothing in the system and in what L is
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -19,6 +18,7 @@ from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching import TouchingForm
+from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem
 from rodjax.mechanics.energy import axial_strain_under, density
@@ -31,14 +31,8 @@ class TouchingTangents(TouchingForm, MixedForm):
 
     @classmethod
     def of(cls, scene: Scene, field: TangentField) -> "TouchingTangents":
-        loads_beyond = field.loads_beyond(scene)
-        return cls(
-            scene=scene,
-            field=field,
-            layout=CellForces(len(field.s) - 1),
-            loads_beyond=loads_beyond,
-            softening=jnp.ones((), loads_beyond.dtype),
-        )
+        layout = CellForces(len(field.s) - 1)
+        return cls(scene=scene, field=field, layout=layout, loads_beyond=field.loads_beyond(scene))
 
     def out_of_plane(self, normal: Float[Array, "3"]) -> "TouchingTangents":
         return dataclasses.replace(self, axes=None, layout=self.layout.in_axes(None))
@@ -46,8 +40,8 @@ class TouchingTangents(TouchingForm, MixedForm):
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
         return self.slopes(point)[:, ::2].T
 
-    def largest_force(self, point: MixedPoint) -> Float[Array, ""]:
-        return jnp.max(jnp.abs(self.forces(point)))
+    def tangent_rates(self, point: MixedPoint, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
+        return bases
 
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
@@ -56,12 +50,14 @@ class TouchingTangents(TouchingForm, MixedForm):
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
-        balance, second = self._balance(edges, point.end_force)
-        closure = [balance.reshape(-1), self._gaps(edges).reshape(-1)]
+        contacts = self.contacts(point, bases)
+        rows, balance, amiss = self.unbalanced_contacts(point, contacts)
+        closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
         columns = [] if torque_column is None else [torque_column]
         by_point = map(field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *columns))
         gradient, diagonal, lengths, *columns = by_point
+        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         if softness is None:
             border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
@@ -77,7 +73,8 @@ class TouchingTangents(TouchingForm, MixedForm):
             compliance,
             cells.by_force,
             self.layout.compliance(cells.compliance),
-            second,
+            contacts.second,
+            contacts.rows,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
         )
@@ -86,40 +83,25 @@ class TouchingTangents(TouchingForm, MixedForm):
             gradient=gradient,
             closure=jnp.concatenate(closure),
             system=system,
-            energy=energy + self._stretching(tangents, point.end_force)[0],
-            residual=_larger(jnp.max(jnp.abs(balance)), residual),
+            energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.touching.places, axis=0)),
+            residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, residual)),
+            gaps=contacts.gaps,
         )
 
-    def _stretching(
-        self, tangents: Float[Array, "3 m"], end_force: Float[Array, "3 n"]
+    def turning_elements(
+        self, point: MixedPoint, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]
+    ) -> tuple[Array, Array]:
+        return point.tangents, jnp.sum(bases * rotation[None], axis=1)
+
+    def in_elements(
+        self, point: MixedPoint, elements: Float[Array, "3 m"], change: Float[Array, "3 n"]
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        """The energy of stretch, loads, contacts and of what closes the spans; and the gaps."""
-        weights = self.field.side_weights
-        _, tension = self.forces_and_tensions(MixedPoint(tangents, end_force, jnp.zeros((), end_force.dtype)))
+        there = MixedPoint(elements, point.end_force + change, point.total_twist)
+        _, tension = self.forces_and_tensions(there)
         strain = axial_strain_under(self.scene.rod, tension)
-        ways = (weights * (1 + strain))[None] * self.field.of_sides(tangents)
-        edges = jnp.sum(ways, axis=1).T
-        gaps = self._gaps(edges)
-        energy = jnp.sum(weights * density(self.scene.rod, axial_strain=strain)) - jnp.sum(self.loads_beyond * ways)
-        return energy + self._contact_energy(self.positions(edges)) + jnp.sum(end_force * gaps.T), gaps
-
-    def under_force(
-        self,
-        point: MixedPoint,
-        here: Linearization,
-        rotation: Float[Array, "b m"],
-        change: Float[Array, "3 n"],
-    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        turning = jnp.sum(here.bases * rotation[None], axis=1)
-        (energy, gaps), (rate, gap_rates) = jax.jvp(
-            lambda tangents: self._stretching(tangents, point.end_force + change), (point.tangents,), (turning,)
-        )
-        before, _ = self._stretching(point.tangents, point.end_force)
-        # Of the gradient by rotations, which has the forces as they are.
-        forces, tension = self.forces_and_tensions(point)
-        lengths = self.field.side_weights * (1 + axial_strain_under(self.scene.rod, tension))
-        counted = -jnp.sum(lengths * short_sum(forces * self.field.of_sides(turning), axis=0))
-        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
+        lengths = self.field.side_weights * (1 + strain)
+        energy = jnp.sum(self.field.side_weights * density(self.scene.rod, axial_strain=strain) - lengths * tension)
+        return energy, short_sum(lengths[None] * self.field.of_sides(elements), axis=1).T
 
 
 class TouchingFrames(TouchingForm, FrameForm):
@@ -128,21 +110,22 @@ class TouchingFrames(TouchingForm, FrameForm):
     @classmethod
     def of(cls, scene: Scene, field: Cells) -> "TouchingFrames":
         parts = parts_of(scene, field)
-        layout = CellForces(len(field.s) - 1)
-        return cls(**{**parts, "layout": layout}, softening=jnp.ones((), field.s.dtype))
+        return cls(**{**parts, "layout": CellForces(len(field.s) - 1)})
 
     def node_slopes(self, point: FramePoint) -> Float[Array, "n+1 3"]:
         strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
         return ((1 + strain)[None] * point.tangents)[:, ::2].T
 
-    def largest_force(self, point: FramePoint) -> Float[Array, ""]:
-        return jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
+    def tangent_rates(self, point: FramePoint, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
+        return cross(bases, jnp.broadcast_to(point.tangents[:, None], bases.shape))
 
     def linearized(self, point: FramePoint) -> Linearization:
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         assert across is not None, "elements, not joints"
-        edges = cells.way.T
-        balance, second = self._balance(edges, point.end_force)
+        bases = self.bases_at(point)
+        contacts = self.contacts(point, bases)
+        rows, balance, amiss = self.unbalanced_contacts(point, contacts)
+        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         dtype = gradient.dtype
         system = ChainSystem(
             diagonal,
@@ -152,17 +135,20 @@ class TouchingFrames(TouchingForm, FrameForm):
             jnp.zeros((0, 0), dtype),
             self._by_force(cells),
             self.layout.compliance(cells.compliance),
-            second,
+            contacts.second,
+            contacts.rows,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
         )
+        gaps = self.gap_of_elements(point, cells.way.T)
         return Linearization(
-            bases=self.bases_at(point),
+            bases=bases,
             gradient=gradient,
-            closure=jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)]),
+            closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=system,
-            energy=self._with_contacts(jnp.sum(cells.value), edges, point.end_force),
-            residual=_larger(jnp.max(jnp.abs(balance)), self._residual(gradient)),
+            energy=jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.touching.places, axis=0)),
+            residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, self._residual(gradient))),
+            gaps=contacts.gaps,
         )
 
     def _by_force(self, cells: CellDerivatives) -> Float[Array, "3 3 3 n"]:
@@ -172,33 +158,23 @@ class TouchingFrames(TouchingForm, FrameForm):
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
-        gradient = self.field.assembled(self.by_rotations(point.quaternions, point.end_force))
-        edges = self.edges(point)
-        balance, _ = self._balance(edges, point.end_force)
-        return self.projected(gradient), jnp.concatenate([balance.reshape(-1), self._gaps(edges).reshape(-1)])
+        gradient = self.projected(self.field.assembled(self.by_rotations(point.quaternions, point.end_force)))
+        contacts = self.contacts(point, self.bases_at(point))
+        rows, balance, _ = self.unbalanced_contacts(point, contacts)
+        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
+        gaps = self.gap_of_elements(point, self.edges(point))
+        return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 
-    def _with_contacts(
-        self, value: Float[Array, ""], edges: Float[Array, "n 3"], end_force: Float[Array, "3 n"]
-    ) -> Float[Array, ""]:
-        """L, of what the cells add to it under the forces through them."""
-        across = jnp.sum(end_force.T * (edges + self._gaps(edges)))
-        return value + across + self._contact_energy(self.positions(edges))
+    def turning_elements(
+        self, point: FramePoint, rotation: Float[Array, "3 m"], bases: Float[Array, "3 3 m"]
+    ) -> tuple[Kinematics, Kinematics]:
+        return self.turning(point, rotation)
 
-    def under_force(
-        self, point: FramePoint, here: Linearization, rotation: Float[Array, "3 m"], change: Float[Array, "3 n"]
-    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        kinematics, rates = self.turning(point, rotation)
-
-        def parts(of_frames: Kinematics, force: Float[Array, "3 n"]) -> tuple[Array, Array]:
-            value, ways = self.in_cells(of_frames, force)
-            return self._with_contacts(value, ways.T, force), self._gaps(ways.T)
-
-        (energy, gaps), (rate, gap_rates) = jax.jvp(
-            lambda of_frames: parts(of_frames, point.end_force + change), (kinematics,), (rates,)
-        )
-        before, _ = parts(kinematics, point.end_force)
-        counted = jnp.sum(rotation * here.gradient)
-        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
+    def in_elements(
+        self, point: FramePoint, elements: Kinematics, change: Float[Array, "3 n"]
+    ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        value, ways = self.in_cells(elements, point.end_force + change)
+        return value, ways.T
 
 
 def _larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:

@@ -28,6 +28,7 @@ from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
+from rodjax.discretization.touching_point import contact_points
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.passage import PLACES, Before
 from rodjax.model.plane import check_planar, is_planar, plane
@@ -43,7 +44,6 @@ from rodjax.model.scene import (
 from rodjax.model.supports import Clamp
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.contact_search import find_touching
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
@@ -285,7 +285,8 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         assert isinstance(shape, Curve | FramedCurve)
         end_force = _of_elements(end_force, state.shape.s, shape.s)
     shape, end_force = _on_its_side(coarse.scene, coarse, shape, end_force)
-    return SolverState(shape, end_force, state.units, state.places, before=state.before)
+    pressures = _pressures(coarse.scene, options)
+    return SolverState(shape, end_force, state.units, state.places, before=state.before, pressures=pressures)
 
 
 def _on_its_side(
@@ -317,6 +318,16 @@ def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
         return Before(jnp.full((PLACES, 3), jnp.nan, scene.rod.length.dtype), scene.obstacles)
     shapes = [jax.tree.map(jnp.shape, obstacles) for obstacles in (last.obstacles, scene.obstacles)]
     return last if eqx.tree_equal(*shapes) else Before(last.points, scene.obstacles)
+
+
+def _pressures(scene: Scene, options: Options, state: SolverState | None = None) -> Float[Array, "k p"] | None:
+    """Those of a state, on its mesh, or no numbers where they are not known."""
+    if not scene.obstacles:
+        return None
+    shape = (len(scene.obstacles), contact_points(options.segments))
+    if state is not None and state.pressures is not None and state.pressures.shape == shape:
+        return state.pressures
+    return jnp.full(shape, jnp.nan, scene.rod.length.dtype)
 
 
 def _of_elements(
@@ -461,7 +472,8 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
         first = last_twist(guess)
         if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
             before = _before(scene, guess)
-            return SolverState(state.shape, state.end_force, state.units, state.places, before=before), first
+            pressures = _pressures(scene, options, state)
+            return dataclasses.replace(state, clip_moments=None, before=before, pressures=pressures), first
     return _first_state(scene, guess, options)
 
 
@@ -527,15 +539,17 @@ def _unsettled_state(
     pieces = options.segments if kind is Polyline else 2 * options.segments
     parts = force_parts(scene, options.segments)
     no_force = jnp.zeros((3, parts), scene.rod.length.dtype)
-    before = _before(scene, guess)
+    before, pressures = _before(scene, guess), _pressures(scene, options)
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
-        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), FirstTwist(no_twist)
+        places = sliding_places(scaled)
+        return SolverState(shape, no_force, units, places, before=before, pressures=pressures), FirstTwist(no_twist)
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(scaled, units, pieces))
         twist = FirstTwist(guess.total_twist)
-        return SolverState(shape, no_force, units, sliding_places(scaled), before=before), twist
+        places = sliding_places(scaled)
+        return SolverState(shape, no_force, units, places, before=before, pressures=pressures), twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -549,7 +563,7 @@ def _unsettled_state(
         places = state.places
     if scene.obstacles:
         shape, end_force = _on_its_side(scene, guess, shape, end_force)
-    return SolverState(shape, end_force, state.units, places, before=before), last_twist(guess)
+    return SolverState(shape, end_force, state.units, places, before=before, pressures=pressures), last_twist(guess)
 
 
 def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
@@ -560,10 +574,10 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     parts = force_parts(scene, options.segments)
     no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
-    before = _before(given, guess)
+    before, pressures = _before(given, guess), _pressures(given, options)
 
     def state(shape: FramedCurve) -> SolverState:
-        return SolverState(shape, no_force, units, places, before=before)
+        return SolverState(shape, no_force, units, places, before=before, pressures=pressures)
 
     if guess is None:
         return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
@@ -578,7 +592,8 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         shape = shape.on(s, of_joints)
         if scene.obstacles:
             shape, end_force = _on_its_side(given, guess, shape, end_force)
-        return SolverState(shape, end_force, guess.state.units, places, before=before), first
+        units = guess.state.units
+        return SolverState(shape, end_force, units, places, before=before, pressures=pressures), first
     points = _in_units(guess.state, units).shape.points(pieces)
     start = guess.scene.start
     if isinstance(start, Clamp):
@@ -636,17 +651,17 @@ class Search(eqx.Module):
             status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
-        return Found(SolverState(shape, point.end_force, self.units, places), point, outcome, stable)
+        pressures = None if point.touching is None else point.touching.pressures
+        state = SolverState(shape, point.end_force, self.units, places, pressures=pressures)
+        return Found(state, point, outcome, stable)
 
 
 def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
     solver = options.solver
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, first, options)
-        if isinstance(search.form, TouchingForm):
-            end = find_touching(search.form, search.point, solver, options.find)
-            return _on_one_side(search, search.found(end), guess)
-        return search.found(find_equilibrium(search.form, search.point, solver, options.find))
+        found = search.found(find_equilibrium(search.form, search.point, solver, options.find))
+        return _on_one_side(search, found, guess) if isinstance(search.form, TouchingForm) else found
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, first)
     minimum = minimize(problem, start, solver)
@@ -660,8 +675,7 @@ def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
     form, before = search.form, guess.before
     assert isinstance(form, TouchingForm)
     assert before is not None
-    nodes = form.nodes(form.edges(search.point))
-    begin, _, _ = form.places(nodes, search.point)
+    begin, _, _ = form.places(search.point.touching.places, search.point)
     begin = guess.units.origin[None] + guess.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
     passed, now = passage_to(form, found.point, found.state.shape.nodes, guess.units, before)
@@ -702,7 +716,8 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
     end_force = form.layout.forces(form.layout.components(guess.end_force))
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
-        return shape, form.holding(FramePoint(shape.turned_to_ends(form, first), end_force, first.total_twist))
+        point = form.holding(FramePoint(shape.turned_to_ends(form, first), end_force, first.total_twist))
+        return shape, form.begun(point, shape.nodes, guess.pressures)
     assert isinstance(form, MixedForm)
     if isinstance(shape, Curve):
         assert isinstance(field, HermiteElements)
@@ -713,7 +728,8 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
             problem, start = FiniteDifference.begin(scene, shape, first)
             return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
         tangents = shape.tangents
-    return shape, MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
+    point = MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
+    return shape, form.begun(point, shape.nodes, guess.pressures)
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
@@ -732,4 +748,5 @@ def _in_units(state: SolverState, units: Units) -> SolverState:
     """The unknowns in other units; unchanged to the last bit where the units are the same."""
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
     force = state.end_force * (state.units.force / units.force)
-    return SolverState(shape, force, units, state.places, before=state.before)
+    pressures = None if state.pressures is None else state.pressures * (state.units.force / units.force)
+    return SolverState(shape, force, units, state.places, before=state.before, pressures=pressures)

@@ -72,7 +72,9 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        found = Found(SolverState(shape, point.end_force, units, places, before=before), point, outcome, result.stable)
+        pressures = None if point.touching is None else point.touching.pressures
+        state = SolverState(shape, point.end_force, units, places, before=before, pressures=pressures)
+        found = Found(state, point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))

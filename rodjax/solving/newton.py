@@ -1,6 +1,6 @@
 """Newton's method on the mixed form: independent of mesh and slenderness, and safeguarded to end in a minimum."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import not_negative, plain_number, whole_number
 from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
+from rodjax.discretization.touching_point import TouchingChange
 from rodjax.geometry.vectors import components, dot
-from rodjax.linalg.saddle_point import factor, factor_and_solve
+from rodjax.linalg.saddle_point import factor
 from rodjax.model.scene import scene_axes
 from rodjax.solving.status import Outcome, Status
 
@@ -85,6 +86,7 @@ class NewtonState(eqx.Module):
     shift: Float[Array, ""]
     rotation: Float[Array, "b n"]
     force_change: Float[Array, "3 parts"]
+    others: Any  # what else it changes, as of `Form.others`
     # The augmented Lagrangian at the point with the new force, its slope along the step, and the fraction of it to try.
     weight: Float[Array, ""]
     merit: Float[Array, ""]
@@ -133,11 +135,12 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     descends = _descends(form, find)
     rotation = state.step * state.rotation
     force_change = state.force_change if descends else state.step * state.force_change
-    moved = form.moved(state.point, state.bases, rotation, force_change)
+    others = jax.tree.map(lambda change: state.step * change, state.others)
+    moved = form.moved(state.point, state.bases, rotation, force_change, others)
     trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
     linearization = form.linearized(trial)
     closure = form.closure(linearization.closure)
-    objective = linearization.energy if descends else _half_square(form, linearization)
+    objective = form.objective(linearization, state.point) if descends else _half_square(form, linearization)
     merit = objective + state.weight / 2 * jnp.sum(closure**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
@@ -189,11 +192,9 @@ def _advanced(
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
-    sought = push * components(here.bases, pattern) - here.gradient
-    factors, rotation, multipliers = factor_and_solve(
-        here.system.shifted(h * shift), sought, -here.closure, is_regularized=True
-    )
-    is_definite = factors.is_minimum
+    system, aside = here.system.shifted(h * shift), push * components(here.bases, pattern)
+    is_definite, rotation, multipliers = form.sought(here, point, system, aside)
+    others = form.others(multipliers)
     is_finite = jnp.isfinite(here.residual + here.energy)
     is_stable = is_definite & (shift <= least)
     if find == "minimum":
@@ -211,8 +212,8 @@ def _advanced(
 
     if _descends(form, find):
         # With the new force in place of the old one.
-        closure, closure_rate, change, along = form.under_force(point, here, rotation, force_change)
-        objective = here.energy + change
+        closure, closure_rate, change, along = form.under_force(point, here, rotation, force_change, others)
+        objective = form.objective(here, point) + change
         along += jnp.sum(rotation * here.gradient)
     else:
         closure = form.closure(here.closure)
@@ -237,6 +238,7 @@ def _advanced(
         shift=shift,
         rotation=rotation,
         force_change=force_change,
+        others=others,
         weight=weight,
         merit=objective + weight / 2 * jnp.sum(closure**2),
         slope=along - weight * falls,
@@ -289,6 +291,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),
+        others=None if point.touching is None else TouchingChange.nothing(point.touching),
         weight=zero,
         merit=zero,
         slope=zero,

@@ -86,7 +86,8 @@ class SolverState(eqx.Module):
     those of clips and contacts;
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
-    was when it last was sound: a solve that begins here is judged by it.
+    was when it last was sound: a solve that begins here is judged by it;
+    `pressures`: of each obstacle at each contact point.
     """
 
     shape: Shape
@@ -95,6 +96,7 @@ class SolverState(eqx.Module):
     places: Float[Array, "... slides"] | None = None
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
+    pressures: Float[Array, "... k p"] | None = None
 
 
 class Equilibrium(eqx.Module):
@@ -473,7 +475,8 @@ def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array,
 def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
-    return form_of(scaled, state.shape), state.shape.point(state.end_force, equilibrium.total_twist)
+    form, point = form_of(scaled, state.shape), state.shape.point(state.end_force, equilibrium.total_twist)
+    return form, form.begun(point, state.shape.nodes, state.pressures)
 
 
 def describe(equilibrium: Equilibrium) -> str:

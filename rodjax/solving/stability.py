@@ -41,7 +41,8 @@ def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None =
     if motion is None:
         return form, begin
     force_change = form.layout.forces(form.closure(motion.multipliers))
-    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change)
+    others = form.others(motion.multipliers)
+    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change, others)
 
 
 def examined(

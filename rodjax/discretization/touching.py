@@ -253,7 +253,7 @@ class TouchingForm(Form):
             jnp.einsum("knc,ndc->knd", normals[:, :nodes], at_nodes),
             jnp.einsum("kqnc,qndc->kqnd", normals[:, nodes:].reshape(len(gaps), *of_elements_shape, 3), within),
             self.softness,
-            touching.pressures * self.softness > gaps + touching.relaxed[:, None],
+            touching.pressures > GAP_WEIGHT * (gaps + touching.relaxed[:, None]),
         )
         curving = self._curving(positions, touching.pressures)
         blocks = NodeBlocks(

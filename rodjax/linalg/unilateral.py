@@ -12,14 +12,13 @@ line search on the model itself, so that it cannot cycle. It ends where a whole 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
-# The most factorisations, and the parts of a step that the line search looks at.
+# The most factorisations, and steps of each line search.
 MOST_FACTORS = 40
-PARTS = 0.5 ** np.arange(12)
+LINE_STEPS = 12
 
 
 class Unilateral(eqx.Module):
@@ -27,10 +26,6 @@ class Unilateral(eqx.Module):
 
     gaps: Float[Array, "k p"]
     pressures: Float[Array, "k p"]
-
-    def closed(self, softness: Float[Array, ""]) -> Bool[Array, "k p"]:
-        """Which contacts push where nothing has moved yet."""
-        return self.pressures * softness > self.gaps
 
 
 class ModelMinimum(eqx.Module):
@@ -55,7 +50,8 @@ class _State(eqx.Module):
 
 def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"], contacts: Unilateral) -> ModelMinimum:
     """From right sides f and c without what the pressures do: forces on the rotations, gaps of the elements, forces on
-    the nodes. The pressures in the result are what they change by.
+    the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
+    what they change by.
     """
     softness, shape = system.contacts.softness, contacts.gaps.shape
     nothing_closed = jnp.zeros(shape, bool)
@@ -93,14 +89,28 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         slope = (work(state.x, state.y, ahead) + work(dx, dy, here)) / 2 - jnp.sum(f * dx) - jnp.sum(of_nodes * du)
         curvature = work(dx, dy, ahead)
         before, rate = contacts.gaps + opening(state.x, state.y), opening(dx, dy)
-        parts = jnp.asarray(PARTS, slope.dtype)
-        pressures = contacts.pressures[None] - (before[None] + parts[:, None, None] * rate[None]) / softness
-        pressures = jnp.where(pressures > 0, pressures, 0.0)
-        energies = parts * slope + parts**2 * curvature / 2 + softness / 2 * jnp.sum(pressures**2, axis=(1, 2))
-        best = jnp.where(is_first, 0, jnp.argmin(energies))
-        part = parts[best]
-        is_closed = pressures[best] > 0
-        is_same = jnp.all(is_closed == state.is_closed) & (best == 0)
+        pressures, falls = contacts.pressures - before / softness, rate / softness
+
+        def rise(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+            """The slope of the model there, and how much that grows."""
+            there = pressures - part * falls
+            pushes = there > 0
+            by_part = jnp.where(pushes, falls, 0.0) * softness
+            return slope + part * curvature - jnp.sum(by_part * there), curvature + jnp.sum(by_part * falls)
+
+        def closer(_, bracket: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            low, high, part = bracket
+            value, growth = rise(part)
+            low, high = jnp.where(value < 0, part, low), jnp.where(value < 0, high, part)
+            newton = part - value / growth
+            return low, high, jnp.where((newton > low) & (newton < high), newton, (low + high) / 2)
+
+        zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)
+        squares = [jnp.sum(jnp.where(p > 0, p, 0.0) ** 2) for p in (pressures, pressures - falls)]
+        is_whole = is_first | (slope + curvature / 2 + softness / 2 * (squares[1] - squares[0]) <= 0)
+        part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
+        is_closed = pressures - part * falls > 0
+        is_same = jnp.all(is_closed == state.is_closed) & is_whole
         return _State(
             state.x + part * dx,
             state.y + part * dy,
@@ -111,7 +121,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         )
 
     count = jnp.zeros((), int)
-    begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), contacts.closed(softness), jnp.array(False), jnp.array(False), count)
+    begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), system.contacts.is_closed, jnp.array(False), jnp.array(False), count)
     end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
     pressures = contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / softness
     change = jnp.where(pressures > 0, pressures, 0.0) - contacts.pressures

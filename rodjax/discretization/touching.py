@@ -133,7 +133,7 @@ class TouchingForm(Form):
         gaps, normals = self.gaps_and_normals(self.contact_positions(touching.places, point.tangents))
         at_nodes = jnp.einsum("cn,knc->kn", self.at_nodes(point.end_force), normals[:, : len(nodes)])
         pushing = jnp.pad(at_nodes, ((0, 0), (0, self.contact_points - len(nodes))))
-        pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.contact_radius), pushing, 0.0)
+        pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.contact_radius[None]), pushing, 0.0)
         known = nothing + jnp.nan if pressures is None else pressures
         deepest = -jnp.min(gaps, axis=1)
         return dataclasses.replace(
@@ -222,7 +222,7 @@ class TouchingForm(Form):
     def gaps_and_normals(self, positions: Float[Array, "p 3"]) -> tuple[Float[Array, "k p"], Float[Array, "k p 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
         found = [jax.vmap(jax.value_and_grad(obstacle.at))(positions) for obstacle in self.scene.obstacles]
-        gaps = jnp.stack([distance - self.contact_radius for distance, _ in found])
+        gaps = jnp.stack([distance for distance, _ in found]) - self.contact_radius[None]
         return jnp.where(self._is_given[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
 
     @property

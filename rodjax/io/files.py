@@ -38,7 +38,7 @@ from rodjax.version import __version__
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 9
+FORMAT = 10
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -76,6 +76,7 @@ FIELDS = {
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
     "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
+    "state/pressures": ("1", "with obstacles: force of each at each contact point, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),

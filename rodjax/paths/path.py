@@ -267,7 +267,7 @@ def _step(
         )
 
     zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
-    nowhere = jax.tree.map(jnp.zeros_like, last.state.shape.point(last.state.end_force, zero))
+    nowhere = jax.tree.map(jnp.zeros_like, last.state.point(zero))
     progress = _Progress(
         reached=last.state,
         begin=_predicted(last, before, scene),

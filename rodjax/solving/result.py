@@ -39,6 +39,7 @@ from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
+from rodjax.discretization.touching_point import Touching
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
@@ -97,6 +98,14 @@ class SolverState(eqx.Module):
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
     pressures: Float[Array, "... k p"] | None = None
+
+    def point(self, total_twist: Float[Array, ""]) -> Any:
+        """The unknowns of the form of one equilibrium."""
+        point = self.shape.point(self.end_force, total_twist)
+        if self.pressures is None:
+            return point
+        relaxed = jnp.zeros_like(self.pressures[:, 0])
+        return dataclasses.replace(point, touching=Touching(self.shape.nodes, self.pressures, relaxed))
 
 
 class Equilibrium(eqx.Module):
@@ -475,7 +484,7 @@ def positions_at(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array,
 def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
-    form, point = form_of(scaled, state.shape), state.shape.point(state.end_force, equilibrium.total_twist)
+    form, point = form_of(scaled, state.shape), state.point(equilibrium.total_twist)
     return form, form.begun(point, state.shape.nodes, state.pressures)
 
 

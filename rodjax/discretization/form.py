@@ -138,6 +138,10 @@ class Form(eqx.Module):
     @abstractmethod
     def linearized(self, point: Any) -> Linearization: ...
 
+    def accepted(self, point: Any, here: Linearization) -> Any:
+        """A point to go on from, with what its linearisation tells."""
+        return point
+
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
         """What a step from a point brings down, where it leads to."""
         return here.energy

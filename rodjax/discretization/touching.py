@@ -11,7 +11,7 @@ A step is the minimum of a model, L to second order with each gap to first: ever
 plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which contacts
 are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
 
-A rod that begins within an obstacle has its gaps seen larger by so much, and by half of that from step to step.
+A rod that lies within an obstacle has its gaps seen larger by half of its depth: each step leads it half of the way out.
 """
 
 import dataclasses
@@ -42,10 +42,8 @@ SOFTNESS = 1e-7
 BENDING = 100.0
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
-# Of a start within an obstacle: less than this is given up at once [L].
+# A rod less deep within an obstacle than this [L] is led out in one step.
 LEAST_RELAXED = 1e-3
-# A start as deep as this within an obstacle lies on it [L].
-LEAST_DEPTH = 1e-6
 # A start touches where its gap is below this part of the radius.
 TOUCHES = 1e-3
 
@@ -115,8 +113,17 @@ class TouchingForm(Form):
         touching = point.touching
         if others is None:
             return touching
-        relaxed = jnp.where(touching.relaxed < LEAST_RELAXED, 0.0, touching.relaxed / 2)
-        return Touching(touching.places + others.displacements, touching.pressures + others.pressures, relaxed)
+        places, pressures = touching.places + others.displacements, touching.pressures + others.pressures
+        return Touching(places, pressures, touching.relaxed)
+
+    def led_out(self, gaps: Float[Array, "k p"]) -> Float[Array, "k"]:
+        """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
+        depths = -jnp.min(gaps, axis=1)
+        return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
+
+    def accepted(self, point: Any, here: Linearization) -> Any:
+        touching = dataclasses.replace(point.touching, relaxed=self.led_out(here.gaps))
+        return dataclasses.replace(point, touching=touching)
 
     def touching_held(self, touching: Touching | None) -> Touching | None:
         if touching is None:
@@ -135,14 +142,9 @@ class TouchingForm(Form):
         pushing = jnp.pad(at_nodes, ((0, 0), (0, self.contact_points - len(nodes))))
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.contact_radius[None]), pushing, 0.0)
         known = nothing + jnp.nan if pressures is None else pressures
-        deepest = -jnp.min(gaps, axis=1)
         return dataclasses.replace(
             point,
-            touching=Touching(
-                touching.places,
-                jnp.where(jnp.isnan(known), pushing, known),
-                jnp.where(deepest > LEAST_DEPTH, deepest, 0.0),
-            ),
+            touching=Touching(touching.places, jnp.where(jnp.isnan(known), pushing, known), self.led_out(gaps)),
         )
 
     # --- places and contacts -----------------------------------------------------------------------------------------
@@ -253,7 +255,7 @@ class TouchingForm(Form):
             jnp.einsum("knc,ndc->knd", normals[:, :nodes], at_nodes),
             jnp.einsum("kqnc,qndc->kqnd", normals[:, nodes:].reshape(len(gaps), *of_elements_shape, 3), within),
             self.softness,
-            touching.pressures > GAP_WEIGHT * (gaps + touching.relaxed[:, None]),
+            touching.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]),
         )
         curving = self._curving(positions, touching.pressures)
         blocks = NodeBlocks(

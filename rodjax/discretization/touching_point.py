@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 # Contact points within an element, as parts of it; the others are its nodes.
-PARTS: tuple[float, ...] = ()
+PARTS: tuple[float, ...] = (0.5,)
 
 
 def contact_points(segments: int) -> int:
@@ -18,7 +18,7 @@ def contact_points(segments: int) -> int:
 
 class Touching(eqx.Module):
     """What a point has in a scene with obstacles beside that of others: the positions of the nodes, the pressure of each
-    obstacle at each contact point, and by how much the gaps of each obstacle are seen larger on the way out of it.
+    obstacle at each contact point, and by how much the gaps of each obstacle are seen larger in the next step.
     """
 
     places: Float[Array, "n+1 3"]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
 # The most factorisations, and steps of each line search.
-MOST_FACTORS = 40
+MOST_FACTORS = 25
 LINE_STEPS = 12
 
 
@@ -127,4 +127,4 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     change = jnp.where(pressures > 0, pressures, 0.0) - contacts.pressures
     first, _, u, force = open_system.parted(end.y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, change, u, force)])
-    return ModelMinimum(end.x, y, end.is_minimum, end.count)
+    return ModelMinimum(end.x, y, end.is_minimum & end.is_done, end.count)

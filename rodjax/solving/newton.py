@@ -174,6 +174,7 @@ def _advanced(
     solver: Newton,
     find: Find,
 ) -> NewtonState:
+    point = form.accepted(point, here)
     dtype = point.tangents.dtype
     h = 1 / point.tangents.shape[1]
     iterations = state.iterations + jnp.where(state.restart, 0, 1)

@@ -5,8 +5,9 @@ With v the motion of the nodes, a contact of the pressure p0 and the gap g has i
     p(v) = max(0, p0 - (g + N^T v)/softness)
 
 and the energy softness p(v)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic. Each
-step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate, and a
-line search on the model itself, so that it cannot cycle. It ends where a whole step closes and opens no contact.
+step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate. The
+first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model itself,
+so that the method cannot cycle. It ends where a whole step closes and opens no contact.
 """
 
 import equinox as eqx
@@ -16,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
-# The most factorisations, and steps of each line search.
-MOST_FACTORS = 25
+# The most factorisations, of which the first so many are followed by whole steps; steps of each line search.
+MOST_FACTORS = 30
+WHOLE_STEPS = 16
 LINE_STEPS = 12
 
 
@@ -81,7 +83,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
 
     def improved(state: _State) -> _State:
         is_minimum, x, y = solved(state.is_closed)
-        is_first = state.count == 0
+        is_early = state.count < WHOLE_STEPS
         dx, dy = x - state.x, y - state.y
         _, _, du, _ = open_system.parted(dy)
         # The model along the way from the last iterate to this one: the rows of border and elements hold at both.
@@ -107,7 +109,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
 
         zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)
         squares = [jnp.sum(jnp.where(p > 0, p, 0.0) ** 2) for p in (pressures, pressures - falls)]
-        is_whole = is_first | (slope + curvature / 2 + softness / 2 * (squares[1] - squares[0]) <= 0)
+        is_whole = is_early | (slope + curvature / 2 + softness / 2 * (squares[1] - squares[0]) <= 0)
         part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
         is_closed = pressures - part * falls > 0
         is_same = jnp.all(is_closed == state.is_closed) & is_whole

@@ -34,6 +34,7 @@ from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.loads import DistributedForce
+from rodjax.model.obstacles import least
 from rodjax.model.supports import Free
 
 # Of contacts: as strong as all loads together and bending of BENDING [EI/L^2], one would give way by so much in each
@@ -44,6 +45,14 @@ BENDING = 100.0
 GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
 LEAST_RELAXED = 1e-3
+# A step takes no place deeper than this, in parts of the radius, into an obstacle; one that is there already so much
+# deeper. Looked at are the nodes and these parts of elements; their way at most so often, further on each time by the
+# distance, or so much at least.
+DEEPEST = 0.5
+DEEPER = 0.125
+LOOKED_AT = (0.25, 0.5, 0.75)
+LEAST_WAY = 0.05
+MOST_LOOKS = 24
 # A start touches where its gap is below this part of the radius.
 TOUCHES = 1e-3
 
@@ -201,19 +210,22 @@ class TouchingForm(Form):
             load += jnp.sqrt(1.0 + jnp.sum(force**2))
         return SOFTNESS / load
 
-    @property
-    def _weights(self) -> tuple[Array, Array]:
-        """Of the contact points in elements: by the positions of both nodes and by the tangents there, (q, 2)."""
-        x = np.array(PARTS)[:, None]
+    def _weights(self, parts: tuple[float, ...] = PARTS) -> tuple[Array, Array]:
+        """Of the places in elements, by the positions of both nodes and by the tangents there, (q, 2)."""
+        x = np.array(parts)[:, None]
         of_places = np.concatenate([(1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)], axis=1)
         of_tangents = np.concatenate([x * (1 - x) ** 2, -(x**2) * (1 - x)], axis=1)
         dtype = self.field.s.dtype
         return jnp.asarray(of_places, dtype), jnp.asarray(of_tangents, dtype)
 
     def contact_positions(self, places: Float[Array, "n+1 3"], tangents: Float[Array, "3 m"]) -> Float[Array, "p 3"]:
-        if not PARTS:
-            return places
-        of_places, of_tangents = self._weights
+        return self._placed(places, tangents, PARTS)
+
+    def _placed(
+        self, places: Float[Array, "n+1 3"], tangents: Float[Array, "3 m"], parts: tuple[float, ...]
+    ) -> Float[Array, "k 3"]:
+        """The nodes, and these parts of elements."""
+        of_places, of_tangents = self._weights(parts)
         slopes, h = tangents[:, ::2].T, jnp.diff(self.field.s)[:, None]
         within = [
             a[0] * places[:-1] + a[1] * places[1:] + h * (b[0] * slopes[:-1] + b[1] * slopes[1:])
@@ -248,7 +260,7 @@ class TouchingForm(Form):
                 jnp.concatenate(
                     [v[0] * h * rates[:-1], w[0] * moving[:-1], v[1] * h * rates[1:], w[1] * moving[1:]], axis=1
                 )
-                for w, v in zip(*self._weights, strict=True)
+                for w, v in zip(*self._weights(), strict=True)
             ])
         of_elements_shape = (len(PARTS), nodes - 1)
         rows = ContactRows(
@@ -267,7 +279,7 @@ class TouchingForm(Form):
             blocks += of_elements(jnp.einsum("qndc,qnce,qnfe->ndf", within, curving, within))
             # The tangents turn on an arc.
             pushing = jnp.einsum("kp,kpc->pc", touching.pressures, normals)[nodes:].reshape(*of_elements_shape, 3)
-            _, of_tangents = self._weights
+            _, of_tangents = self._weights()
             first, second = (h[..., 0] * jnp.einsum("q,qnc->nc", weights, pushing) for weights in of_tangents.T)
             none = jnp.zeros_like(first[:1])
             on_tangents = jnp.concatenate([first, none]) + jnp.concatenate([none, second])
@@ -370,7 +382,41 @@ class TouchingForm(Form):
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - jnp.sum(rotation * here.gradient)
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        return is_better
+        """Only where contact points, and places between them, go straight from one to the other without getting too deep
+        into an obstacle: one that is not convex, or thinner than contact points are apart, no tangent plane keeps out.
+        """
+        before, after = self._looked_at(point), self._looked_at(trial)
+        ways = after - before
+        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        radius = self.radius
+        rim = jnp.concatenate([radius, *[least(radius[:-1], radius[1:])] * len(LOOKED_AT)])
+
+        def distances(positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
+            return least(*(jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles))
+
+        first = distances(before)
+        bound = least(DEEPEST * rim, first - DEEPER * rim)
+
+        # No place is nearer than its distance: so far each may go, and is looked at again.
+        def ahead(gone: Float[Array, "k"], gaps: Float[Array, "k"]) -> Float[Array, "k"]:
+            return gone + jnp.maximum(gaps, LEAST_WAY * rim)
+
+        def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            gone, _, count = state
+            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
+            gaps = distances(before + parts[:, None] * ways) - bound
+            return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+            gone, is_blocked, count = state
+            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
+
+        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
+        gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
+        return is_better & ~is_blocked & jnp.all(gone >= lengths)
+
+    def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
+        return self._placed(point.touching.places, point.tangents, LOOKED_AT)
 
     def depths_at(self, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
         """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""

@@ -41,11 +41,14 @@ class Before(eqx.Module):
 
 
 class Passage(eqx.Module):
-    """The first obstacle, -1 for none, that a rod came through or lies within, and where, as a part of its length."""
+    """The first obstacle, -1 for none, that a rod came through or lies within, which of both, and where, as a part of its
+    length; and whether it lies within any.
+    """
 
     obstacle: Int[Array, "..."]
     place: Float[Array, "..."]
     is_within: Bool[Array, "..."]
+    lies_within: Bool[Array, "..."]
 
     @property
     def is_sound(self) -> Bool[Array, "..."]:
@@ -75,7 +78,10 @@ def passage(
     place = jnp.argmax(jnp.where(wrong, depths[which], -jnp.inf))
     is_any = jnp.any(wrong)
     fraction = place.astype(radius.dtype) / (len(points) - 1)
-    return Passage(jnp.where(is_any, which, -1), jnp.where(is_any, fraction, jnp.nan), is_any & ~jnp.any(passed[which]))
+    is_within = is_any & ~jnp.any(passed[which])
+    return Passage(
+        jnp.where(is_any, which, -1), jnp.where(is_any, fraction, jnp.nan), is_within, jnp.any(within)
+    )
 
 
 def _through(

@@ -671,17 +671,24 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
 
 
 def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
-    """Not converged where the rod came through an obstacle on the way, or lies within one."""
+    """Not converged where the rod came through an obstacle on the way, or lies within one.
+
+    No step of the search leads through. So a rod that begins on the side of all obstacles where it last was sound has
+    stayed there, however far it slid around one; of others the shape in the end is compared with the last sound one.
+    """
     form, before = search.form, guess.before
     assert isinstance(form, TouchingForm)
     assert before is not None
-    begin, _, _ = form.places(search.point.touching.places, search.point)
+    places = search.point.touching.places
+    begin, _, _ = form.places(places, search.point)
     begin = guess.units.origin[None] + guess.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
+    begins, _ = passage_to(form, search.point, places, guess.units, before)
     passed, now = passage_to(form, found.point, found.state.shape.nodes, guess.units, before)
+    is_sound = passed.is_sound | (begins.is_sound & ~passed.lies_within)
     converged = is_converged(found.outcome.status)
-    status = jnp.where(converged & ~passed.is_sound, Status.PASSED_THROUGH, found.outcome.status)
-    kept = jax.tree.map(lambda new, old: jnp.where(converged & passed.is_sound, new, old), now, before)
+    status = jnp.where(converged & ~is_sound, Status.PASSED_THROUGH, found.outcome.status)
+    kept = jax.tree.map(lambda new, old: jnp.where(converged & is_sound, new, old), now, before)
     return eqx.tree_at(
         lambda found: (found.outcome.status, found.state.before),
         found,

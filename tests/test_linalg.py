@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 import rodjax as rj
-from rodjax.linalg.chain import ChainSystem, ContactRows, NodeBlocks
+from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, NodeBlocks
 from rodjax.linalg.saddle_point import DenseSystem, SaddlePointSystem, factor, factor_and_solve
 from rodjax.solving.result import form_and_point
 
@@ -268,9 +268,15 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-15, atol=0)
     right = np.random.default_rng(1).normal(size=len(matrix))
     factors = factor(system)
-    x, y = factors.solve(jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :]))
-    # The contacts, of 1e6, cost both solves some digits.
-    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(matrix, right), rtol=1e-7, atol=1e-7)
+    assert isinstance(factors, ChainFactors)
+    given = jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :])
+    hard = np.array(matrix)
+    softness = np.concatenate([np.zeros(2 * m + 1), 1e-6 * np.ravel(system.contacts.is_closed)])
+    np.fill_diagonal(hard[: len(softness), : len(softness)], np.diag(hard)[: len(softness)] + softness)
+    # The contacts, of 1e6, cost all of them some digits.
+    for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
+        x, y = solve(*given)
+        np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(full, right), rtol=1e-7, atol=1e-7)
     # A pressure is one negative eigenvalue, whether its contact is closed or open.
     assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - pressures - 3 * elements
     assert int(factors.negative) > 0

@@ -33,14 +33,11 @@ from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
-from rodjax.model.loads import DistributedForce
 from rodjax.model.obstacles import least
-from rodjax.model.supports import Free
 
-# Of contacts: as strong as all loads together and bending of BENDING [EI/L^2], one would give way by so much in each
-# step of the search, of L, before its pressure is corrected.
-SOFTNESS = 1e-7
-BENDING = 100.0
+# Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
+# 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
+SOFTNESS = 1e-6
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
@@ -200,15 +197,8 @@ class TouchingForm(Form):
     @property
     def softness(self) -> Float[Array, ""]:
         """Of the contacts in the model of a step [L^3/EI]."""
-        scene = self.scene
-        forces = [load.force for load in scene.point_forces]
-        forces += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
-        forces += [] if scene.gravity is None else [scene.gravity]
-        forces += [load.force for load in scene.distributed if isinstance(load, DistributedForce)]
-        load = jnp.asarray(BENDING, self.field.s.dtype)
-        for force in forces:
-            load += jnp.sqrt(1.0 + jnp.sum(force**2))
-        return SOFTNESS / load
+        h = jnp.diff(self.field.s)
+        return SOFTNESS * h[jnp.argmin(h)] ** 3
 
     def _weights(self, parts: tuple[float, ...] = PARTS) -> tuple[Array, Array]:
         """Of the places in elements, by the positions of both nodes and by the tangents there, (q, 2)."""

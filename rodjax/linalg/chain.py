@@ -26,6 +26,10 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.linalg.blocks import inverse_of_blocks
 
 
+# Solutions with soft contacts, before that which is told.
+HARDENINGS = 5
+
+
 class NodeBlocks(eqx.Module):
     """A symmetric matrix by rotation and displacement of the nodes: the blocks of each, and those below, that couple a
     node with the one before it.
@@ -216,6 +220,29 @@ class ChainFactors(eqx.Module):
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
+        """As if no contact were soft: what their softness gives way by is asked for again, by which it becomes less by
+        softness times stiffness of the rod each time.
+        """
+        contacts = self.contacts
+        if not contacts.is_closed.size:
+            return self.solve_softly(f, c)
+        first, given, nodes, gaps = self.system.parted(c)
+
+        def harder(given: Float[Array, "k p"], _) -> tuple[Float[Array, "k p"], None]:
+            pressures = self.system.parted(self.solve_softly(f, whole(given))[1])[1]
+            return jnp.where(contacts.is_closed, asked - contacts.softness * pressures, asked), None
+
+        def whole(given: Float[Array, "k p"]) -> Float[Array, "j"]:
+            return jnp.concatenate([part.reshape(-1) for part in (first, given, nodes, gaps)])
+
+        asked = given
+        given, _ = jax.lax.scan(harder, given, None, length=HARDENINGS)
+        return self.solve_softly(f, whole(given))
+
+    def solve_softly(
+        self, f: Float[Array, "b m"], c: Float[Array, "j"]
+    ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
+        """With the softness of the contacts."""
         system, contacts, b = self.system, self.contacts, len(f)
         first, given, nodes, gaps = system.parted(c)
         pressing = -contacts.pushed(jnp.where(contacts.is_closed, given / contacts.softness, 0.0))

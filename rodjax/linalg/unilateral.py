@@ -68,7 +68,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         nodes = of_nodes + jnp.where(here.held[:, None], 0.0, pushed[:, b:])
         right = [part.reshape(-1) for part in (of_border, by_contacts, nodes, of_elements)]
         factors = factor_chain(here)
-        return factors.is_minimum, *factors.solve(f.at[:, ::2].add(pushed[:, :b].T), jnp.concatenate(right))
+        return factors.is_minimum, *factors.solve_softly(f.at[:, ::2].add(pushed[:, :b].T), jnp.concatenate(right))
 
     def opening(x: Float[Array, "b m"], y: Float[Array, "j"]) -> Float[Array, "k p"]:
         """By how much the gaps grow."""

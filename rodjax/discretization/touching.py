@@ -50,6 +50,8 @@ DEEPER = 0.125
 LOOKED_AT = (0.25, 0.5, 0.75)
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
+# A point lies on an obstacle where its gap is below this [L].
+LIES_ON = 1e-9
 # A start touches where its gap is below this part of the radius.
 TOUCHES = 1e-3
 
@@ -336,6 +338,8 @@ class TouchingForm(Form):
             [part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)]
         )
         contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
+        # What lies on an obstacle without pressure is more likely to press on it than to leave it.
+        system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
         found = minimized(system, f, c, contacts)
         return found.is_minimum, found.x, found.y
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
 # The most factorisations, of which the first so many are followed by whole steps; steps of each line search.
-MOST_FACTORS = 30
+MOST_FACTORS = 60
 WHOLE_STEPS = 16
 LINE_STEPS = 12
 

@@ -17,9 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
-# The most factorisations, of which the first so many are followed by whole steps; steps of each line search.
+# The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at a time;
+# with each softness the first so many are followed by whole steps; steps of each line search.
 MOST_FACTORS = 60
-WHOLE_STEPS = 16
+FIRST_FACTORS = 8
+SOFTEST = 1e-4
+HARDENING = 100.0
+WHOLE_STEPS = 12
 LINE_STEPS = 12
 
 
@@ -45,8 +49,10 @@ class _State(eqx.Module):
     x: Float[Array, "b m"]
     y: Float[Array, "j"]
     is_closed: Bool[Array, "k p"]
+    softness: Float[Array, ""]
     is_minimum: Bool[Array, ""]
     is_done: Bool[Array, ""]
+    since: Int[Array, ""]  # factorisations with this softness
     count: Int[Array, ""]
 
 
@@ -55,13 +61,13 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
     what they change by.
     """
-    softness, shape = system.contacts.softness, contacts.gaps.shape
+    final, shape = system.contacts.softness, contacts.gaps.shape
     nothing_closed = jnp.zeros(shape, bool)
     open_system = system.closed_where(nothing_closed)
     of_border, _, of_nodes, of_elements = open_system.parted(c)
 
-    def solved(is_closed: Bool[Array, "k p"]):
-        here = system.closed_where(is_closed)
+    def solved(is_closed: Bool[Array, "k p"], softness: Float[Array, ""]):
+        here = eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
         pushed = here.contacts.pushed(jnp.where(is_closed, contacts.pressures, 0.0))
         b = len(f)
         by_contacts = jnp.where(is_closed, contacts.gaps, contacts.pressures)
@@ -82,8 +88,9 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         return jnp.sum(x * moments) + jnp.sum(u * balance) - jnp.sum(force * gap) - jnp.sum(first * border)
 
     def improved(state: _State) -> _State:
-        is_minimum, x, y = solved(state.is_closed)
-        is_early = state.count < WHOLE_STEPS
+        softness = state.softness
+        is_minimum, x, y = solved(state.is_closed, softness)
+        is_early = state.since < WHOLE_STEPS
         dx, dy = x - state.x, y - state.y
         _, _, du, _ = open_system.parted(dy)
         # The model along the way from the last iterate to this one: the rows of border and elements hold at both.
@@ -113,19 +120,25 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
         is_closed = pressures - part * falls > 0
         is_same = jnp.all(is_closed == state.is_closed) & is_whole
+        # Where the contacts are not found at once, softer ones are, and harder ones from these.
+        is_late = (state.count + 1 == FIRST_FACTORS) & ~is_same
+        harder = jnp.where(softness > HARDENING * final, softness / HARDENING, final)
         return _State(
             state.x + part * dx,
             state.y + part * dy,
             is_closed,
+            jnp.where(is_late & (final < SOFTEST), SOFTEST, jnp.where(is_same, harder, softness)),
             is_minimum,
-            is_same | ~is_minimum,
+            (is_same & (softness <= final)) | ~is_minimum,
+            jnp.where(is_late | is_same, 0, state.since + 1),
             state.count + 1,
         )
 
     count = jnp.zeros((), int)
-    begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), system.contacts.is_closed, jnp.array(False), jnp.array(False), count)
+    no = jnp.array(False)
+    begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), system.contacts.is_closed, final, no, no, count, count)
     end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
-    pressures = contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / softness
+    pressures = contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / final
     change = jnp.where(pressures > 0, pressures, 0.0) - contacts.pressures
     first, _, u, force = open_system.parted(end.y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, change, u, force)])

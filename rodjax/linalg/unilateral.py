@@ -20,9 +20,9 @@ from rodjax.linalg.chain import ChainSystem, factor_chain
 # The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at a time;
 # with each softness the first so many are followed by whole steps; steps of each line search.
 MOST_FACTORS = 60
-FIRST_FACTORS = 8
+FIRST_FACTORS = 6
 SOFTEST = 1e-4
-HARDENING = 100.0
+HARDENING = 1e4
 WHOLE_STEPS = 12
 LINE_STEPS = 12
 

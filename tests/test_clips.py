@@ -7,7 +7,9 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame, problems, rotate
-from rodjax.model.scene import between
+from rodjax.model.scene import between, nondimensional
+from rodjax.solving.result import form_and_point
+from rodjax.solving.sliding import slide
 
 # Thick rods bent within short spans: strains up to 0.2, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
@@ -236,30 +238,39 @@ def test_no_axial_force_acts_where_the_rod_slides(sliding, tangent, discretizati
     np.testing.assert_array_equal(again.nodes, result.nodes)
 
 
-@pytest.mark.slow
+def lifted(at: float, *, sliding: bool) -> Scene:
+    """A slack cable in a clip above the middle between its clamps."""
+    ends = Clamp(ORIGIN, LEVEL), Clamp((0.8, 0, 0), LEVEL)
+    return Scene(problems.cable(100.0), *ends, (0, 0, -9.81), clips=[Clip(at, (0.4, 0, 0.1), None, sliding)])
+
+
 def test_a_sliding_clip_is_where_the_energy_is_least():
     """Clips that hold the rod beside that place cost more; half way, by symmetry, most: the rod slides away."""
-    rod = problems.cable(100.0)
-    ends = Clamp(ORIGIN, LEVEL), Clamp((0.8, 0, 0), LEVEL)
-
-    def scene(at: float, *, sliding: bool) -> Scene:
-        return Scene(rod, *ends, (0, 0, -9.81), clips=[Clip(at, (0.4, 0, 0.1), None, sliding)])
-
     options = {"segments": 32, "solver": TIGHT}
-    result = rj.solve(scene(0.44, sliding=True), **options)
+    result = rj.solve(lifted(0.44, sliding=True), **options)
     at = float(result.scene.clips[0].at)
     assert 0.4 < at < 0.499
     assert result.stable
-    held = [rj.solve(scene(at + shift, sliding=False), guess=result, **options) for shift in (-0.005, 0.0, 0.005)]
+    held = [rj.solve(lifted(at + shift, sliding=False), guess=result, **options) for shift in (-0.001, 0.0, 0.001)]
     energies = [float(each.energy) for each in held]
     assert energies[1] < min(energies[0], energies[2])
     # Of the same place on another mesh.
     assert float(result.energy) == pytest.approx(energies[1], rel=1e-5)
-    half = rj.solve(scene(0.5, sliding=True), find="equilibrium", **options)
+    # By a difference of second order: twice as far apart it is off by 1 %.
+    scaled, units = nondimensional(result.scene)
+    stiffness = jax.jit(slide)(scaled, result.state.shape, form_and_point(result)[1]).stiffness * units.energy
+    np.testing.assert_allclose(stiffness, [[np.diff(energies, 2)[0] / 0.001**2]], rtol=0.02)
+    middle = rj.solve(lifted(0.5, sliding=False), guess=result, **options)
+    assert middle.index == 0
+    half = rj.solve(lifted(0.5, sliding=True), guess=middle, find="equilibrium", **options)
     np.testing.assert_allclose(half.scene.clips[0].at, 0.5, rtol=0, atol=1e-11)
-    # One way down by sliding, and as by Newton's steps alone the arcs are no minima either.
-    assert half.index >= 1
+    assert half.index == 1
     assert not half.stable
+    # Beside the largest energy, where it curves the other way, a step of Newton's method would go up to it.
+    away = rj.solve(lifted(0.498, sliding=True), guess=middle, **options)
+    assert away.stable
+    # On another mesh: 7e-5 was seen.
+    np.testing.assert_allclose(away.scene.clips[0].at, at, rtol=0, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -397,7 +397,6 @@ def test_a_reaction_is_the_derivative_of_the_energy():
 # --- other loads, guesses and ends -----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_loads_without_a_potential_are_carried():
     """Follower loads and couples: what supports apply is the reverse of all of them; the mesh has fourth order."""
     first, _, last = precurved(None).clips

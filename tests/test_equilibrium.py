@@ -108,6 +108,16 @@ def test_the_result_moves_and_turns_with_the_scene(twisted):
     np.testing.assert_allclose(moved.energy, twisted.energy - (weight + loads[0].force) @ shift, rtol=1e-10)
 
 
+def test_the_energy_of_a_load_along_the_rod_is_zero_at_the_origin():
+    """Moved as a whole the rod differs by the work of the load alone: roundings."""
+    rod, shift, load = Rod(2.0, 1.0, 0.7, 1e4), np.array([0.3, -1.0, 2.0]), np.array([0.1, 0.2, -1.0])
+    here, there = (
+        solve(Scene(rod, Clamp(start, frame((1, 0, 0))), Free(), distributed=[rj.DistributedForce(load)]))
+        for start in (np.zeros(3), shift)
+    )
+    np.testing.assert_allclose(there.energy - here.energy, -2.0 * load @ shift, rtol=1e-9)
+
+
 def test_frames_are_rotations_that_meet_both_clamps(twisted):
     scene = twisted_scene()
     products = np.einsum("nij,nik->njk", twisted.frames, twisted.frames)

@@ -199,7 +199,6 @@ def test_that_nobody_chose_a_mesh_is_told_once():
         assert traced() == (33,)
 
 
-@pytest.mark.slow
 def test_what_torque_and_shear_do_within_an_element_is_counted():
     """Of a rod stiff against torsion: either of them with another sign or size makes the estimate 1.6 to 9 times the
     error.

@@ -81,6 +81,15 @@ def test_within_is_found():
     assert found(arch(-0.05), arch(-0.4), PIPE).is_sound
 
 
+def test_a_place_is_through_where_it_was_deeper_than_half_of_the_radius():
+    """Straight down beside a wire along the rod; the wire adds its own radius, 1e-4."""
+    up = np.array([[0, 0, 1]])
+    for depth, is_sound in ((0.25, True), (0.75, False)):
+        y = (1 - depth) * RADIUS + 1e-4
+        wire = rj.Capsule((-1, y, 0), (2, y, 0), 1e-4)
+        assert found(arch(0.0) + up, arch(0.0) - up, wire).is_sound == is_sound
+
+
 # --- solves ----------------------------------------------------------------------------------------------------------
 
 

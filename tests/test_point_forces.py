@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax import Clamp, Free, PointForce, Scene, frame, problems
+from rodjax import Clamp, Free, PointForce, Rod, Scene, frame, problems
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at
 
 
@@ -75,3 +75,13 @@ def test_a_hanging_string_of_weights():
     assert float(result.elastic_energy) == pytest.approx(energy, rel=1e-12)
     work = 0.02 * EA * -(expected[1] + expected[2] + expected[3])
     assert float(result.energy) == pytest.approx(energy - work, rel=1e-12)
+
+
+def test_a_rod_by_frames_whose_start_is_free_bends_as_one_by_tangents():
+    """In a plane, where both kinds of elements are the same: to the solver's tolerance of 1e-8 EI/L^2."""
+    ends = Free(), Clamp((0, 0, 0), frame((1, 0, 0)))
+    by_tangents, by_frames = (
+        rj.solve(Scene(Rod(1.0, EI, 0.7, 1e4), *ends, point_forces=[PointForce(0.3, (0.0, 1.0, -2.0))]), segments=8)
+        for EI in (1.0, (1.0, 1.0))
+    )
+    np.testing.assert_allclose(by_frames.nodes, by_tangents.nodes, rtol=0, atol=1e-8)

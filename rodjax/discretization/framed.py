@@ -38,7 +38,7 @@ from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.saddle_point import AnySystem, DenseSystem, SaddlePointSystem
 from rodjax.mechanics.energy import Sections
 from rodjax.model.loads import DistributedCouple, DistributedForce
-from rodjax.model.scene import Scene, has_potential, held_position
+from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Clamp, Directed, Free, Held
 
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
@@ -334,12 +334,12 @@ class FrameForm(Form):
         return jnp.sum(self.field.lengths * densities)
 
     def load_energy(self, point: FramePoint) -> Float[Array, ""]:
-        """The potential of dead forces, zero at the origin; other loads have none."""
+        """The potential of dead forces, zero at the origin, where the rod is held; other loads have none."""
         here = self.strained(point)
         work = jnp.sum(here.lengths * dot(self.loads, here.tangents))
         rest = self._rest_of_ways(self.field.of_cells(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
-        return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
+        return -work
 
     def loads_on_all(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         scene, q = self.scene, point.quaternions

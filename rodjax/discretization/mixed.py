@@ -29,7 +29,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import rotated, tangent_bases
@@ -43,7 +42,7 @@ from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene, dead_end_moment, held_position
+from rodjax.model.scene import Scene, dead_end_moment
 from rodjax.model.supports import Clamp, Free
 
 
@@ -209,9 +208,8 @@ class MixedForm(Form):
     # --- energies ----------------------------------------------------------------------------------------------------
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
-        """The potential of gravity and dead forces, zero at the origin."""
-        work = jnp.sum(self.loads_beyond * self.ways(point))
-        return -work - jnp.sum(total_force(self.scene) * held_position(self.scene))
+        """The potential of gravity and dead forces, zero at the origin, where the rod is held."""
+        return -jnp.sum(self.loads_beyond * self.ways(point))
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod

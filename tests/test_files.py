@@ -307,6 +307,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
     before = Before(single.nodes, touching.obstacles)
     state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1], before=before)
+    state = dataclasses.replace(state, pressures=single.s[None])
     results.append(dataclasses.replace(single, state=state))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")

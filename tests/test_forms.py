@@ -67,14 +67,15 @@ def test_what_another_force_changes_is_that_of_the_lagrangian(kind):
         form, point = form_and_point(result)
         bases = form.bases_at(point)
         rotation = numbers[: bases.shape[1] * bases.shape[2]].reshape(bases.shape[1:])
-        here = form.under_force(point, form.linearized(point), rotation, change)
+        here = form.under_force(point, form.linearized(point), rotation, change, None)
         trial = dataclasses.replace(point, end_force=point.end_force + change)
         energy = form.linearized(trial).energy - form.linearized(point).energy
         closure = form.closure(form.linearized(trial).closure)
 
         def at(step):
             moved = form.moved(point, bases, step * rotation, jnp.zeros_like(change))
-            lacking, _, more, _ = form.under_force(moved, form.linearized(moved), jnp.zeros_like(rotation), change)
+            still = jnp.zeros_like(rotation)
+            lacking, _, more, _ = form.under_force(moved, form.linearized(moved), still, change, None)
             return lacking, more
 
         step = 1e-5

@@ -223,8 +223,10 @@ def test_wrong_shapes_are_named(shapes):
         SaddlePointSystem(*map(jnp.zeros, shapes))
 
 
-def random_chain(elements: int, seed: int = 0) -> ChainSystem:
-    """Of elements between nodes of which three are held; two obstacles touch it at nodes and within elements."""
+def random_chain(elements: int, within: int, seed: int = 0) -> ChainSystem:
+    """Of elements between nodes of which three are held; two obstacles touch it at nodes, and at so many places within
+    each element.
+    """
     rng = np.random.default_rng(seed)
     m = 2 * elements + 1
     diagonal = rng.normal(size=(2, 2, m))
@@ -233,12 +235,12 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
     free = np.concatenate([np.ones((elements + 1, 2)), np.repeat(~held[:, None], 3, axis=1)], axis=1)
     stiffness = rng.normal(size=(elements + 1, 5, 5)) * free[:, :, None] * free[:, None]
     below = rng.normal(size=(elements, 5, 5)) * free[1:, :, None] * free[:-1, None]
-    within = rng.normal(size=(2, 3, elements, 10)) * np.concatenate([free[:-1], free[1:]], axis=1)
-    closed = rng.random((2, elements + 1 + 3 * elements)) < 0.08
+    of_elements = rng.normal(size=(2, within, elements, 10)) * np.concatenate([free[:-1], free[1:]], axis=1)
+    closed = rng.random((2, elements + 1 + within * elements)) < 0.08
     contacts = ContactRows(
         jnp.asarray(rng.normal(size=(2, elements + 1, 5)) * free),
-        jnp.asarray(within),
-        jnp.asarray(1e-6),
+        jnp.asarray(of_elements),
+        jnp.asarray(1e-3 if within else 1e-6),
         jnp.asarray(closed),
     )
     return ChainSystem(
@@ -255,8 +257,9 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
 
 @pytest.mark.parametrize("elements", [4, 7])
 @pytest.mark.parametrize("is_backward", [False, True])
-def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
-    system = dataclasses.replace(random_chain(elements), is_backward=is_backward)
+@pytest.mark.parametrize("within", [0, 3])
+def test_chains_are_solved_and_their_signs_counted(elements, within, is_backward):
+    system = dataclasses.replace(random_chain(elements, within), is_backward=is_backward)
     pressures = system.contacts.is_closed.size
     m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 
@@ -264,19 +267,23 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
         f, c = system.times(unit[: 2 * m].reshape(2, m), unit[2 * m :])
         return jnp.concatenate([f.reshape(-1), c])
 
-    matrix = np.asarray(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
+    matrix = np.array(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-15, atol=0)
     right = np.random.default_rng(1).normal(size=len(matrix))
     factors = factor(system)
     assert isinstance(factors, ChainFactors)
     given = jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :])
-    hard = np.array(matrix)
-    softness = np.concatenate([np.zeros(2 * m + 1), 1e-6 * np.ravel(system.contacts.is_closed)])
-    np.fill_diagonal(hard[: len(softness), : len(softness)], np.diag(hard)[: len(softness)] + softness)
-    # The contacts, of 1e6, cost all of them some digits.
-    for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
-        x, y = solve(*given)
-        np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), np.linalg.solve(full, right), rtol=1e-7, atol=1e-7)
+    # Contacts within elements cost the square of their stiffness in digits, a pressure is a difference over softness.
+    x, y = factors.solve_softly(*given)
+    soft = np.concatenate([np.ravel(x), y])
+    np.testing.assert_allclose(soft, np.linalg.solve(matrix, right), rtol=1e-6, atol=1e-6)
+    if not within:
+        softness = np.concatenate([np.zeros(2 * m + 1), 1e-6 * np.ravel(system.contacts.is_closed)])
+        matrix[np.arange(len(softness)), np.arange(len(softness))] += softness
+        x, y = factors.solve(*given)
+        np.testing.assert_allclose(
+            np.concatenate([np.ravel(x), y]), np.linalg.solve(matrix, right), rtol=1e-6, atol=1e-6
+        )
     # A pressure is one negative eigenvalue, whether its contact is closed or open.
     assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - pressures - 3 * elements
     assert int(factors.negative) > 0

@@ -149,8 +149,8 @@ class Form(eqx.Module):
     def sought(
         self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
-        """Whether a system, that of a linearisation and stiffer, is one of a minimum; the rotations and multipliers that
-        lead there, pushed aside.
+        """Whether a system, that of a linearisation and stiffer, is one of a minimum; the rotations and multipliers
+        that lead there, pushed aside.
         """
         found = factor_and_solve(system, push - here.gradient, -here.closure, is_regularized=True)
         factors, rotation, multipliers = found

@@ -34,8 +34,8 @@ from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearizatio
 from rodjax.discretization.joints import rotated, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.touching_point import Touching
 from rodjax.discretization.tangent_field import Blocks, TangentField
+from rodjax.discretization.touching_point import Touching
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import short_sum

@@ -6,12 +6,13 @@ pressure p >= 0 [a force, for each obstacle and point] is the multiplier of that
     L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
 
 The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
-unknowns of their own: so a gap depends on what is local, and a step of Newton's method moves nodes along straight lines.
-A step is the minimum of a model, L to second order with each gap to first: every point stays on its side of the tangent
-plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which contacts
-are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
+unknowns of their own: so a gap depends on what is local, and a step of Newton's method moves nodes along straight
+lines. A step is the minimum of a model, L to second order with each gap to first: every point stays on its side of the
+tangent plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which
+contacts are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
 
-A rod that lies within an obstacle has its gaps seen larger by half of its depth: each step leads it half of the way out.
+A rod that lies within an obstacle has its gaps seen larger by half of its depth: each step leads it half of the way
+out.
 """
 
 import dataclasses
@@ -37,7 +38,7 @@ from rodjax.model.obstacles import least
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
-SOFTNESS = 1e-6
+SOFTNESS = 1e-4
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
@@ -130,6 +131,7 @@ class TouchingForm(Form):
         return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
+        assert here.gaps is not None
         touching = dataclasses.replace(point.touching, relaxed=self.led_out(here.gaps))
         return dataclasses.replace(point, touching=touching)
 
@@ -248,12 +250,14 @@ class TouchingForm(Form):
         h = jnp.diff(self.field.s)[:, None, None]
         within = jnp.zeros((0, nodes - 1, 2 * (b + 3), 3), dtype)
         if PARTS:
-            within = jnp.stack([
-                jnp.concatenate(
-                    [v[0] * h * rates[:-1], w[0] * moving[:-1], v[1] * h * rates[1:], w[1] * moving[1:]], axis=1
-                )
-                for w, v in zip(*self._weights(), strict=True)
-            ])
+            within = jnp.stack(
+                [
+                    jnp.concatenate(
+                        [v[0] * h * rates[:-1], w[0] * moving[:-1], v[1] * h * rates[1:], w[1] * moving[1:]], axis=1
+                    )
+                    for w, v in zip(*self._weights(), strict=True)
+                ]
+            )
         of_elements_shape = (len(PARTS), nodes - 1)
         rows = ContactRows(
             jnp.einsum("knc,ndc->knd", normals[:, :nodes], at_nodes),
@@ -290,8 +294,9 @@ class TouchingForm(Form):
             # Where the rod touches nothing of an obstacle, its curvature is not computed.
             total = jax.lax.cond(
                 jnp.any(pressure != 0),
-                lambda total, obstacle=obstacle, pressure=pressure: total - pressure[:, None, None]
-                * jax.vmap(jax.hessian(obstacle.at))(positions),
+                lambda total, obstacle=obstacle, pressure=pressure: (
+                    total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(positions)
+                ),
                 lambda total: total,
                 total,
             )
@@ -334,9 +339,7 @@ class TouchingForm(Form):
         pushed = system.contacts.pushed(touching.pressures)
         balance = balance - jnp.where(self.is_held[:, None], 0.0, pushed[:, b:])
         f = (push - here.gradient).at[:, ::2].add(-pushed[:, :b].T)
-        c = jnp.concatenate(
-            [part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)]
-        )
+        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)])
         contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
         # What lies on an obstacle without pressure is more likely to press on it than to leave it.
         system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
@@ -369,6 +372,7 @@ class TouchingForm(Form):
         before, _ = parts(elements, places, jnp.zeros_like(change))
         # Of the gradient by rotations, which has the forces and pressures as they are.
         assert here.gaps is not None
+        assert isinstance(here.system, ChainSystem)
         contacts, touching = here.system.contacts, point.touching
         v = here.system.of_nodes(rotation, others.displacements)
         seen = touching.pressures - (here.gaps + touching.relaxed[:, None]) / self.softness
@@ -376,8 +380,9 @@ class TouchingForm(Form):
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - jnp.sum(rotation * here.gradient)
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        """Only where contact points, and places between them, go straight from one to the other without getting too deep
-        into an obstacle: one that is not convex, or thinner than contact points are apart, no tangent plane keeps out.
+        """Only where contact points, and places between them, go straight from one to the other without getting too
+        deep into an obstacle: one that is not convex, or thinner than contact points are apart, no tangent plane keeps
+        out.
         """
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before

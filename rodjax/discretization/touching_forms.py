@@ -51,6 +51,7 @@ class TouchingTangents(TouchingForm, MixedForm):
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         contacts = self.contacts(point, bases)
+        assert point.touching is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
@@ -124,6 +125,7 @@ class TouchingFrames(TouchingForm, FrameForm):
         assert across is not None, "elements, not joints"
         bases = self.bases_at(point)
         contacts = self.contacts(point, bases)
+        assert point.touching is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         dtype = gradient.dtype

@@ -2,8 +2,8 @@
 
 The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in
 `saddle_point`, and the positions of the nodes, and the pressures of contact points. The force of an element is the
-multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first, each by itself, then
-the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
+multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first, each by itself,
+then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
 displacement, coupled with those of its neighbours only: O(n).
 
     rotation     H theta + B F + border y + (S v - N p) = f
@@ -24,7 +24,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
-
 
 # Solutions with soft contacts, before that which is told.
 HARDENINGS = 5
@@ -51,8 +50,8 @@ class NodeBlocks(eqx.Module):
 
 
 class ContactRows(eqx.Module):
-    """How the gaps of contact points, k at a place, grow as nodes turn and move: of points at the nodes, and of q within
-    each element by its two nodes. `softness`: of the pressures; `is_closed`: where there is one.
+    """How the gaps of contact points, k at a place, grow as nodes turn and move: of points at the nodes, and of q
+    within each element by its two nodes. `softness`: of the pressures; `is_closed`: where there is one.
     """
 
     at_nodes: Float[Array, "k n+1 d"]
@@ -108,8 +107,8 @@ class ChainSystem(eqx.Module):
     `diagonal`, `lower`, `across`: the blocks of H, as in `saddle_point.SaddlePointSystem`; `by_force`: those of B at
     start, middle and end of each element; `cell_compliance`: C; `at_nodes`: S; `contacts`: N, of which rows and columns
     of what is held are zero, as those of S; `held`: the nodes whose place is given. What is no rotation comes as one
-    vector: border, contacts, then the nodes, then the elements. `is_backward`: elimination begins at the end, for a free
-    start: a first node that nothing holds or touches has no pivot.
+    vector: border, contacts, then the nodes, then the elements. `is_backward`: elimination begins at the end, for a
+    free start: a first node that nothing holds or touches has no pivot.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -181,9 +180,7 @@ class ChainSystem(eqx.Module):
     def parted(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
         """What belongs to the border (k,), the contacts (k, p), the nodes (n+1, 3) and the elements (n, 3)."""
         nodes, is_closed = len(self.held), self.contacts.is_closed
-        first, contacts, places, forces = jnp.split(
-            y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes])
-        )
+        first, contacts, places, forces = jnp.split(y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes]))
         return first, contacts.reshape(is_closed.shape), places.reshape(nodes, 3), forces.reshape(nodes - 1, 3)
 
     def condensed(self) -> "ChainSystem":

@@ -4,10 +4,12 @@ With v the motion of the nodes, a contact of the pressure p0 and the gap g has i
 
     p(v) = max(0, p0 - (g + N^T v)/softness)
 
-and the energy softness p(v)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic. Each
-step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate. The
-first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model itself,
-so that the method cannot cycle. It ends where a whole step closes and opens no contact.
+and the energy softness p(v)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
+Each step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate.
+The first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model
+itself, so that the method cannot cycle. It ends where a whole step closes and opens no contact. Where many contacts
+close or open, it would advance by one or two at a time: then much softer contacts are sought first, and from these
+harder ones.
 """
 
 import equinox as eqx
@@ -17,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem, factor_chain
 
-# The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at a time;
-# with each softness the first so many are followed by whole steps; steps of each line search.
+# The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at
+# a time; with each softness the first so many are followed by whole steps; steps of each line search.
 MOST_FACTORS = 60
 FIRST_FACTORS = 6
 SOFTEST = 1e-4

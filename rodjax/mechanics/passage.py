@@ -41,8 +41,8 @@ class Before(eqx.Module):
 
 
 class Passage(eqx.Module):
-    """The first obstacle, -1 for none, that a rod came through or lies within, which of both, and where, as a part of its
-    length; and whether it lies within any.
+    """The first obstacle, -1 for none, that a rod came through or lies within, which of both, and where, as a part of
+    its length; and whether it lies within any.
     """
 
     obstacle: Int[Array, "..."]
@@ -79,9 +79,7 @@ def passage(
     is_any = jnp.any(wrong)
     fraction = place.astype(radius.dtype) / (len(points) - 1)
     is_within = is_any & ~jnp.any(passed[which])
-    return Passage(
-        jnp.where(is_any, which, -1), jnp.where(is_any, fraction, jnp.nan), is_within, jnp.any(within)
-    )
+    return Passage(jnp.where(is_any, which, -1), jnp.where(is_any, fraction, jnp.nan), is_within, jnp.any(within))
 
 
 def _through(

@@ -679,6 +679,7 @@ def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
     form, before = search.form, guess.before
     assert isinstance(form, TouchingForm)
     assert before is not None
+    assert search.point.touching is not None
     places = search.point.touching.places
     begin, _, _ = form.places(places, search.point)
     begin = guess.units.origin[None] + guess.units.length * begin

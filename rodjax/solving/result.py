@@ -584,7 +584,9 @@ def _passage_of(equilibrium: Equilibrium) -> Passage:
     assert isinstance(form, TouchingForm)
     state = equilibrium.state
     if state.before is None:  # of a file of an earlier version
-        return Passage(jnp.full((), -1), jnp.full_like(equilibrium.residual, jnp.nan), jnp.array(False), jnp.array(False))
+        return Passage(
+            jnp.full((), -1), jnp.full_like(equilibrium.residual, jnp.nan), jnp.array(False), jnp.array(False)
+        )
     found, _ = passage_to(form, point, state.shape.nodes, state.units, state.before)
     return found
 

@@ -137,7 +137,7 @@ def test_random_heavy_cables_never_come_through_without_a_word():
         # By a part of the radius over a corner of the box on a mesh that is given, nowhere to the centerline.
         assert float(jnp.min(rj.clearance(result, scene.obstacles, points=7).distance)) > -1.1 * RADIUS
         right += 1
-    assert right >= 0.7 * len(scenes)
+    assert right >= 0.95 * len(scenes)
 
 
 def above_or_not_converged(result: rj.Equilibrium, axis: rj.Obstacle) -> None:
@@ -151,6 +151,23 @@ def test_a_slack_heavy_cable_does_not_fall_through_a_pipe():
     """It came back 0.2 below the pipe, and was called converged."""
     result = rj.solve(heavy(0.92, 1000.0, [PIPE]), segments=32, guess=rj.Guess(arch(0.19)))
     above_or_not_converged(result, PIPE)
+
+
+def test_a_cable_is_let_down_on_pegs():
+    """It came through, or stopped at the largest number of iterations, on 14 of 60 steps to a fifth of this weight."""
+    pegs = [rj.Capsule((x, -1, z), (x, 1, z), r) for x, z, r in ((0.3, -0.1, 0.06), (0.6, -0.2, 0.05))]
+    result = rj.Guess([(0, 0, 0), (0.5, 0, 0), (1, 0, 0)])
+    ends = rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Free()
+    for weight in np.geomspace(1.0, 1e5, 12):
+        rod = rj.Rod(1.0, 1.0, 0.8, 1e6, weight, radius=RADIUS)
+        scene = Scene(rod, *ends, (0, 0, -1.0), obstacles=pegs)
+        result = rj.solve(scene, segments=32, guess=result, strain_limit=None)
+        assert result.converged
+        assert result.stable
+        # Contacts are exact at the nodes: a gap of 1e-4 of the residual's 1e-8 EI/L^2.
+        assert float(jnp.min(rj.clearance(result, pegs, points=0).distance)) > -2e-12
+    assert isinstance(result, rj.Equilibrium)
+    assert float(jnp.sum(result.contact_forces[:, 2])) > 0.5e5  # most of the weight
 
 
 def over_a_pipe(raised: float = 0.0) -> Scene:

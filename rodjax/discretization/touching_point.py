@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Contact points within an element, as parts of it; the others are its nodes. None for now: with (0.5,) the rod lies
-# 5 to 16 times less deep within obstacles between its nodes, but a pressure that is eliminated by itself costs the square
+# Contact points within an element, as parts of it; the others are its nodes. None for now: with (0.5,) the rod lies 5
+# to 16 times less deep within obstacles between its nodes, but a pressure that is eliminated by itself costs the square
 # of its stiffness in digits where it pushes on two nodes (`docs/design.md`, "Contact").
 PARTS: tuple[float, ...] = ()
 

@@ -78,9 +78,11 @@ def random_scene(rng: np.random.Generator) -> tuple[rj.Scene, np.ndarray]:
     side, angles = rng.choice([1, -1]), rng.uniform(-0.6, 0.6, 2)
     u, sag = np.linspace(0, 1, 65), 0.6 * np.sqrt(1 - span**2) * side
     points = np.stack([span * u, 0.02 * np.sin(np.pi * u), -4 * sag * u * (1 - u)], axis=1)
-    ends = [rj.Swivel((x, 0, 0), (np.cos(angle), 0, np.sin(angle))) for x, angle in zip((0, span), angles, strict=True)]
+    start, end = (
+        rj.Swivel((x, 0, 0), (np.cos(angle), 0, np.sin(angle))) for x, angle in zip((0, span), angles, strict=True)
+    )
     rod = rj.Rod(1.0, 1.0, 0.8, 1e6, weight, radius=RADIUS)
-    return rj.Scene(rod, *ends, (0, 0, -1.0), obstacles=obstacles), points
+    return rj.Scene(rod, start, end, (0, 0, -1.0), obstacles=obstacles), points
 
 
 def cold(count: int, segments: int = 48) -> None:

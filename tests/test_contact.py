@@ -151,12 +151,12 @@ def test_the_first_mesh_beside_obstacles_is_finer():
 
 @pytest.mark.slow
 def test_a_rod_that_begins_across_a_box_and_stays_there_is_told():
-    """The library's first shape of so much slack crosses the box. Contacts at nodes leave an element within it, or the
-    rod balanced on its corner, that no finer mesh would lead out: not converged, and not sought up to the finest mesh.
+    """The library's first shape of so much slack crosses the box. Contacts at nodes leave an element within it, that no
+    finer mesh would lead out: not converged, and not sought up to the finest mesh.
     """
     box = rj.Box((0.4, 0, -0.25), (0.1, 1, 0.6))
     scene = Scene(cable(1.2), Clamp((0, 0, 0.1), LEVEL), Clamp((0.8, 0, 0.1), LEVEL), GRAVITY, obstacles=[box])
-    with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = |is not a minimum"):
+    with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = "):
         result = rj.solve(scene)
     assert not result.converged
     assert len(result.s) - 1 < 512

@@ -42,7 +42,7 @@ class Linearization(eqx.Module):
     system: AnySystem
     energy: Float[Array, ""]
     residual: Float[Array, ""]
-    gaps: Float[Array, "k p"] | None = None
+    gaps: Float[Array, "k n+1"] | None = None
 
 
 class Point(Protocol):
@@ -207,7 +207,7 @@ class Form(eqx.Module):
         """Nodes along the edges, at held places to the last digit."""
         return nodes_along(self.scene, self.field.s, self.clip_nodes, edges)
 
-    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k p"] | None) -> Any:
+    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """The point with what it has beside obstacles, of nodes and pressures."""
         return point
 

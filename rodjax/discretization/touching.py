@@ -1,13 +1,13 @@
-"""A rod that touches obstacles: the forms with a force of its own in each element, and pressures at contact points.
+"""A rod that touches obstacles: the forms with a force of its own in each element, and pressures on the nodes.
 
-No contact point, a node or a place within an element, is nearer to an obstacle than the rod is thick: gap g >= 0. The
-pressure p >= 0 [a force, for each obstacle and point] is the multiplier of that, without friction:
+No node is nearer to an obstacle than the rod is thick: gap g >= 0. The pressure p >= 0 [a force, for each obstacle and
+node] is the multiplier of that, without friction:
 
     L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
 
 The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
 unknowns of their own: so a gap depends on what is local, and a step of Newton's method moves nodes along straight
-lines. A step is the minimum of a model, L to second order with each gap to first: every point stays on its side of the
+lines. A step is the minimum of a model, L to second order with each gap to first: every node stays on its side of the
 tangent plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which
 contacts are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
 
@@ -19,17 +19,16 @@ import dataclasses
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
-from rodjax.discretization.touching_point import PARTS, Touching, TouchingChange, contact_points
+from rodjax.discretization.touching_point import Touching, TouchingChange
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
-from rodjax.linalg.chain import ChainSystem, ContactRows, NodeBlocks, of_elements
+from rodjax.linalg.chain import ChainSystem, ContactRows
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
@@ -51,21 +50,18 @@ DEEPER = 0.125
 LOOKED_AT = (0.25, 0.5, 0.75)
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
-# A point lies on an obstacle where its gap is below this [L].
+# A node lies on an obstacle where its gap is below this [L].
 LIES_ON = 1e-9
 # A start touches where its gap is below this part of the radius.
 TOUCHES = 1e-3
 
 
 class Contacts(NamedTuple):
-    """At a point: gaps, and by the motion of the nodes, those of `rows`, first and second derivatives of what L has of
-    them.
-    """
+    """At a point: gaps, their gradients, and the second derivatives of what L has of them by the places of nodes."""
 
-    gaps: Float[Array, "k p"]
+    gaps: Float[Array, "k n+1"]
     rows: ContactRows
-    first: Float[Array, "n+1 d"]
-    second: NodeBlocks
+    stiffness: Float[Array, "n+1 3 3"]
 
 
 class TouchingForm(Form):
@@ -76,10 +72,6 @@ class TouchingForm(Form):
     @abstractmethod
     def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
         """The derivative of the centerline by arclength at the nodes."""
-
-    @abstractmethod
-    def tangent_rates(self, point: Any, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
-        """Of the tangents, by rotations in bases."""
 
     @abstractmethod
     def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
@@ -112,11 +104,11 @@ class TouchingForm(Form):
         return super().is_closed(self.closure(closure), tolerance)
 
     def others(self, multipliers: Float[Array, "k"]) -> TouchingChange:
-        nodes = len(self.field.s)
-        count = len(self.scene.obstacles) * self.contact_points
-        of_nodes = multipliers[-3 * (2 * nodes - 1) : -3 * (nodes - 1)].reshape(nodes, 3)
-        pressures = multipliers[-3 * (2 * nodes - 1) - count : -3 * (2 * nodes - 1)]
-        return TouchingChange(of_nodes, pressures.reshape(-1, self.contact_points))
+        nodes, obstacles = len(self.field.s), len(self.scene.obstacles)
+        pressures, displacements = jnp.split(
+            multipliers[-3 * (2 * nodes - 1) - obstacles * nodes : -3 * (nodes - 1)], [obstacles * nodes]
+        )
+        return TouchingChange(displacements.reshape(nodes, 3), pressures.reshape(obstacles, nodes))
 
     def touching_moved(self, point: Any, others: TouchingChange | None) -> Touching:
         touching = point.touching
@@ -125,7 +117,7 @@ class TouchingForm(Form):
         places, pressures = touching.places + others.displacements, touching.pressures + others.pressures
         return Touching(places, pressures, touching.relaxed)
 
-    def led_out(self, gaps: Float[Array, "k p"]) -> Float[Array, "k"]:
+    def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
         depths = -jnp.min(gaps, axis=1)
         return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
@@ -141,21 +133,18 @@ class TouchingForm(Form):
         positions, held = self.held_places
         return dataclasses.replace(touching, places=touching.places.at[held].set(positions.T))
 
-    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k p"] | None) -> Any:
+    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
-        count = len(self.scene.obstacles)
-        nothing = jnp.zeros((count, self.contact_points), nodes.dtype)
+        nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
         touching = self.touching_held(Touching(nodes, nothing, nothing[:, 0]))
         assert touching is not None
-        gaps, normals = self.gaps_and_normals(self.contact_positions(touching.places, point.tangents))
-        at_nodes = jnp.einsum("cn,knc->kn", self.at_nodes(point.end_force), normals[:, : len(nodes)])
-        pushing = jnp.pad(at_nodes, ((0, 0), (0, self.contact_points - len(nodes))))
-        pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.contact_radius[None]), pushing, 0.0)
+        gaps, normals = self.gaps_and_normals(touching.places)
+        pushing = jnp.einsum("cn,knc->kn", self.at_nodes(point.end_force), normals)
+        pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
         known = nothing + jnp.nan if pressures is None else pressures
-        return dataclasses.replace(
-            point,
-            touching=Touching(touching.places, jnp.where(jnp.isnan(known), pushing, known), self.led_out(gaps)),
-        )
+        pressures = jnp.where(jnp.isnan(known), pushing, known)
+        touching = dataclasses.replace(touching, pressures=pressures, relaxed=self.led_out(gaps))
+        return dataclasses.replace(point, touching=touching)
 
     # --- places and contacts -----------------------------------------------------------------------------------------
 
@@ -171,20 +160,9 @@ class TouchingForm(Form):
         return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
 
     @property
-    def contact_points(self) -> int:
-        return contact_points(len(self.field.s) - 1)
-
-    @property
     def radius(self) -> Float[Array, "n+1"]:
         """At the nodes; of a radius that jumps, the larger one beside the node."""
         return largest_beside(self._radius, self.field.s)
-
-    @property
-    def contact_radius(self) -> Float[Array, "p"]:
-        if not PARTS:
-            return self.radius
-        within = self.radius_in_elements(jnp.asarray(PARTS, self.field.s.dtype))
-        return jnp.concatenate([self.radius, within.T.reshape(-1)])
 
     def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
         """At places in each element, as parts of it."""
@@ -204,98 +182,30 @@ class TouchingForm(Form):
         h = jnp.diff(self.field.s)
         return SOFTNESS * h[jnp.argmin(h)] ** 3
 
-    def _weights(self, parts: tuple[float, ...] = PARTS) -> tuple[Array, Array]:
-        """Of the places in elements, by the positions of both nodes and by the tangents there, (q, 2)."""
-        x = np.array(parts)[:, None]
-        of_places = np.concatenate([(1 + 2 * x) * (1 - x) ** 2, x**2 * (3 - 2 * x)], axis=1)
-        of_tangents = np.concatenate([x * (1 - x) ** 2, -(x**2) * (1 - x)], axis=1)
-        dtype = self.field.s.dtype
-        return jnp.asarray(of_places, dtype), jnp.asarray(of_tangents, dtype)
-
-    def contact_positions(self, places: Float[Array, "n+1 3"], tangents: Float[Array, "3 m"]) -> Float[Array, "p 3"]:
-        return self._placed(places, tangents, PARTS)
-
-    def _placed(
-        self, places: Float[Array, "n+1 3"], tangents: Float[Array, "3 m"], parts: tuple[float, ...]
-    ) -> Float[Array, "k 3"]:
-        """The nodes, and these parts of elements."""
-        of_places, of_tangents = self._weights(parts)
-        slopes, h = tangents[:, ::2].T, jnp.diff(self.field.s)[:, None]
-        within = [
-            a[0] * places[:-1] + a[1] * places[1:] + h * (b[0] * slopes[:-1] + b[1] * slopes[1:])
-            for a, b in zip(of_places, of_tangents, strict=True)
-        ]
-        return jnp.concatenate([places, *within])
-
-    def gaps_and_normals(self, positions: Float[Array, "p 3"]) -> tuple[Float[Array, "k p"], Float[Array, "k p 3"]]:
+    def gaps_and_normals(self, places: Float[Array, "n+1 3"]) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
-        found = [jax.vmap(jax.value_and_grad(obstacle.at))(positions) for obstacle in self.scene.obstacles]
-        gaps = jnp.stack([distance for distance, _ in found]) - self.contact_radius[None]
-        return jnp.where(self._is_given[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
+        found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
+        gaps = jnp.stack([distance for distance, _ in found]) - self.radius[None]
+        return jnp.where(self.is_held[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
 
-    @property
-    def _is_given(self) -> Bool[Array, "p"]:
-        return jnp.pad(self.is_held, (0, self.contact_points - len(self.field.s)))
+    def contacts(self, point: Any) -> Contacts:
+        touching = point.touching
+        gaps, normals = self.gaps_and_normals(touching.places)
+        is_free = jnp.where(self.is_held, 0.0, 1.0).astype(normals.dtype)[:, None]
+        is_closed = touching.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None])
+        rows = ContactRows(normals * is_free[None], self.softness, is_closed)
+        curving = is_free[..., None] * self._curving(touching.places, touching.pressures)
+        return Contacts(gaps, rows, curving)
 
-    def contacts(self, point: Any, bases: Float[Array, "3 b m"]) -> Contacts:
-        touching, nodes, b = point.touching, len(self.field.s), bases.shape[1]
-        dtype = bases.dtype
-        positions = self.contact_positions(touching.places, point.tangents)
-        gaps, normals = self.gaps_and_normals(positions)
-        # How contact points move as nodes turn and move.
-        is_free = jnp.where(self.is_held, 0.0, 1.0).astype(dtype)
-        moving = is_free[:, None, None] * jnp.eye(3, dtype=dtype)[None]
-        at_nodes = jnp.concatenate([jnp.zeros((nodes, b, 3), dtype), moving], axis=1)
-        rates = self.tangent_rates(point, bases)[..., ::2].transpose(2, 1, 0)
-        h = jnp.diff(self.field.s)[:, None, None]
-        within = jnp.zeros((0, nodes - 1, 2 * (b + 3), 3), dtype)
-        if PARTS:
-            within = jnp.stack(
-                [
-                    jnp.concatenate(
-                        [v[0] * h * rates[:-1], w[0] * moving[:-1], v[1] * h * rates[1:], w[1] * moving[1:]], axis=1
-                    )
-                    for w, v in zip(*self._weights(), strict=True)
-                ]
-            )
-        of_elements_shape = (len(PARTS), nodes - 1)
-        rows = ContactRows(
-            jnp.einsum("knc,ndc->knd", normals[:, :nodes], at_nodes),
-            jnp.einsum("kqnc,qndc->kqnd", normals[:, nodes:].reshape(len(gaps), *of_elements_shape, 3), within),
-            self.softness,
-            touching.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]),
-        )
-        curving = self._curving(positions, touching.pressures)
-        blocks = NodeBlocks(
-            jnp.einsum("ndc,nce,nfe->ndf", at_nodes, curving[:nodes], at_nodes),
-            jnp.zeros((nodes - 1, b + 3, b + 3), dtype),
-        )
-        if PARTS:
-            curving = curving[nodes:].reshape(*of_elements_shape, 3, 3)
-            blocks += of_elements(jnp.einsum("qndc,qnce,qnfe->ndf", within, curving, within))
-            # The tangents turn on an arc.
-            pushing = jnp.einsum("kp,kpc->pc", touching.pressures, normals)[nodes:].reshape(*of_elements_shape, 3)
-            _, of_tangents = self._weights()
-            first, second = (h[..., 0] * jnp.einsum("q,qnc->nc", weights, pushing) for weights in of_tangents.T)
-            none = jnp.zeros_like(first[:1])
-            on_tangents = jnp.concatenate([first, none]) + jnp.concatenate([none, second])
-            axes, tangents = bases[..., ::2], point.tangents[:, ::2]
-            along, across = jnp.einsum("cbn,cn->nb", axes, tangents), jnp.einsum("cbn,nc->nb", axes, on_tangents)
-            arcs = along[:, :, None] * across[:, None] + across[:, :, None] * along[:, None]
-            tension = jnp.einsum("cn,nc->n", tangents, on_tangents)
-            arcs = arcs / 2 - tension[:, None, None] * jnp.einsum("cbn,can->nba", axes, axes)
-            blocks = eqx.tree_at(lambda blocks: blocks.diagonal, blocks, blocks.diagonal.at[:, :b, :b].add(-arcs))
-        return Contacts(gaps, rows, -rows.pushed(touching.pressures), blocks)
-
-    def _curving(self, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"]) -> Float[Array, "p 3 3"]:
-        """Second derivatives of what L has of the contacts, by the positions of contact points."""
-        total = jnp.zeros((len(positions), 3, 3), positions.dtype)
+    def _curving(self, places: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3 3"]:
+        """Second derivatives of what L has of the contacts, by the places of the nodes."""
+        total = jnp.zeros((len(places), 3, 3), places.dtype)
         for obstacle, pressure in zip(self.scene.obstacles, pressures, strict=True):
             # Where the rod touches nothing of an obstacle, its curvature is not computed.
             total = jax.lax.cond(
                 jnp.any(pressure != 0),
                 lambda total, obstacle=obstacle, pressure=pressure: (
-                    total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(positions)
+                    total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(places)
                 ),
                 lambda total: total,
                 total,
@@ -304,10 +214,9 @@ class TouchingForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        b = contacts.first.shape[1] - 3
-        balance = contacts.first[:, b:] + self.at_nodes(point.end_force).T
-        balance = jnp.where(self.is_held[:, None], 0.0, balance)
         pressures = point.touching.pressures
+        balance = self.at_nodes(point.end_force).T - contacts.rows.pushed(pressures)
+        balance = jnp.where(self.is_held[:, None], 0.0, balance)
         rows = -jnp.where(contacts.rows.is_closed, contacts.gaps, pressures)
         # Of a gap and a pressure one is zero, none is negative.
         weighted = GAP_WEIGHT * contacts.gaps
@@ -334,16 +243,12 @@ class TouchingForm(Form):
         assert here.gaps is not None
         touching = point.touching
         first, _, balance, gaps = system.parted(-here.closure)
-        b = len(push)
-        # Without the pressures, which the model has.
-        pushed = system.contacts.pushed(touching.pressures)
-        balance = balance - jnp.where(self.is_held[:, None], 0.0, pushed[:, b:])
-        f = (push - here.gradient).at[:, ::2].add(-pushed[:, :b].T)
+        balance -= system.contacts.pushed(touching.pressures)  # which the model has
         c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)])
         contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
         # What lies on an obstacle without pressure is more likely to press on it than to leave it.
         system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
-        found = minimized(system, f, c, contacts)
+        found = minimized(system, push - here.gradient, c, contacts)
         return found.is_minimum, found.x, found.y
 
     def under_force(
@@ -374,15 +279,13 @@ class TouchingForm(Form):
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         contacts, touching = here.system.contacts, point.touching
-        v = here.system.of_nodes(rotation, others.displacements)
         seen = touching.pressures - (here.gaps + touching.relaxed[:, None]) / self.softness
-        rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(v))
+        rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(others.displacements))
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - jnp.sum(rotation * here.gradient)
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        """Only where contact points, and places between them, go straight from one to the other without getting too
-        deep into an obstacle: one that is not convex, or thinner than contact points are apart, no tangent plane keeps
-        out.
+        """Only where nodes, and places between them, go straight from one to the other without getting too deep into an
+        obstacle: one that is not convex, or thinner than nodes are apart, no tangent plane keeps out.
         """
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before
@@ -415,7 +318,10 @@ class TouchingForm(Form):
         return is_better & ~is_blocked & jnp.all(gone >= lengths)
 
     def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
-        return self._placed(point.touching.places, point.tangents, LOOKED_AT)
+        nodes, slopes = point.touching.places, point.tangents[:, ::2].T
+        s = self.field.s
+        between = s[None, :-1] + jnp.asarray(LOOKED_AT, s.dtype)[:, None] * jnp.diff(s)[None]
+        return jnp.concatenate([nodes, cubic(s, nodes, slopes, between.reshape(-1))])
 
     def depths_at(self, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
         """How far the rod is within the nearest obstacle at places, by its radius there; 0 outside."""

@@ -18,7 +18,6 @@ from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching import TouchingForm
-from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem
 from rodjax.mechanics.energy import axial_strain_under, density
@@ -40,9 +39,6 @@ class TouchingTangents(TouchingForm, MixedForm):
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
         return self.slopes(point)[:, ::2].T
 
-    def tangent_rates(self, point: MixedPoint, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
-        return bases
-
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
         assert isinstance(field, HermiteElements)
@@ -50,7 +46,7 @@ class TouchingTangents(TouchingForm, MixedForm):
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
-        contacts = self.contacts(point, bases)
+        contacts = self.contacts(point)
         assert point.touching is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
@@ -58,7 +54,6 @@ class TouchingTangents(TouchingForm, MixedForm):
         columns = [] if torque_column is None else [torque_column]
         by_point = map(field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *columns))
         gradient, diagonal, lengths, *columns = by_point
-        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         if softness is None:
             border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
@@ -74,7 +69,7 @@ class TouchingTangents(TouchingForm, MixedForm):
             compliance,
             cells.by_force,
             self.layout.compliance(cells.compliance),
-            contacts.second,
+            contacts.stiffness,
             contacts.rows,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
@@ -117,17 +112,12 @@ class TouchingFrames(TouchingForm, FrameForm):
         strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
         return ((1 + strain)[None] * point.tangents)[:, ::2].T
 
-    def tangent_rates(self, point: FramePoint, bases: Float[Array, "3 b m"]) -> Float[Array, "3 b m"]:
-        return cross(bases, jnp.broadcast_to(point.tangents[:, None], bases.shape))
-
     def linearized(self, point: FramePoint) -> Linearization:
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         assert across is not None, "elements, not joints"
-        bases = self.bases_at(point)
-        contacts = self.contacts(point, bases)
+        contacts = self.contacts(point)
         assert point.touching is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
-        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         dtype = gradient.dtype
         system = ChainSystem(
             diagonal,
@@ -137,14 +127,14 @@ class TouchingFrames(TouchingForm, FrameForm):
             jnp.zeros((0, 0), dtype),
             self._by_force(cells),
             self.layout.compliance(cells.compliance),
-            contacts.second,
+            contacts.stiffness,
             contacts.rows,
             self.is_held,
             is_backward=not isinstance(self.scene.start, Held),
         )
         gaps = self.gap_of_elements(point, cells.way.T)
         return Linearization(
-            bases=bases,
+            bases=self.bases_at(point),
             gradient=gradient,
             closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=system,
@@ -161,9 +151,8 @@ class TouchingFrames(TouchingForm, FrameForm):
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
         gradient = self.projected(self.field.assembled(self.by_rotations(point.quaternions, point.end_force)))
-        contacts = self.contacts(point, self.bases_at(point))
+        contacts = self.contacts(point)
         rows, balance, _ = self.unbalanced_contacts(point, contacts)
-        gradient = gradient.at[:, ::2].add(contacts.first[:, :-3].T)
         gaps = self.gap_of_elements(point, self.edges(point))
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 

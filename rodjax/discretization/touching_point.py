@@ -6,24 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Contact points within an element, as parts of it; the others are its nodes. None for now: with (0.5,) the rod lies 5
-# to 16 times less deep within obstacles between its nodes, but a pressure that is eliminated by itself costs the square
-# of its stiffness in digits where it pushes on two nodes (`docs/design.md`, "Contact").
-PARTS: tuple[float, ...] = ()
-
-
-def contact_points(segments: int) -> int:
-    """The nodes, then those in elements."""
-    return segments + 1 + len(PARTS) * segments
-
 
 class Touching(eqx.Module):
     """What a point has in a scene with obstacles beside that of others: the positions of the nodes, the pressure of
-    each obstacle at each contact point, and by how much the gaps of each obstacle are seen larger in the next step.
+    each obstacle at each node, and by how much the gaps of each obstacle are seen larger in the next step.
     """
 
     places: Float[Array, "n+1 3"]
-    pressures: Float[Array, "k p"]
+    pressures: Float[Array, "k n+1"]
     relaxed: Float[Array, "k"]
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "Touching":
@@ -42,7 +32,7 @@ class TouchingChange(NamedTuple):
     """Of a step."""
 
     displacements: Float[Array, "n+1 3"]
-    pressures: Float[Array, "k p"]
+    pressures: Float[Array, "k n+1"]
 
     @staticmethod
     def nothing(touching: Touching) -> "TouchingChange":

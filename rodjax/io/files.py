@@ -76,7 +76,7 @@ FIELDS = {
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
     "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
-    "state/pressures": ("1", "with obstacles: force of each at each contact point, in the solver's units"),
+    "state/pressures": ("1", "with obstacles: force of each on each node, in the solver's units"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),

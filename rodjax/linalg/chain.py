@@ -1,18 +1,16 @@
 """Saddle-point systems of a rod whose nodes have positions of their own, by block elimination from node to node.
 
 The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in
-`saddle_point`, and the positions of the nodes, and the pressures of contact points. The force of an element is the
+`saddle_point`, and the positions of the nodes, and the pressures of contacts there. The force of an element is the
 multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first, each by itself,
 then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
 displacement, coupled with those of its neighbours only: O(n).
 
-    rotation     H theta + B F + border y + (S v - N p) = f
-    gap          B^T theta - C F + u_after - u_before = gap,    for each element
-    balance      (S v - N p) + F_before - F_after = balance,    for each node that is not held
+    rotation     H theta + B F + border y = f
+    gap          B^T theta - C F + u_after - u_before = gap,       for each element
+    balance      S u - N p + F_before - F_after = balance,         for each node that is not held
     border       border^T theta - compliance y = c
-    pressure     -N^T v - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
-
-v: rotation and displacement of the nodes, v = (theta, u) there.
+    pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
 """
 
 import dataclasses
@@ -29,86 +27,37 @@ from rodjax.linalg.blocks import inverse_of_blocks
 HARDENINGS = 5
 
 
-class NodeBlocks(eqx.Module):
-    """A symmetric matrix by rotation and displacement of the nodes: the blocks of each, and those below, that couple a
-    node with the one before it.
-    """
-
-    diagonal: Float[Array, "n+1 d d"]
-    below: Float[Array, "n d d"]
-
-    def __add__(self, other: "NodeBlocks") -> "NodeBlocks":
-        return NodeBlocks(self.diagonal + other.diagonal, self.below + other.below)
-
-    def times(self, v: Float[Array, "n+1 d"]) -> Float[Array, "n+1 d"]:
-        found = jnp.einsum("nij,nj->ni", self.diagonal, v)
-        found = found.at[1:].add(jnp.einsum("nij,nj->ni", self.below, v[:-1]))
-        return found.at[:-1].add(jnp.einsum("nji,nj->ni", self.below, v[1:]))
-
-    def mirrored(self) -> "NodeBlocks":
-        return NodeBlocks(self.diagonal[::-1], jnp.swapaxes(self.below, 1, 2)[::-1])
-
-
 class ContactRows(eqx.Module):
-    """How the gaps of contact points, k at a place, grow as nodes turn and move: of points at the nodes, and of q
-    within each element by its two nodes. `softness`: of the pressures; `is_closed`: where there is one.
+    """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held. `softness`: of the
+    pressures; `is_closed`: where there is one.
     """
 
-    at_nodes: Float[Array, "k n+1 d"]
-    within: Float[Array, "k q n 2d"]
+    normals: Float[Array, "k n+1 3"]
     softness: Float[Array, ""]
-    is_closed: Bool[Array, "k p"]
+    is_closed: Bool[Array, "k n+1"]
 
-    def closed_where(self, is_closed: Bool[Array, "k p"]) -> "ContactRows":
-        return dataclasses.replace(self, is_closed=is_closed)
+    def rates(self, u: Float[Array, "n+1 3"]) -> Float[Array, "k n+1"]:
+        """Of the gaps, as nodes move."""
+        return jnp.einsum("knc,nc->kn", self.normals, u)
 
-    def rates(self, v: Float[Array, "n+1 d"]) -> Float[Array, "k p"]:
-        """Of the gaps, as nodes go by v."""
-        at_nodes = jnp.einsum("knd,nd->kn", self.at_nodes, v)
-        if not self.within.shape[1]:
-            return at_nodes
-        ends = jnp.concatenate([v[:-1], v[1:]], axis=1)
-        within = jnp.einsum("kqnd,nd->kqn", self.within, ends)
-        return jnp.concatenate([at_nodes, within.reshape(len(within), -1)], axis=1)
+    def pushed(self, pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3"]:
+        """The forces of pressures on the nodes."""
+        return jnp.einsum("knc,kn->nc", self.normals, pressures)
 
-    def pushed(self, pressures: Float[Array, "k p"]) -> Float[Array, "n+1 d"]:
-        """The work of pressures, by v."""
-        nodes, d = self.at_nodes.shape[1:]
-        found = jnp.einsum("knd,kn->nd", self.at_nodes, pressures[:, :nodes])
-        if not self.within.shape[1]:
-            return found
-        of_ends = jnp.einsum("kqnd,kqn->nd", self.within, pressures[:, nodes:].reshape(self.within.shape[:-1]))
-        return found.at[:-1].add(of_ends[:, :d]).at[1:].add(of_ends[:, d:])
-
-    def condensed(self) -> NodeBlocks:
+    def condensed(self) -> Float[Array, "n+1 3 3"]:
         """What closed contacts add to the stiffness."""
-        nodes, d = self.at_nodes.shape[1:]
         weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
-        diagonal = jnp.einsum("knd,kne,kn->nde", self.at_nodes, self.at_nodes, weights[:, :nodes])
-        if not self.within.shape[1]:
-            return NodeBlocks(diagonal, jnp.zeros((nodes - 1, d, d), diagonal.dtype))
-        weights = weights[:, nodes:].reshape(self.within.shape[:-1])
-        return NodeBlocks(diagonal, jnp.zeros((nodes - 1, d, d), diagonal.dtype)) + of_elements(
-            jnp.einsum("kqnd,kqne,kqn->nde", self.within, self.within, weights)
-        )
-
-
-def of_elements(blocks: Float[Array, "n 2d 2d"]) -> NodeBlocks:
-    """The same matrix, of what each element adds by its two nodes."""
-    d = blocks.shape[1] // 2
-    none = jnp.zeros_like(blocks[:1, :d, :d])
-    diagonal = jnp.concatenate([blocks[:, :d, :d], none]) + jnp.concatenate([none, blocks[:, d:, d:]])
-    return NodeBlocks(diagonal, blocks[:, d:, :d])
+        return jnp.einsum("knc,kne,kn->nce", self.normals, self.normals, weights)
 
 
 class ChainSystem(eqx.Module):
     """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
 
     `diagonal`, `lower`, `across`: the blocks of H, as in `saddle_point.SaddlePointSystem`; `by_force`: those of B at
-    start, middle and end of each element; `cell_compliance`: C; `at_nodes`: S; `contacts`: N, of which rows and columns
-    of what is held are zero, as those of S; `held`: the nodes whose place is given. What is no rotation comes as one
-    vector: border, contacts, then the nodes, then the elements. `is_backward`: elimination begins at the end, for a
-    free start: a first node that nothing holds or touches has no pivot.
+    start, middle and end of each element; `cell_compliance`: C; `stiffness`: S; `contacts`: N; `held`: the nodes whose
+    place is given. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
+    `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or touches has no
+    pivot.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -118,7 +67,7 @@ class ChainSystem(eqx.Module):
     compliance: Float[Array, "k k"]
     by_force: Float[Array, "b 3 3 n"]
     cell_compliance: Float[Array, "3 3 n"]
-    at_nodes: NodeBlocks
+    stiffness: Float[Array, "n+1 3 3"]
     contacts: ContactRows
     held: Bool[Array, "n+1"]
     is_backward: bool = eqx.field(static=True, default=False)
@@ -136,7 +85,7 @@ class ChainSystem(eqx.Module):
             border=self.border[..., ::-1],
             by_force=-self.by_force[:, :, ::-1, ::-1],
             cell_compliance=self.cell_compliance[..., ::-1],
-            at_nodes=self.at_nodes.mirrored(),
+            stiffness=self.stiffness[::-1],
             held=self.held[::-1],
         )
 
@@ -148,34 +97,30 @@ class ChainSystem(eqx.Module):
 
     def closed_where(self, is_closed: Bool[Array, "k p"]) -> "ChainSystem":
         """With these contacts closed."""
-        return dataclasses.replace(self, contacts=self.contacts.closed_where(is_closed))
+        return dataclasses.replace(self, contacts=dataclasses.replace(self.contacts, is_closed=is_closed))
 
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
         first, pressures, u, force = self.parted(y)
-        v = self.of_nodes(x, u)
+        moved = jnp.where(self.held[:, None], 0.0, u)
         f = jnp.einsum("ijm,jm->im", self.diagonal, x) + jnp.einsum("ikm,k->im", self.border, first)
         f = f.at[:, 1:].add(jnp.einsum("ijm,jm->im", self.lower, x[:, :-1]))
         f = f.at[:, :-1].add(jnp.einsum("jim,jm->im", self.lower, x[:, 1:]))
         f = f.at[:, 2::2].add(jnp.einsum("ijm,jm->im", self.across, x[:, :-1:2]))
         f = f.at[:, :-1:2].add(jnp.einsum("jim,jm->im", self.across, x[:, 2::2]))
-        gap = jnp.diff(v[:, len(x) :], axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
+        gap = jnp.diff(moved, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
         for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
             f = f.at[:, at].add(jnp.einsum("icn,nc->in", self.by_force[:, :, point], force))
             gap += jnp.einsum("icn,in->nc", self.by_force[:, :, point], x[:, at])
         is_closed = self.contacts.is_closed
-        by_nodes = self.at_nodes.times(v) - self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
-        f = f.at[:, ::2].add(by_nodes[:, : len(x)].T)
+        pushed = jnp.einsum("nij,nj->ni", self.stiffness, moved)
+        pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
         none = jnp.zeros_like(force[:1])
-        balance = by_nodes[:, len(x) :] + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
+        balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
         balance = jnp.where(self.held[:, None], u, balance)
-        gaps = -jnp.where(is_closed, self.contacts.rates(v) + self.contacts.softness * pressures, pressures)
+        gaps = -jnp.where(is_closed, self.contacts.rates(moved) + self.contacts.softness * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
         return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
-
-    def of_nodes(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "n+1 d"]:
-        """Rotations and displacements of the nodes; held ones stay."""
-        return jnp.concatenate([x[:, ::2].T, jnp.where(self.held[:, None], 0.0, u)], axis=1)
 
     def parted(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
         """What belongs to the border (k,), the contacts (k, p), the nodes (n+1, 3) and the elements (n, 3)."""
@@ -185,7 +130,7 @@ class ChainSystem(eqx.Module):
 
     def condensed(self) -> "ChainSystem":
         """Without the pressures, as elimination goes along the rod."""
-        system = dataclasses.replace(self, at_nodes=self.at_nodes + self.contacts.condensed())
+        system = dataclasses.replace(self, stiffness=self.stiffness + self.contacts.condensed())
         return system.mirrored() if self.is_backward else system
 
 
@@ -240,10 +185,10 @@ class ChainFactors(eqx.Module):
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """With the softness of the contacts."""
-        system, contacts, b = self.system, self.contacts, len(f)
+        system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
         pressing = -contacts.pushed(jnp.where(contacts.is_closed, given / contacts.softness, 0.0))
-        f, nodes = f.at[:, ::2].add(pressing[:, :b].T), nodes + pressing[:, b:]
+        nodes += pressing
         if system.is_backward:
             f, nodes, gaps = f[:, ::-1], nodes[::-1], -gaps[::-1]
         x, displacements, forces = self._without_border(f[:, None], nodes[None], gaps[None])
@@ -255,8 +200,7 @@ class ChainFactors(eqx.Module):
         forces -= jnp.tensordot(multipliers, force_by_border, 1)
         if system.is_backward:
             x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
-        v = jnp.concatenate([x[:, ::2].T, displacements], axis=1)
-        pressures = jnp.where(contacts.is_closed, -(given + contacts.rates(v)) / contacts.softness, -given)
+        pressures = jnp.where(contacts.is_closed, -(given + contacts.rates(displacements)) / contacts.softness, -given)
         parts = (multipliers, pressures, displacements, forces)
         return x, jnp.concatenate([part.reshape(-1) for part in parts])
 
@@ -312,24 +256,20 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, force, force]
     turn, pull, place = slice(0, b), slice(b, b + 3), slice(b + 3, None)  # of the unknowns of a node
     blocks = jnp.zeros((n + 1, b + 6, b + 6), dtype)
-    on_nodes, beside = system.at_nodes.diagonal, system.at_nodes.below
-    blocks = blocks.at[:, turn, turn].set(of_nodes + on_nodes[:, :b, :b])
-    blocks = blocks.at[:, place, turn].set(on_nodes[:, b:, :b]).at[:, turn, place].set(on_nodes[:, :b, b:])
+    blocks = blocks.at[:, turn, turn].set(of_nodes)
     blocks = blocks.at[1:, pull, turn].set(by_end).at[1:, turn, pull].set(by_end.transpose(0, 2, 1))
     # The first node has no element before it.
     blocks = blocks.at[1:, pull, pull].set(of_force).at[0, pull, pull].set(-identity)
     pushed = free[1:, None, None] * identity[None]
     blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
-    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], on_nodes[:, b:, b:]))
+    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
     below = jnp.zeros((n, b + 6, b + 6), dtype)
-    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start] + beside[:, :b, :b])
-    below = below.at[:, place, turn].set(beside[:, b:, :b]).at[:, turn, place].set(beside[:, :b, b:])
-    below = below.at[:, place, place].set(beside[:, b:, b:])
+    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start])
     below = below.at[:, pull, turn].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, force, start])
     below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])
 
     # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
-    stiffness = jnp.trace(on_nodes[:, b:, b:], axis1=1, axis2=2) / 3
+    stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
     unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
     scale = jnp.concatenate(
         [jnp.ones((n + 1, b), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1

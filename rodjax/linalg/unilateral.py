@@ -1,10 +1,10 @@
 """The minimum of a quadratic model of a rod whose gaps may only close: which contacts of a `ChainSystem` are closed.
 
-With v the motion of the nodes, a contact of the pressure p0 and the gap g has in the model the pressure
+With u the motion of the nodes, a contact of the pressure p0 and the gap g has in the model the pressure
 
-    p(v) = max(0, p0 - (g + N^T v)/softness)
+    p(u) = max(0, p0 - (g + N^T u)/softness)
 
-and the energy softness p(v)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
+and the energy softness p(u)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
 Each step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate.
 The first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model
 itself, so that the method cannot cycle. It ends where a whole step closes and opens no contact. Where many contacts
@@ -30,10 +30,10 @@ LINE_STEPS = 12
 
 
 class Unilateral(eqx.Module):
-    """Gaps and pressures of the contact points, k at a place."""
+    """Gaps and pressures of k obstacles and the nodes."""
 
-    gaps: Float[Array, "k p"]
-    pressures: Float[Array, "k p"]
+    gaps: Float[Array, "k n+1"]
+    pressures: Float[Array, "k n+1"]
 
 
 class ModelMinimum(eqx.Module):
@@ -50,7 +50,7 @@ class ModelMinimum(eqx.Module):
 class _State(eqx.Module):
     x: Float[Array, "b m"]
     y: Float[Array, "j"]
-    is_closed: Bool[Array, "k p"]
+    is_closed: Bool[Array, "k n+1"]
     softness: Float[Array, ""]
     is_minimum: Bool[Array, ""]
     is_done: Bool[Array, ""]
@@ -63,25 +63,22 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
     what they change by.
     """
-    final, shape = system.contacts.softness, contacts.gaps.shape
-    nothing_closed = jnp.zeros(shape, bool)
-    open_system = system.closed_where(nothing_closed)
+    final = system.contacts.softness
+    open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
     of_border, _, of_nodes, of_elements = open_system.parted(c)
 
-    def solved(is_closed: Bool[Array, "k p"], softness: Float[Array, ""]):
+    def solved(is_closed: Bool[Array, "k n+1"], softness: Float[Array, ""]):
         here = eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
         pushed = here.contacts.pushed(jnp.where(is_closed, contacts.pressures, 0.0))
-        b = len(f)
         by_contacts = jnp.where(is_closed, contacts.gaps, contacts.pressures)
-        nodes = of_nodes + jnp.where(here.held[:, None], 0.0, pushed[:, b:])
+        nodes = of_nodes + jnp.where(here.held[:, None], 0.0, pushed)
         right = [part.reshape(-1) for part in (of_border, by_contacts, nodes, of_elements)]
         factors = factor_chain(here)
-        return factors.is_minimum, *factors.solve_softly(f.at[:, ::2].add(pushed[:, :b].T), jnp.concatenate(right))
+        return factors.is_minimum, *factors.solve_softly(f, jnp.concatenate(right))
 
-    def opening(x: Float[Array, "b m"], y: Float[Array, "j"]) -> Float[Array, "k p"]:
+    def opening(y: Float[Array, "j"]) -> Float[Array, "k n+1"]:
         """By how much the gaps grow."""
-        _, _, u, _ = open_system.parted(y)
-        return open_system.contacts.rates(open_system.of_nodes(x, u))
+        return open_system.contacts.rates(open_system.parted(y)[2])
 
     def work(x: Array, y: Array, by: tuple[Array, Array]) -> Float[Array, ""]:
         first, _, u, force = open_system.parted(y)
@@ -99,7 +96,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         ahead, here = open_system.times(dx, dy), open_system.times(state.x, state.y)
         slope = (work(state.x, state.y, ahead) + work(dx, dy, here)) / 2 - jnp.sum(f * dx) - jnp.sum(of_nodes * du)
         curvature = work(dx, dy, ahead)
-        before, rate = contacts.gaps + opening(state.x, state.y), opening(dx, dy)
+        before, rate = contacts.gaps + opening(state.y), opening(dy)
         pressures, falls = contacts.pressures - before / softness, rate / softness
 
         def rise(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -140,7 +137,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     no = jnp.array(False)
     begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), system.contacts.is_closed, final, no, no, count, count)
     end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
-    pressures = contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / final
+    pressures = contacts.pressures - (contacts.gaps + opening(end.y)) / final
     change = jnp.where(pressures > 0, pressures, 0.0) - contacts.pressures
     first, _, u, force = open_system.parted(end.y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, change, u, force)])

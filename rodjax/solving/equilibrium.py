@@ -28,7 +28,6 @@ from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.touching import TouchingForm
-from rodjax.discretization.touching_point import contact_points
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.passage import PLACES, Before
 from rodjax.model.plane import check_planar, is_planar, plane
@@ -320,11 +319,11 @@ def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
     return last if eqx.tree_equal(*shapes) else Before(last.points, scene.obstacles)
 
 
-def _pressures(scene: Scene, options: Options, state: SolverState | None = None) -> Float[Array, "k p"] | None:
+def _pressures(scene: Scene, options: Options, state: SolverState | None = None) -> Float[Array, "k n+1"] | None:
     """Those of a state, on its mesh, or no numbers where they are not known."""
     if not scene.obstacles:
         return None
-    shape = (len(scene.obstacles), contact_points(options.segments))
+    shape = (len(scene.obstacles), options.segments + 1)
     if state is not None and state.pressures is not None and state.pressures.shape == shape:
         return state.pressures
     return jnp.full(shape, jnp.nan, scene.rod.length.dtype)

@@ -88,7 +88,7 @@ class SolverState(eqx.Module):
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it;
-    `pressures`: of each obstacle at each contact point.
+    `pressures`: of each obstacle on each node.
     """
 
     shape: Shape
@@ -97,7 +97,7 @@ class SolverState(eqx.Module):
     places: Float[Array, "... slides"] | None = None
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
-    pressures: Float[Array, "... k p"] | None = None
+    pressures: Float[Array, "... k n+1"] | None = None
 
     def point(self, total_twist: Float[Array, ""]) -> Any:
         """The unknowns of the form of one equilibrium."""

@@ -274,14 +274,16 @@ class TouchingForm(Form):
             (elements, places),
             (rates, others.displacements),
         )
-        before, _ = parts(elements, places, jnp.zeros_like(change))
-        # Of the gradient by rotations, which has the forces and pressures as they are.
+        # The gradient by rotations has the forces as they are.
+        (before, _), (counted, _) = jax.jvp(
+            lambda elements: parts(elements, places, jnp.zeros_like(change)), (elements,), (rates,)
+        )
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         contacts, touching = here.system.contacts, point.touching
         seen = touching.pressures - (here.gaps + touching.relaxed[:, None]) / self.softness
         rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(others.displacements))
-        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - jnp.sum(rotation * here.gradient)
+        return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
         """Only where nodes, and places between them, go straight from one to the other without getting too deep into an

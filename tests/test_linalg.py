@@ -9,8 +9,8 @@ import pytest
 from jax.test_util import check_grads
 
 import rodjax as rj
-from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows
-from rodjax.linalg.saddle_point import DenseSystem, SaddlePointSystem, factor, factor_and_solve
+from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, LoadRows
+from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.solving.result import form_and_point
 
 
@@ -76,23 +76,6 @@ def test_solutions_and_signs_agree_with_dense_matrices(n, b, k):
         negative = np.sum(np.linalg.eigvalsh(matrix) < 0) - k
         assert factors.negative == negative
         assert factors.is_minimum == (negative == 0)
-
-
-def test_a_full_matrix_is_solved_and_shifted():
-    """Without symmetry; the order of the unknowns is x row by row, then y."""
-    rng = np.random.default_rng(3)
-    b, n, k = 3, 4, 2
-    matrix = rng.normal(size=(b * n + k, b * n + k))
-    f, c = right_side(n, b, k)
-    shift = jnp.asarray(rng.normal(size=n))
-    system = DenseSystem(jnp.asarray(matrix), (b, n)).shifted(shift)
-    shifted = matrix + np.diag([*np.tile(shift, b), *np.zeros(k)])
-    expected = np.linalg.solve(shifted, [*np.asarray(f).ravel(), *np.asarray(c)])
-    factors, x, y = at_once(system, f, c)
-    np.testing.assert_allclose([*np.asarray(x).ravel(), *np.asarray(y)], expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(system.times(x, y)[0], f, rtol=0, atol=1e-12)
-    assert factors.is_minimum
-    assert factors.negative == 0
 
 
 def test_a_minimum_under_the_constraints_may_be_indefinite_without_them():
@@ -246,10 +229,18 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
     )
 
 
+def random_loads(elements: int) -> LoadRows:
+    rng = np.random.default_rng(7)
+    shapes = ((2, 3, 2, 3, elements), (3, 2, 3, elements), (2, 3, 2, 3, elements))
+    return LoadRows(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
+
+
 @pytest.mark.parametrize("elements", [4, 7])
 @pytest.mark.parametrize("is_backward", [False, True])
-def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
-    system = dataclasses.replace(random_chain(elements), is_backward=is_backward)
+@pytest.mark.parametrize("loads", [None, random_loads])
+def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads):
+    """Also with loads that have no potential, without symmetry."""
+    system = dataclasses.replace(random_chain(elements), is_backward=is_backward, loads=loads and loads(elements))
     pressures = system.contacts.is_closed.size
     m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 
@@ -258,7 +249,7 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
         return jnp.concatenate([f.reshape(-1), c])
 
     matrix = np.array(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
-    np.testing.assert_array_equal(matrix, matrix.T)
+    assert np.array_equal(matrix, matrix.T) == (loads is None)
     right = np.random.default_rng(1).normal(size=len(matrix))
     factors = factor(system)
     assert isinstance(factors, ChainFactors)
@@ -273,6 +264,9 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward):
         # The contacts, of 1e5, cost the dense solve some digits; a pressure is a difference over its softness.
         np.testing.assert_allclose(found[~is_pressure], truth[~is_pressure], rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(found[is_pressure], truth[is_pressure], rtol=1e-6, atol=1e-6)
+    if loads is not None:
+        assert factors.negative == 0  # the sign of a curvature has no meaning without symmetry
+        return
     # A pressure is one negative eigenvalue, whether its contact is closed or open.
     assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - pressures - 3 * elements
     assert int(factors.negative) > 0

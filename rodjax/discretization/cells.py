@@ -112,10 +112,6 @@ class Cells(Protocol):
         """How much of the length of each strain point lies before an arclength."""
         ...
 
-    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 p n"], Float[Array, "3"]]:
-        """The integral along the rod of what is given per length, from each strain point on and from the start on."""
-        ...
-
     def couplings(self, blocks: Float[Array, "p 3 p 3 n"]) -> tuple[Array, Array, Array | None]:
         """The blocks (b, b, ...) on the diagonal, between neighbours, and between ends of elements."""
         ...
@@ -258,13 +254,6 @@ class JointCells(eqx.Module):
         none = jnp.zeros_like(of_edges[:1])
         return jnp.stack([jnp.concatenate([none, of_edges]), jnp.concatenate([of_edges, none])])
 
-    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 2 n+1"], Float[Array, "3"]]:
-        of_edges = jnp.diff(self.s)[None] * by_frame[:, 1:-1]
-        sums = jnp.cumsum(of_edges[:, ::-1], axis=1)[:, ::-1]
-        middles = sums - of_edges / 2
-        beyond = [jnp.concatenate([sums[:, :1], middles], axis=1), jnp.pad(middles, ((0, 0), (0, 1)))]
-        return jnp.stack(beyond, axis=1), sums[:, 0]
-
     def couplings(self, blocks: Float[Array, "2 3 2 3 n"]) -> tuple[Array, Array, None]:
         diagonal = self.assembled(jnp.stack([blocks[0, :, 0], blocks[1, :, 1]], axis=-2))
         return diagonal, blocks[1, :, 0], None
@@ -349,15 +338,6 @@ class ElementCells(eqx.Module):
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
         return parts_before(self.s, at)
-
-    def summed_beyond(self, by_frame: Float[Array, "3 m"]) -> tuple[Float[Array, "3 3 n"], Float[Array, "3"]]:
-        """By parabolas through the three points of each element."""
-        a, b, c = of_elements(by_frame)
-        whole = self.h[None] * (SIMPSON[0] * (a + c) + SIMPSON[1] * b)
-        second_half = self.h[None] * (-a + 8 * b + 5 * c) / 24
-        sums = jnp.cumsum(whole[:, ::-1], axis=1)[:, ::-1]
-        beyond = sums - whole
-        return jnp.stack([sums, beyond + second_half, beyond], axis=1), sums[:, 0]
 
     def couplings(self, blocks: Float[Array, "3 3 3 3 n"]) -> tuple[Array, Array, Array]:
         diagonal = self.assembled(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))

@@ -24,7 +24,7 @@ def with_contacts(errors: Errors, form: TouchingForm, point: Any) -> Errors:
     And how deep the rod lies between the nodes.
     """
     h = jnp.diff(form.field.s)
-    forces = jnp.where(form.is_held[None], 0.0, form.at_nodes(point.end_force))
+    forces = jnp.where(form.is_held[None], 0.0, form.applied(point))
     beside = jnp.pad(forces, ((0, 0), (1, 1)))
     alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
     spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2

@@ -214,17 +214,12 @@ class Form(eqx.Module):
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
         return self.nodes(self.edges(point)) if point.touching is None else point.touching.places
 
-    def loads_on_all(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """All loads together, and the given force on an end that is free."""
-        given = jnp.zeros(3, point.tangents.dtype)
+    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The section forces at s = 0 and s = L."""
+        total, given = total_force(self.scene), jnp.zeros(3, point.tangents.dtype)
         for end in (self.scene.start, self.scene.end):
             if isinstance(end, Free) and end.force is not None:
                 given = end.force
-        return total_force(self.scene), given
-
-    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The section forces at s = 0 and s = L."""
-        total, given = self.loads_on_all(point)
         first, last = point.end_force[:, 0], point.end_force[:, -1]
         if isinstance(self.scene.start, Free):
             return -given, last - total

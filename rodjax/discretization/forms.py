@@ -9,15 +9,15 @@ from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching_forms import TouchingFrames, TouchingTangents
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, has_node_places
 
 
 def form_of(scene: Scene, shape: Shape) -> Form:
     """Of a nondimensional scene."""
     if isinstance(shape, FramedCurve):
         cells = cells_of(scene, shape)
-        return TouchingFrames.of(scene, cells) if scene.obstacles else FrameForm.of(scene, cells)
-    if scene.obstacles:
+        return TouchingFrames.of(scene, cells) if has_node_places(scene) else FrameForm.of(scene, cells)
+    if has_node_places(scene):
         return TouchingTangents.of(scene, field_of(scene, shape))
     return MixedForm.of(scene, field_of(scene, shape))
 

@@ -10,8 +10,7 @@ A frame turns by a vector in its own axes, so that L and its derivatives are sum
 frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
 rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
 
-Couples, follower loads and dead moments have no potential. Their virtual work enters the gradient; what follower forces
-change far away makes the matrix full, and the method Newton's own on all of it.
+Loads without a potential are those of `touching_forms.TouchingFrames`.
 """
 
 import dataclasses
@@ -24,7 +23,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
 from rodjax.discretization.cells import REFERENCE, Cells, strains_between
-from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
@@ -35,11 +33,10 @@ from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rota
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import product as block_product
 from rodjax.linalg.blocks import short_sum
-from rodjax.linalg.saddle_point import AnySystem, DenseSystem, SaddlePointSystem
+from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import Sections
-from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.scene import Scene, has_potential
-from rodjax.model.supports import Clamp, Directed, Free, Held
+from rodjax.model.supports import Clamp, Directed
 
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
 # and of EI/L^2: directions count as lying in the plane up to as much.
@@ -248,44 +245,16 @@ class FrameForm(Form):
     def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> Float[Array, "3 k n"]:
         """The force through the rod at the strain points."""
         forces = self.through(end_force) + self.loads
-        following = self._following(quaternions)
+        following = self.following(quaternions)
         return forces if following is None else forces + following
 
-    def _following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
-        """What the follower loads beyond each strain point exert on it; where the start is free, less all of them."""
-        scene = self.scene
-        parts = []
-        starts_held = isinstance(scene.start, Held)
-        for load in scene.distributed:
-            if isinstance(load, DistributedForce) and load.follower:
-                given = rotated(quaternions, jnp.broadcast_to(load.force[:, None], quaternions[1:].shape))
-                beyond, total = self.field.summed_beyond(given)
-                parts.append(beyond if starts_held else beyond - total[:, None, None])
-        for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1)):
-            if isinstance(end, Free) and end.follower and end.force is not None:
-                parts.append(sign * rotated(quaternions[:, k], end.force)[:, None, None])
-        return sum(parts[1:], parts[0]) if parts else None
+    def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
+        """What follower loads exert on the strain points; `None` where there are none."""
+        return None
 
-    def couples_in_cells(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
+    def couples_along(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
         """The couples along the rod on the strain points, in their axes; `None` where there are none."""
-        parts = []
-        for load in self.scene.distributed:
-            if isinstance(load, DistributedCouple):
-                couple = jnp.broadcast_to(load.couple[:, None], quaternions[1:].shape)
-                couple = couple if load.follower else rotated(inverse(quaternions), couple)
-                parts.append(self.field.lengths[None] * self.field.of_cells(couple))
-        return sum(parts[1:], parts[0]) if parts else None
-
-    def _couples(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 m"] | None:
-        """All couples on the frames, in their axes; `None` where there are none."""
-        scene = self.scene
-        along = self.couples_in_cells(quaternions)
-        parts = [] if along is None else [self.field.assembled(along)]
-        for end, k in ((scene.start, 0), (scene.end, -1)):
-            if isinstance(end, Free) and end.moment is not None:
-                moment = end.moment if end.follower else rotated(inverse(quaternions[:, k]), end.moment)
-                parts.append(jnp.zeros_like(quaternions[1:]).at[:, k].set(moment))
-        return sum(parts[1:], parts[0]) if parts else None
+        return None
 
     def strained(self, point: FramePoint) -> Strained:
         forces = self.forces(point.quaternions, point.end_force)
@@ -341,22 +310,6 @@ class FrameForm(Form):
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work
 
-    def loads_on_all(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        scene, q = self.scene, point.quaternions
-        total = total_force(scene)
-        given = jnp.zeros_like(total)
-        for load in scene.distributed:
-            if isinstance(load, DistributedForce) and load.follower:
-                along = rotated(q, jnp.broadcast_to(load.force[:, None], q[1:].shape))
-                total += self.field.summed_beyond(along)[1]
-        for end, k in ((scene.start, 0), (scene.end, -1)):
-            if isinstance(end, Free) and end.force is not None:
-                given = end.force
-                if end.follower:
-                    given = rotated(q[:, k], given)
-                    total += given
-        return total, given
-
     # --- derivatives -------------------------------------------------------------------------------------------------
 
     def by_rotations(
@@ -365,25 +318,13 @@ class FrameForm(Form):
         """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
         return first_derivatives(self._cells(quaternions, end_force))
 
-    def _unbalanced(
-        self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]
-    ) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
-        """What is out of balance at the frames, in their axes, and what the rod lacks of its span."""
-        gradient = self.field.assembled(self.by_rotations(quaternions, end_force))
-        couples = self._couples(quaternions)
-        if couples is not None:
-            gradient -= couples
-        closure = jnp.zeros(0, end_force.dtype)
-        if self.layout.size:
-            edges = self.edges(FramePoint(quaternions, end_force, jnp.zeros((), end_force.dtype)))
-            closure = self.layout.components(self.spans - self.layout.sums(edges.T))
-        return self.projected(gradient), closure
-
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
-        return self._unbalanced(point.quaternions, point.end_force)
-
-    def linearized(self, point: FramePoint) -> Linearization:
-        return self._with_cells(point) if self.has_potential else self.with_all(point)
+        """What is out of balance at the frames, in their axes, and what the rod lacks of its spans."""
+        gradient = self.field.assembled(self.by_rotations(point.quaternions, point.end_force))
+        closure = jnp.zeros(0, gradient.dtype)
+        if self.layout.size:
+            closure = self.layout.components(self.spans - self.layout.sums(self.edges(point).T))
+        return self.projected(gradient), closure
 
     def by_cells(
         self, point: FramePoint
@@ -410,8 +351,7 @@ class FrameForm(Form):
                 across = block_product(block_product(projection[..., 2::2], across), projection[..., 0:-1:2])
         return cells, self.projected(field.assembled(cells.first)), (diagonal, lower, across)
 
-    def _with_cells(self, point: FramePoint) -> Linearization:
-        """By two derivatives of each cell."""
+    def linearized(self, point: FramePoint) -> Linearization:
         layout = self.layout
         assert isinstance(layout, SpanForces)
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
@@ -429,30 +369,6 @@ class FrameForm(Form):
             closure=closure,
             system=SaddlePointSystem(diagonal, lower, border, compliance, across=across),
             energy=value,
-            residual=self._residual(gradient),
-        )
-
-    def with_all(self, point: FramePoint) -> Linearization:
-        """By one derivative of all that is out of balance, by all rotations."""
-        q = point.quaternions
-        gradient, closure = self._unbalanced(q, point.end_force)
-
-        def residual(unknowns: Float[Array, "3m+c"]) -> Float[Array, "3m+c"]:
-            rotation = unknowns[: gradient.size].reshape(gradient.shape)
-            force = point.end_force + self.layout.forces(unknowns[gradient.size :])
-            turning, closure = self._unbalanced(turned(q, self.projected(rotation)), force)
-            # Unit rows for what is not turned.
-            turning += rotation - self.projected(rotation)
-            return jnp.concatenate([turning.reshape(-1), closure])
-
-        unknowns = jnp.zeros(gradient.size + len(closure), gradient.dtype)
-        matrix = jax.jacfwd(residual)(unknowns)
-        return Linearization(
-            bases=self.bases_at(point),
-            gradient=gradient,
-            closure=closure,
-            system=DenseSystem(matrix, (3, gradient.shape[1])),
-            energy=self.elastic_energy(point),
             residual=self._residual(gradient),
         )
 

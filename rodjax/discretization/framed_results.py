@@ -74,7 +74,7 @@ def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
     """By frames of cells, global axes: at the last one the section moment, at the first the reverse."""
     q = point.quaternions
     by_cells = form.by_rotations(q, point.end_force)
-    couples = form.couples_in_cells(q)
+    couples = form.couples_along(q)
     if couples is not None:
         by_cells -= couples
     return rotated(form.field.of_cells(q), by_cells)
@@ -301,7 +301,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
     forces = form.forces(point.quaternions, point.end_force)
     sections = form.sections
     rest = form.scene.rod.rest_shape
-    couples = form.couples_in_cells(point.quaternions)
+    couples = form.couples_along(point.quaternions)
     if couples is not None:
         couples = rotated(field.of_cells(point.quaternions), couples) / field.lengths[None]
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rodjax.linalg.blocks import partial_sums
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, has_node_places
 from rodjax.model.supports import Held
 
 
@@ -177,7 +177,7 @@ def nodes_along(
 
 def force_parts(scene: Scene, segments: int) -> int:
     """How many forces the layout of a scene has on a mesh."""
-    return segments if scene.obstacles else len(scene.clips) + 1
+    return segments if has_node_places(scene) else len(scene.clips) + 1
 
 
 def in_parts(forces: Float[Array, "3 parts"], parts: int) -> Float[Array, "3 others"]:

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
+from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.touching_point import Touching, TouchingChange
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
@@ -34,6 +35,7 @@ from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.obstacles import least
+from rodjax.model.supports import Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
@@ -97,7 +99,7 @@ class TouchingForm(Form):
     def axial_forces(self, point: Any) -> Float[Array, "slides"]:
         nodes = self.clip_nodes
         assert nodes is not None
-        along = dot(self.at_nodes(point.end_force)[:, nodes], self.tangents_in_clips(point))
+        along = dot(self.applied(point)[:, nodes], self.tangents_in_clips(point))
         return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
@@ -119,7 +121,7 @@ class TouchingForm(Form):
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
-        depths = -jnp.min(gaps, axis=1)
+        depths = -jnp.min(gaps, axis=1, initial=jnp.inf)
         return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
@@ -135,24 +137,43 @@ class TouchingForm(Form):
 
     def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
+        if point.end_force.shape[1] != len(nodes) - 1:
+            point = dataclasses.replace(point, end_force=self._in_elements(point))
         nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
         touching = self.touching_held(Touching(nodes, nothing, nothing[:, 0]))
         assert touching is not None
+        if not self.scene.obstacles:
+            return dataclasses.replace(point, touching=touching)
         gaps, normals = self.gaps_and_normals(touching.places)
-        pushing = jnp.einsum("cn,knc->kn", self.at_nodes(point.end_force), normals)
+        pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
         known = nothing + jnp.nan if pressures is None else pressures
         pressures = jnp.where(jnp.isnan(known), pushing, known)
         touching = dataclasses.replace(touching, pressures=pressures, relaxed=self.led_out(gaps))
         return dataclasses.replace(point, touching=touching)
 
+    def _in_elements(self, point: Any) -> Float[Array, "3 n"]:
+        """The forces through the elements, of those in the spans, as files until format 10 have them."""
+        members = SpanForces.of(self.scene, self.clip_nodes, len(self.field.s) - 1)
+        forces = jnp.broadcast_to(members.of_cells(point.end_force), (3, len(self.field.s) - 1))
+        loads = self.loads_on_nodes(point)
+        if loads is None:
+            return forces
+        if isinstance(self.scene.start, Held):
+            return forces + jnp.cumsum(loads[:, :0:-1], axis=1)[:, ::-1]
+        return forces - jnp.cumsum(loads[:, :-1], axis=1)
+
     # --- places and contacts -----------------------------------------------------------------------------------------
 
-    @staticmethod
-    def at_nodes(end_force: Float[Array, "3 n"]) -> Float[Array, "3 n+1"]:
-        """What clips, contacts and supports apply at the nodes, of the forces through the elements."""
-        around = jnp.pad(end_force, ((0, 0), (1, 1)))
-        return around[:, :-1] - around[:, 1:]
+    def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
+        """By which the forces of two elements differ, beside what is applied to the node between; `None` for none."""
+        return None
+
+    def applied(self, point: Any) -> Float[Array, "3 n+1"]:
+        """What clips, contacts and supports apply at the nodes."""
+        around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
+        applied, loads = around[:, :-1] - around[:, 1:], self.loads_on_nodes(point)
+        return applied if loads is None else applied - loads
 
     @property
     def is_held(self) -> Bool[Array, "n+1"]:
@@ -184,6 +205,8 @@ class TouchingForm(Form):
 
     def gaps_and_normals(self, places: Float[Array, "n+1 3"]) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
+        if not self.scene.obstacles:
+            return jnp.zeros((0, len(places)), places.dtype), jnp.zeros((0, *places.shape), places.dtype)
         found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
         gaps = jnp.stack([distance for distance, _ in found]) - self.radius[None]
         return jnp.where(self.is_held[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
@@ -215,12 +238,12 @@ class TouchingForm(Form):
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
         pressures = point.touching.pressures
-        balance = self.at_nodes(point.end_force).T - contacts.rows.pushed(pressures)
+        balance = self.applied(point).T - contacts.rows.pushed(pressures)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
         rows = -jnp.where(contacts.rows.is_closed, contacts.gaps, pressures)
         # Of a gap and a pressure one is zero, none is negative.
         weighted = GAP_WEIGHT * contacts.gaps
-        amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)))
+        amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
         return rows.reshape(-1), balance, amiss
 
     def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -245,6 +268,8 @@ class TouchingForm(Form):
         first, _, balance, gaps = system.parted(-here.closure)
         balance -= system.contacts.pushed(touching.pressures)  # which the model has
         c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)])
+        if not self.scene.obstacles:
+            return super().sought(here, point, system, push)
         contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
         # What lies on an obstacle without pressure is more likely to press on it than to leave it.
         system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
@@ -289,6 +314,8 @@ class TouchingForm(Form):
         """Only where nodes, and places between them, go straight from one to the other without getting too deep into an
         obstacle: one that is not convex, or thinner than nodes are apart, no tangent plane keeps out.
         """
+        if not self.scene.obstacles:
+            return is_better
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before
         lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
@@ -344,4 +371,6 @@ class TouchingForm(Form):
 
     def rounding_floor(self, point: Any) -> Float[Array, ""]:
         floor = super().rounding_floor(point)  # pyright: ignore
+        if not self.scene.obstacles:
+            return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT

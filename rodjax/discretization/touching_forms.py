@@ -8,8 +8,9 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.cell_derivatives import CellDerivatives
-from rodjax.discretization.cells import Cells
+from rodjax.discretization import unconservative
+from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
+from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
 from rodjax.discretization.framed import FrameForm, FramePoint, Kinematics
 from rodjax.discretization.framed_parts import parts_of
@@ -18,8 +19,10 @@ from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.touching import TouchingForm
+from rodjax.geometry.rotations import turned
+from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import short_sum
-from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Held
@@ -112,8 +115,73 @@ class TouchingFrames(TouchingForm, FrameForm):
         strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
         return ((1 + strain)[None] * point.tangents)[:, ::2].T
 
+    # --- loads without a potential -----------------------------------------------------------------------------------
+
+    def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
+        return unconservative.following(self.scene, self._elements, self.field.of_cells(quaternions))
+
+    def couples_along(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
+        return unconservative.couples_along(self.scene, self._elements, self.field.of_cells(quaternions))
+
+    def loads_on_nodes(self, point: FramePoint) -> Float[Array, "3 n+1"] | None:
+        if self.has_potential:
+            return None
+        loads = unconservative.on_nodes(self.scene, self._elements, self.field.of_cells(point.quaternions))
+        return jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
+
+    def end_forces(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        if self.has_potential:
+            return super().end_forces(point)
+        forces = self.forces(point.quaternions, point.end_force)
+        return forces[:, 0, 0], forces[:, -1, -1]
+
+    @property
+    def _elements(self) -> ElementCells:
+        assert isinstance(self.field, ElementCells)
+        return self.field
+
+    def _moments(self, point: FramePoint) -> Float[Array, "3 m"]:
+        """The derivative of L by the rotations, less couples."""
+        gradient = self.by_rotations(point.quaternions, point.end_force)
+        if not self.has_potential:
+            gradient -= unconservative.couples(self.scene, self._elements, self.field.of_cells(point.quaternions))
+        return self.projected(self.field.assembled(gradient))
+
+    def _load_rows(self, point: FramePoint) -> LoadRows:
+        field, scene = self._elements, self.scene
+        q = field.of_cells(point.quaternions)
+        cells, base = self._cells(point.quaternions, point.end_force), self.through(point.end_force) + self.loads
+        kinematics, couples = self._kinematics(q), unconservative.couples(scene, field, q)
+
+        def rows(turn: Float[Array, "3 3 n"]) -> tuple[Array, Array, Array]:
+            """Of what the loads change alone: moments, gaps and the balance of nodes."""
+            there = turned(q, turn)
+            following = unconservative.following(scene, field, there)
+            forces = base if following is None else base + following
+            # By the virtual work in what turns the frames, of which only half is a turn of the couple beside its frame.
+            moments = first_derivatives(cells._replace(forces=forces)) - cross(turn, couples) / 2
+            moments -= unconservative.couples(scene, field, there)
+            ways = short_sum(self._strained(kinematics, forces).ways, axis=1)
+            return moments, -ways, -unconservative.on_nodes(scene, field, there)
+
+        along = field.of_cells(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
+        alone = jnp.eye(q.shape[1], dtype=q.dtype)[None, :, None, :, None]
+        moments, ways, balance = unconservative.turned_rows(rows, along[:, None] * alone)
+        moments = jnp.einsum("xain,bjain->xibjn", along, moments)
+        return LoadRows(moments, jnp.einsum("bjan->abjn", ways), jnp.einsum("bjkan->kabjn", balance))
+
+    @property
+    def _projections(self) -> Float[Array, "3 3 m"]:
+        if self.across is not None:
+            return self._projection
+        return jnp.eye(3, dtype=self.loads.dtype)[..., None] * self.is_free[None]
+
+    # --- derivatives -------------------------------------------------------------------------------------------------
+
     def linearized(self, point: FramePoint) -> Linearization:
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
+        if not self.has_potential:
+            gradient = self._moments(point)
         assert across is not None, "elements, not joints"
         contacts = self.contacts(point)
         assert point.touching is not None
@@ -130,6 +198,7 @@ class TouchingFrames(TouchingForm, FrameForm):
             contacts.stiffness,
             contacts.rows,
             self.is_held,
+            None if self.has_potential else self._load_rows(point),
             is_backward=not isinstance(self.scene.start, Held),
         )
         gaps = self.gap_of_elements(point, cells.way.T)
@@ -150,7 +219,7 @@ class TouchingFrames(TouchingForm, FrameForm):
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
-        gradient = self.projected(self.field.assembled(self.by_rotations(point.quaternions, point.end_force)))
+        gradient = self._moments(point)
         contacts = self.contacts(point)
         rows, balance, _ = self.unbalanced_contacts(point, contacts)
         gaps = self.gap_of_elements(point, self.edges(point))

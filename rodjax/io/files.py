@@ -38,7 +38,7 @@ from rodjax.version import __version__
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 10
+FORMAT = 11
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.

@@ -11,6 +11,8 @@ displacement, coupled with those of its neighbours only: O(n).
     balance      S u - N p + F_before - F_after = balance,         for each node that is not held
     border       border^T theta - compliance y = c
     pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
+
+Loads without a potential add rows of their own to the first three, without symmetry (`LoadRows`).
 """
 
 import dataclasses
@@ -50,6 +52,24 @@ class ContactRows(eqx.Module):
         return jnp.einsum("knc,kne,kn->nce", self.normals, self.normals, weights)
 
 
+class LoadRows(eqx.Module):
+    """What loads without a potential add, of each element by the rotations of its start, middle and end: [.., c, j, n]
+    by component c of point j.
+
+    `rotation`: [a, i, ..] to the row of component a of point i; `way`: to those of the gap; `balance`: [k, ..] to those
+    of the node at its start and its end.
+    """
+
+    rotation: Float[Array, "b 3 b 3 n"]
+    way: Float[Array, "3 b 3 n"]
+    balance: Float[Array, "2 3 b 3 n"]
+
+    def mirrored(self) -> "LoadRows":
+        return LoadRows(
+            self.rotation[:, ::-1, :, ::-1, ::-1], -self.way[:, :, ::-1, ::-1], self.balance[::-1, ..., ::-1, ::-1]
+        )
+
+
 class ChainSystem(eqx.Module):
     """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
 
@@ -57,7 +77,7 @@ class ChainSystem(eqx.Module):
     start, middle and end of each element; `cell_compliance`: C; `stiffness`: S; `contacts`: N; `held`: the nodes whose
     place is given. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
     `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or touches has no
-    pivot.
+    pivot. `loads`: `None` where all have a potential.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -70,6 +90,7 @@ class ChainSystem(eqx.Module):
     stiffness: Float[Array, "n+1 3 3"]
     contacts: ContactRows
     held: Bool[Array, "n+1"]
+    loads: LoadRows | None = None
     is_backward: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> "ChainSystem":
@@ -87,6 +108,7 @@ class ChainSystem(eqx.Module):
             cell_compliance=self.cell_compliance[..., ::-1],
             stiffness=self.stiffness[::-1],
             held=self.held[::-1],
+            loads=None if self.loads is None else self.loads.mirrored(),
         )
 
     def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
@@ -117,6 +139,14 @@ class ChainSystem(eqx.Module):
         pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
         none = jnp.zeros_like(force[:1])
         balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
+        if self.loads is not None:
+            ends = jnp.stack([x[:, :-1:2], x[:, 1::2], x[:, 2::2]], axis=1)
+            of_points = jnp.einsum("aicjn,cjn->ain", self.loads.rotation, ends)
+            for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
+                f = f.at[:, at].add(of_points[:, point])
+            gap += jnp.einsum("acjn,cjn->na", self.loads.way, ends)
+            of_nodes = jnp.einsum("kacjn,cjn->kna", self.loads.balance, ends)
+            balance += _on_nodes(*of_nodes)
         balance = jnp.where(self.held[:, None], u, balance)
         gaps = -jnp.where(is_closed, self.contacts.rates(moved) + self.contacts.softness * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
@@ -135,14 +165,24 @@ class ChainSystem(eqx.Module):
 
 
 class _Middles(eqx.Module):
-    """The elimination of the points in the middle: what couples them to start, end and force, before and after."""
+    """The elimination of the points in the middle: the inverse times what couples them to start, end and force;
+    `left`: what couples the rows of start, end, gap and both nodes to them, times the inverse. Of a symmetric system
+    the nodes are not coupled, and the other rows are those of `solved`.
+    """
 
     solved: Float[Array, "n b 2b+3"]
     inverse: Float[Array, "n b b"]
+    left: Float[Array, "n 2b+9 b"] | None
+
+    def moved(self, of_middles: Float[Array, "n b r"]) -> Float[Array, "n rows r"]:
+        """What the right sides of the other rows lose."""
+        if self.left is None:
+            return jnp.einsum("npq,npr->nqr", self.solved, of_middles)
+        return self.left @ of_middles
 
 
 class ChainFactors(eqx.Module):
-    """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`.
+    """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`, 0 without symmetry.
 
     `system`: that without pressures. Where elimination begins at the end, it and all else is mirrored.
     """
@@ -152,6 +192,7 @@ class ChainFactors(eqx.Module):
     middles: _Middles
     inverses: Float[Array, "n+1 c c"]
     below: Float[Array, "n c c"]
+    above: Float[Array, "n c c"]
     border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
     complement: Float[Array, "k k"]
     negative: Int[Array, ""]
@@ -209,13 +250,14 @@ class ChainFactors(eqx.Module):
     ) -> tuple[Float[Array, "b r m"], Float[Array, "r n+1 3"], Float[Array, "r n 3"]]:
         middles, b = self.middles, len(f)
         of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
-        moved = jnp.einsum("npq,npr->nqr", middles.solved, of_middles)
+        moved = middles.moved(of_middles)
         none = jnp.zeros_like(of_nodes[:1])
         rotations = of_nodes - jnp.concatenate([moved[:, :b], none]) - jnp.concatenate([none, moved[:, b : 2 * b]])
-        forces = gaps.transpose(1, 2, 0) - moved[:, 2 * b :]
-        right = jnp.concatenate(
-            [rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), nodes.transpose(1, 2, 0)], axis=1
-        )
+        forces = gaps.transpose(1, 2, 0) - moved[:, 2 * b : 2 * b + 3]
+        of_places = nodes.transpose(1, 2, 0)
+        if middles.left is not None:
+            of_places -= _on_nodes(moved[:, 2 * b + 3 : 2 * b + 6], moved[:, 2 * b + 6 :])
+        right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_places], axis=1)
 
         def forward(before: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             inverse, below, right = given
@@ -224,14 +266,14 @@ class ChainFactors(eqx.Module):
 
         def backward(after: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             inverse, above, here = given
-            here -= inverse @ (above.T @ after)
+            here -= inverse @ (above @ after)
             return here, here
 
         first = self.inverses[0] @ right[0]
         _, reached = jax.lax.scan(forward, first, (self.inverses[1:], self.below, right[1:]))
         last = reached[-1]
         reached = jnp.concatenate([first[None], reached[:-1]])
-        _, solved = jax.lax.scan(backward, last, (self.inverses[:-1], self.below, reached), reverse=True)
+        _, solved = jax.lax.scan(backward, last, (self.inverses[:-1], self.above, reached), reverse=True)
         z = jnp.concatenate([solved, last[None]])
         around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
@@ -246,27 +288,31 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     contacts, system = system.contacts, system.condensed()
     b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
-    middles, coupled, negative = _eliminated(system)
-    start, end, force = slice(0, b), slice(b, 2 * b), slice(2 * b, None)
-    of_nodes = system.diagonal[..., ::2].transpose(2, 0, 1)
-    of_nodes = of_nodes.at[:-1].add(-coupled[:, start, start]).at[1:].add(-coupled[:, end, end])
+    middles, elements, negative = _eliminated(system)
     free = jnp.where(system.held, 0.0, 1.0).astype(dtype)
     identity = jnp.eye(3, dtype=dtype)
-    by_end = system.by_force[:, :, 2].transpose(2, 1, 0) - coupled[:, force, end]
-    of_force = -system.cell_compliance.transpose(2, 0, 1) - coupled[:, force, force]
+    start, end, gap = slice(0, b), slice(b, 2 * b), slice(2 * b, 2 * b + 3)  # of an element
     turn, pull, place = slice(0, b), slice(b, b + 3), slice(b + 3, None)  # of the unknowns of a node
     blocks = jnp.zeros((n + 1, b + 6, b + 6), dtype)
-    blocks = blocks.at[:, turn, turn].set(of_nodes)
-    blocks = blocks.at[1:, pull, turn].set(by_end).at[1:, turn, pull].set(by_end.transpose(0, 2, 1))
+    blocks = blocks.at[:, turn, turn].set(system.diagonal[..., ::2].transpose(2, 0, 1))
+    blocks = blocks.at[:-1, turn, turn].add(elements[:, start, start]).at[1:, turn, turn].add(elements[:, end, end])
+    blocks = blocks.at[1:, pull, turn].set(elements[:, gap, end]).at[1:, turn, pull].set(elements[:, end, gap])
     # The first node has no element before it.
-    blocks = blocks.at[1:, pull, pull].set(of_force).at[0, pull, pull].set(-identity)
+    blocks = blocks.at[1:, pull, pull].set(elements[:, gap, gap]).at[0, pull, pull].set(-identity)
     pushed = free[1:, None, None] * identity[None]
     blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
     blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
     below = jnp.zeros((n, b + 6, b + 6), dtype)
-    below = below.at[:, turn, turn].set(system.across.transpose(2, 0, 1) - coupled[:, end, start])
-    below = below.at[:, pull, turn].set(system.by_force[:, :, 0].transpose(2, 1, 0) - coupled[:, force, start])
+    below = below.at[:, turn, turn].set(elements[:, end, start]).at[:, pull, turn].set(elements[:, gap, start])
     below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])
+    above = below.transpose(0, 2, 1)
+    if system.loads is not None:
+        above = above.at[:, turn, turn].set(elements[:, start, end]).at[:, turn, pull].set(elements[:, start, gap])
+        before, after = elements[:, 2 * b + 3 : 2 * b + 6], elements[:, 2 * b + 6 :]
+        blocks = blocks.at[:-1, place, turn].add(before[..., start]).at[1:, place, turn].add(after[..., end])
+        blocks = blocks.at[1:, place, pull].add(after[..., gap])
+        below = below.at[:, place, turn].set(after[..., start])
+        above = above.at[:, place, turn].set(before[..., end]).at[:, place, pull].add(before[..., gap])
 
     # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
     stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
@@ -279,36 +325,73 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
         pivot = scale[:, None] * block * scale[None]
         return pivot, scale[:, None] * jnp.linalg.inv(pivot) * scale[None]
 
-    def eliminated(inverse: Array, given: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        block, below, scale = given
-        pivot, inverse = inverted(block - below @ inverse @ below.T, scale)
+    def eliminated(inverse: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        block, below, above, scale = given
+        pivot, inverse = inverted(block - below @ inverse @ above, scale)
         return inverse, (pivot, inverse)
 
     begin, first = inverted(blocks[0], scale[0])
-    _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, scale[1:]))
+    _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, above, scale[1:]))
     pivots, inverses = jnp.concatenate([begin[None], pivots]), jnp.concatenate([first[None], inverses])
-    # Each force is a multiplier, and so is that of the element before the first node.
-    signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
-    negative += jnp.sum(signs < 0) - 3 * (n + 1)
+    if system.loads is None:
+        # Each force is a multiplier, and so is that of the element before the first node.
+        signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
+        negative += jnp.sum(signs < 0) - 3 * (n + 1)
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    factors = ChainFactors(contacts, system, middles, inverses, below, blank, jnp.zeros((k, k), dtype), negative)
+    factors = ChainFactors(contacts, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative)
     if not k:
         return factors
     solution = factors._without_border(system.border, *nothing)
     matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, solution[0])
-    negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
+    if system.loads is None:
+        negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
     complement = jnp.linalg.inv(matrix)
-    return ChainFactors(contacts, system, middles, inverses, below, solution, complement, negative)
+    return ChainFactors(contacts, system, middles, inverses, below, above, solution, complement, negative)
 
 
-def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n d d"], Int[Array, ""]]:
-    """The middles eliminated, what that takes from start, end and force, and how many negative eigenvalues they had."""
-    before = system.lower[..., 0::2].transpose(2, 0, 1)
-    after = system.lower[..., 1::2].transpose(2, 1, 0)
-    coupling = jnp.concatenate([before, after, system.by_force[:, :, 1].transpose(2, 0, 1)], axis=2)
-    inverse, negative = inverse_of_blocks(system.diagonal[..., 1::2])
-    inverse = inverse.transpose(2, 0, 1)
-    solved = inverse @ coupling
-    return _Middles(solved, inverse), coupling.transpose(0, 2, 1) @ solved, negative
+def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:
+    """The middles eliminated; what then couples the rows of an element, of start, end and gap, and where loads have no
+    potential of both nodes, to its start, end and force; how many negative eigenvalues the middles had.
+    """
+    b, loads = len(system.diagonal), system.loads
+    start, middle, end = system.by_force.transpose(2, 3, 0, 1)
+    of_middle = jnp.concatenate(
+        [system.lower[..., 0::2].transpose(2, 0, 1), system.lower[..., 1::2].transpose(2, 1, 0), middle], axis=2
+    )
+    across = system.across.transpose(2, 0, 1)
+    none = jnp.zeros_like(across)
+    upper = jnp.concatenate([none, across.transpose(0, 2, 1), start], axis=2)
+    lower = jnp.concatenate([across, none, end], axis=2)
+    gaps = jnp.concatenate(
+        [start.transpose(0, 2, 1), end.transpose(0, 2, 1), -system.cell_compliance.transpose(2, 0, 1)], axis=2
+    )
+    direct = jnp.concatenate([upper, lower, gaps], axis=1)
+    if loads is None:
+        inverse, negative = inverse_of_blocks(system.diagonal[..., 1::2])
+        inverse = inverse.transpose(2, 0, 1)
+        solved = inverse @ of_middle
+        return _Middles(solved, inverse, None), direct - of_middle.transpose(0, 2, 1) @ solved, negative
+    of_points, of_ways = loads.rotation.transpose(4, 1, 0, 3, 2), loads.way.transpose(3, 0, 2, 1)
+    free = jnp.where(system.held, 0.0, 1.0).astype(none.dtype)
+    of_nodes = loads.balance.transpose(4, 0, 1, 3, 2) * jnp.stack([free[:-1], free[1:]], 1)[:, :, None, None, None]
+    of_nodes = of_nodes.reshape(-1, 6, 3, b)
+
+    def of_point(j: int) -> Float[Array, "n rows b"]:
+        """What the rows have of the loads by the rotation of a point."""
+        return jnp.concatenate([of_points[:, 0, :, j], of_points[:, 2, :, j], of_ways[:, :, j], of_nodes[:, :, j]], 1)
+
+    inverse = jnp.linalg.inv(system.diagonal[..., 1::2].transpose(2, 0, 1) + of_points[:, 1, :, 1])
+    columns = of_middle.at[..., :b].add(of_points[:, 1, :, 0]).at[..., b : 2 * b].add(of_points[:, 1, :, 2])
+    rows = of_point(1).at[:, : 2 * b + 3].add(of_middle.transpose(0, 2, 1))
+    direct = jnp.pad(direct, ((0, 0), (0, 6), (0, 0)))
+    direct = direct.at[..., :b].add(of_point(0)).at[..., b : 2 * b].add(of_point(2))
+    solved = inverse @ columns
+    return _Middles(solved, inverse, rows @ inverse), direct - rows @ solved, jnp.zeros((), int)
+
+
+def _on_nodes(before: Float[Array, "n *c"], after: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:
+    """What elements have for the nodes at their start and their end."""
+    none = jnp.zeros_like(before[:1])
+    return jnp.concatenate([before, none]) + jnp.concatenate([none, after])

@@ -13,8 +13,6 @@ the rod as their last axis, (b, b, n): all loops are then vector loops along the
 Reference: Heller, "Some aspects of the cyclic reduction algorithm for block tridiagonal linear systems" (1976).
 """
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -78,44 +76,6 @@ class SaddlePointSystem(eqx.Module):
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
 
 
-class DenseSystem(eqx.Module):
-    """The same as one full matrix without symmetry, where each place of the rod is coupled with all others."""
-
-    matrix: Float[Array, "bn+k bn+k"]
-    shape: tuple[int, int] = eqx.field(static=True)
-
-    def times(self, x: Float[Array, "b n"], y: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
-        return self._parted(self.matrix @ jnp.concatenate([x.reshape(-1), y]))
-
-    def _parted(self, all: Float[Array, "bn+k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
-        size = math.prod(self.shape)
-        return all[:size].reshape(self.shape), all[size:]
-
-    def shifted(self, shift: Float[Array, ""] | Float[Array, "n"]) -> "DenseSystem":
-        b, n = self.shape
-        by_rotation = jnp.broadcast_to(shift, (b, n)).reshape(-1)
-        k = len(self.matrix) - b * n
-        added = jnp.diag(jnp.concatenate([by_rotation, jnp.zeros(k, by_rotation.dtype)]))
-        return DenseSystem(self.matrix + added, self.shape)
-
-
-class DenseFactors(eqx.Module):
-    """The factorisation of a `DenseSystem`, which says nothing of minima."""
-
-    system: DenseSystem
-    lu: tuple[Array, Array]
-    negative: Int[Array, ""]
-
-    @property
-    def is_minimum(self) -> Bool[Array, ""]:
-        """Whether the factorisation has worked: there is no energy that could be minimal."""
-        return jnp.isfinite(jnp.sum(self.lu[0]))
-
-    def solve(self, f: Float[Array, "b n"], c: Float[Array, "k"]) -> tuple[Float[Array, "b n"], Float[Array, "k"]]:
-        right = jnp.concatenate([f.reshape(-1), c])
-        return self.system._parted(jax.scipy.linalg.lu_solve(self.lu, right))
-
-
 class Factors(eqx.Module):
     """The factorisation of a `SaddlePointSystem`.
 
@@ -144,12 +104,12 @@ class Factors(eqx.Module):
         return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
 
 
-AnyFactors = Factors | DenseFactors | ChainFactors
-AnySystem = SaddlePointSystem | DenseSystem | ChainSystem
+AnyFactors = Factors | ChainFactors
+AnySystem = SaddlePointSystem | ChainSystem
 
 
 def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
-    """Factorisation by cyclic reduction, O(n); of a full matrix by elimination, O(n^3).
+    """Factorisation, O(n): by cyclic reduction, of a chain from node to node.
 
     `is_regularized`: soft pivots of a `SaddlePointSystem` are made stiffer (see `blocks.inverse_of_blocks`), so that
     the inertia is right where the rod may turn as a whole; a critical motion would be lost with that. Other systems
@@ -157,8 +117,6 @@ def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
 
     Where the last block is singular there are infinities or NaN.
     """
-    if isinstance(system, DenseSystem):
-        return DenseFactors(system, jax.scipy.linalg.lu_factor(system.matrix), jnp.zeros((), int))
     if isinstance(system, ChainSystem):
         return factor_chain(system)
     return _factor(system, system.border, is_regularized)[0]
@@ -168,7 +126,7 @@ def factor_and_solve(
     system: AnySystem, f: Float[Array, "b n"], c: Float[Array, "k"], *, is_regularized: bool = False
 ) -> tuple["AnyFactors", Float[Array, "b n"], Float[Array, "k"]]:
     """Factorisation and the solution for one right side, in one sweep."""
-    if isinstance(system, DenseSystem | ChainSystem):
+    if isinstance(system, ChainSystem):
         factors = factor(system)
         return factors, *factors.solve(f, c)
     factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1), is_regularized)

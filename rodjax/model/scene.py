@@ -138,11 +138,6 @@ def _check_obstacles(scene: Scene) -> None:
         return
     if scene.rod.radius is None:
         raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
-    if not has_potential(scene):
-        raise ValueError(
-            "obstacles must be () under loads without a potential: a moment on a free end, couples along the rod, and "
-            "forces that follow it"
-        )
     if scene.rod.length.dtype != jnp.float64:
         raise ValueError(
             "obstacles must be () in single precision, in which contacts have no digits: "
@@ -330,7 +325,15 @@ def needs_frames(scene: Scene) -> bool:
     """Whether the rod, its loads or clips ask for the angle of the sections about the tangent, all along the rod."""
     holds_frames = any(clip.frame is not None for clip in scene.clips)
     follows = _follows(scene.start) or _follows(scene.end)
-    return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames
+    twists = bool(scene.obstacles) and dead_end_moment(scene) is not None
+    return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames or twists
+
+
+def has_node_places(scene: Scene) -> bool:
+    """Whether forces along the rod depend on where it is or how it turns, so that the positions of the nodes, and a
+    force in each element, are unknowns: beside obstacles, and of rods by frames under loads without a potential.
+    """
+    return bool(scene.obstacles) or (needs_frames(scene) and not has_potential(scene))
 
 
 def _follows(end: Support) -> bool:

@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, whole_number
 from rodjax.discretization.form import Form, Linearization, Point
-from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_curve import FramedCurve
+from rodjax.discretization.framed_curve import FramedCurve, cells_of
 from rodjax.discretization.motion import Motion
-from rodjax.linalg.saddle_point import DenseSystem
+from rodjax.discretization.touching_forms import TouchingFrames
+from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
 from rodjax.model.scene import nondimensional, slides
 from rodjax.programs.answers import one_answer
@@ -86,25 +86,28 @@ def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
 @compiled
 def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float[Array, "n"]]:
     """The displacements of the nodes under forces on them, nondimensional, and the mass that each node stands for."""
-    form, point = form_and_point(equilibrium)
-    assert isinstance(form, FrameForm)
-    here = form.with_all(point)
+    scene, state = nondimensional(equilibrium.scene)[0], equilibrium.state
+    assert isinstance(state.shape, FramedCurve)
+    # Forces on nodes are right sides where these have places of their own.
+    form = TouchingFrames.of(scene, cells_of(scene, state.shape))
+    point = form.begun(state.point(equilibrium.total_twist), state.shape.nodes, state.pressures)
+    here = form.linearized(point)
     # A rod that can spin, or turn as a whole, is held softly.
-    system = form.regular(here.system)
-    assert isinstance(system, DenseSystem)
-    bases, free = here.bases, here.gradient  # of the shape of the rotations
+    factors = factor(form.regular(here.system))
+    count = 3 * len(form.field.s)
+    before = len(here.closure) - form.layout.size - count
 
-    def nodes(rotation: Float[Array, "3 m"], closure: Float[Array, "c"]) -> Float[Array, "3n"]:
-        moved = form.moved(point, bases, rotation * form.is_free, form.layout.forces(closure))
-        return form.nodes(form.edges(moved)).reshape(-1)
+    def moved(force: Float[Array, "3n"]) -> Float[Array, "3n"]:
+        given = jnp.zeros_like(here.closure).at[before : before + count].set(force)
+        _, multipliers = factors.solve(jnp.zeros_like(here.gradient), given)
+        return form.others(multipliers).displacements.reshape(-1)
 
-    by_rotation, by_force = jax.jacfwd(nodes, argnums=(0, 1))(jnp.zeros_like(free), jnp.zeros_like(here.closure))
-    by_all = jnp.concatenate([by_rotation.reshape(len(by_rotation), -1), by_force], axis=1)
-    forces = by_all.at[:, free.size :].set(0.0)
+    is_free = jnp.repeat(~form.is_held, 3)
+    forces = jnp.eye(count, dtype=here.closure.dtype) * is_free[None]
     s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
     mass = form.scene.rod.mass_per_length
-    before = mass.integral(s) if isinstance(mass, Along) else s
-    return by_all @ jnp.linalg.solve(system.matrix, forces.T), jnp.diff(before)
+    masses = mass.integral(s) if isinstance(mass, Along) else s
+    return jax.vmap(moved)(forces).T * is_free[:, None], jnp.diff(masses)
 
 
 @over_leading_axes

@@ -34,6 +34,8 @@ from rodjax.model.plane import check_planar, is_planar, plane
 from rodjax.model.scene import (
     Scene,
     dead_end_moment,
+    has_node_places,
+    has_potential,
     needs_frames,
     nondimensional,
     slid,
@@ -279,7 +281,7 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
     else:
         shape = Polyline.through(shape.points(options.segments))
     end_force = state.end_force
-    if coarse.scene.obstacles:
+    if has_node_places(coarse.scene):
         assert isinstance(state.shape, Curve | FramedCurve)
         assert isinstance(shape, Curve | FramedCurve)
         end_force = _of_elements(end_force, state.shape.s, shape.s)
@@ -369,6 +371,11 @@ def checked_options(
             )
         if isinstance(solver, NonlinearCG):
             raise ValueError("solver must be a Newton for a scene with clips")
+    if of_frames and not has_potential(scene) and discretization == "finite_difference":
+        raise ValueError(
+            "discretization must be 'hermite' under couples along the rod, forces that follow it, and moments on a rod "
+            "that needs frames"
+        )
     if scene.obstacles and discretization == "finite_difference":
         raise ValueError("discretization must be 'hermite' for a scene with obstacles")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
@@ -650,7 +657,7 @@ class Search(eqx.Module):
             status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
-        pressures = None if point.touching is None else point.touching.pressures
+        pressures = point.touching.pressures if self.form.scene.obstacles else None
         state = SolverState(shape, point.end_force, self.units, places, pressures=pressures)
         return Found(state, point, outcome, stable)
 
@@ -660,7 +667,7 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, first, options)
         found = search.found(find_equilibrium(search.form, search.point, solver, options.find))
-        return _on_one_side(search, found, guess) if isinstance(search.form, TouchingForm) else found
+        return _on_one_side(search, found, guess) if scene.obstacles else found
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, first)
     minimum = minimize(problem, start, solver)

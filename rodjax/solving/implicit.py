@@ -72,7 +72,8 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        pressures = None if point.touching is None else point.touching.pressures
+        touching = point.touching if scene.obstacles else None
+        pressures = None if touching is None else touching.pressures
         state = SolverState(shape, point.end_force, units, places, before=before, pressures=pressures)
         found = Found(state, point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)

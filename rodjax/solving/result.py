@@ -45,7 +45,7 @@ from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.passage import Before, Passage, passage
 from rodjax.model.obstacles import InUnits
-from rodjax.model.scene import Scene, has_potential, nondimensional, slid, slides
+from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional, slid, slides
 from rodjax.programs.compilation import compiled
 from rodjax.solving.sliding import slide
 from rodjax.solving.stability import examined
@@ -83,8 +83,8 @@ class SolverState(eqx.Module):
 
     `shape`: a `Polyline` by finite differences, a `Curve` by Hermite elements, a `FramedCurve` by either where frames
     are unknown; `end_force`: the forces of the layout (`discretization.layout`): the force at s = L as each span sees
-    it, with the forces of the clips beyond, zero where that ends freely; with obstacles as each segment sees it, with
-    those of clips and contacts;
+    it, with the forces of the clips beyond, zero where that ends freely; with obstacles, or loads
+    without a potential, as each segment sees it, with those of clips and contacts;
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it;
@@ -186,7 +186,7 @@ class Equilibrium(eqx.Module):
     def clip_forces(self) -> Float[Array, "... clips 3"]:
         if not self.scene.clips:
             return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
-        if self.scene.obstacles:
+        if has_node_places(self.scene):
             return _node_forces(self)[0]
         seen = self.state.end_force * self.state.units.force[..., None, None]
         return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
@@ -377,7 +377,7 @@ def _errors_of(equilibrium: Equilibrium, axis: Float[Array, "3"]) -> Errors:
     else:
         assert isinstance(form, MixedForm)
         errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T, axis)
-    if isinstance(form, TouchingForm):
+    if isinstance(form, TouchingForm) and form.scene.obstacles:
         errors = with_contacts(errors, form, point)
     if errors.axial is None:
         return errors
@@ -435,11 +435,10 @@ def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
 
 @over_leading_axes
 def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Float[Array, "n+1 3"]]:
-    """What clips and what obstacles apply to the rod, of a scene with obstacles."""
-    form, _ = form_and_point(equilibrium)
+    """What clips and what obstacles apply to the rod, of a scene whose nodes have places of their own."""
+    form, point = form_and_point(equilibrium)
     assert isinstance(form, TouchingForm)
-    state = equilibrium.state
-    forces = form.at_nodes(state.end_force).T * state.units.force
+    forces = form.applied(point).T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 

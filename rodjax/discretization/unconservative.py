@@ -1,0 +1,93 @@
+"""Loads without a potential: couples, forces that follow the rod, and dead moments on a free end.
+
+Of each element they are a function of its frames alone, where the rod has a force of its own in each: what follower
+forces exert within it, from a point to its end; the force of all of it, which stands in the balance of the node where
+it begins; couples on its frames. Their virtual work enters the gradient.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.discretization.cells import ElementCells
+from rodjax.discretization.hermite import SIMPSON
+from rodjax.geometry.rotations import inverse, rotated
+from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.scene import Scene
+from rodjax.model.supports import Free
+
+
+def following(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "3 3 n"] | None:
+    """What the follower forces along the rod exert on each strain point from there to the end of its element, by
+    parabolas through the three points; `None` without such.
+    """
+    force = _follower_force(scene, quaternions)
+    if force is None:
+        return None
+    a, b, c = (force[:, k] for k in range(3))
+    whole = _whole(field, force)
+    second_half = field.h[None] * (-a + 8 * b + 5 * c) / 24
+    return jnp.stack([whole, second_half, jnp.zeros_like(whole)], axis=1)
+
+
+def on_nodes(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "2 3 n"]:
+    """What follower forces are for the balance of the nodes at both ends of each element."""
+    force = _follower_force(scene, quaternions)
+    loads = jnp.zeros((2, *quaternions[1:, 0].shape), quaternions.dtype)
+    if force is not None:
+        loads = loads.at[0].set(_whole(field, force))
+    for end, k in ((scene.start, 0), (scene.end, -1)):
+        if isinstance(end, Free) and end.follower and end.force is not None:
+            loads = loads.at[k, :, k].add(rotated(quaternions[:, k, k], end.force))
+    return loads
+
+
+def _follower_force(scene: Scene, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "3 3 n"] | None:
+    """Per length, global axes."""
+    parts = [
+        rotated(quaternions, jnp.broadcast_to(load.force[:, None, None], quaternions[1:].shape))
+        for load in scene.distributed
+        if isinstance(load, DistributedForce) and load.follower
+    ]
+    return functools.reduce(jnp.add, parts) if parts else None
+
+
+def _whole(field: ElementCells, force: Float[Array, "3 3 n"]) -> Float[Array, "3 n"]:
+    return field.h[None] * (SIMPSON[0] * (force[:, 0] + force[:, 2]) + SIMPSON[1] * force[:, 1])
+
+
+def couples_along(
+    scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]
+) -> Float[Array, "3 3 n"] | None:
+    """The couples along the rod on the strain points, in the axes of the frames; `None` where there are none."""
+    parts = []
+    for load in scene.distributed:
+        if isinstance(load, DistributedCouple):
+            couple = jnp.broadcast_to(load.couple[:, None, None], quaternions[1:].shape)
+            parts.append(field.lengths[None] * (couple if load.follower else rotated(inverse(quaternions), couple)))
+    return functools.reduce(jnp.add, parts) if parts else None
+
+
+def couples(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "3 3 n"]:
+    """The same, with those on free ends."""
+    along = couples_along(scene, field, quaternions)
+    total = jnp.zeros_like(quaternions[1:]) if along is None else along
+    for end, k in ((scene.start, 0), (scene.end, -1)):
+        if isinstance(end, Free) and end.moment is not None:
+            moment = end.moment if end.follower else rotated(inverse(quaternions[:, k, k]), end.moment)
+            total = total.at[:, k, k].add(moment)
+    return total
+
+
+def turned_rows(function: Any, directions: Float[Array, "b 3 3 3 n"]) -> Any:
+    """The derivatives of a function of rotations of the frames of elements, by rotations along b axes of each of the
+    three: as its results, with two leading axes.
+    """
+    b, points = directions.shape[:2]
+    zero = jnp.zeros_like(directions[0, 0])
+    flat = directions.reshape(b * points, *zero.shape)
+    rows = jax.vmap(lambda direction: jax.jvp(function, (zero,), (direction,))[1])(flat)
+    return jax.tree.map(lambda rows: rows.reshape(b, points, *rows.shape[1:]), rows)

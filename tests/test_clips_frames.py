@@ -421,20 +421,40 @@ def test_loads_without_a_potential_are_carried():
     assert np.log2(errors[0] / errors[1]) > 3.3
 
 
-def test_full_and_banded_derivatives_are_the_same(resting):
-    """The system of Newton's method by cells, and by one derivative of all that is out of balance."""
+def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
+    """Of spans, and of elements under loads without a potential of every kind, at both ends too."""
     from rodjax.solving.result import form_and_point
 
-    form, point = form_and_point(resting)
-    generator = np.random.default_rng(0)
-    x = jnp.asarray(generator.normal(size=form.is_free.shape)) * form.is_free
-    y = jnp.asarray(generator.normal(size=12))
-    banded, full = (
-        jax.jit(lambda form, point, x, y, of=of: of(form, point).system.times(x, y))(form, point, x, y)
-        for of in (type(form).linearized, type(form).with_all)
-    )
-    for a, b in zip(banded, full, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-9 * float(np.max(np.abs(b))))  # at an equilibrium: the solver's 1e-12
+    rod = Rod(1.0, (1.0, 1.5), 0.7, 1e4)
+    loads = [
+        *(rj.DistributedForce((0.5, 4.0, 3.0), follower=follows) for follows in (False, True)),
+        *(rj.DistributedCouple((0.3, 0.2, 0.5), follower=follows) for follows in (False, True)),
+    ]
+    ends = Free((1.0, 0.5, 2.0), (0.3, -0.2, 0.4), follower=True), Free((-1.0, 0.5, 2.0), (0.3, 0.6, 0.4))
+    held = Clip(0.4, ORIGIN, frame=LEVEL)
+    pushed = rj.solve(Scene(rod, *ends, distributed=loads, clips=[held]), segments=6, solver=TIGHT)
+    assert pushed.converged
+    for result in (resting, pushed):
+        form, point = form_and_point(result)
+        here = form.linearized(point)
+        generator = np.random.default_rng(0)
+        x = jnp.asarray(generator.normal(size=form.is_free.shape)) * form.is_free
+        y = jnp.asarray(generator.normal(size=here.closure.shape))
+
+        def moved(part, form=form, point=point, here=here, x=x, y=y):
+            change = form.layout.forces(form.closure(y))
+            others = jax.tree.map(lambda change: part * change, form.others(y))
+            return form.unbalanced(form.moved(point, here.bases, part * x, part * change, others))
+
+        _, expected = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
+        found = here.system.times(x, y)
+        # What of a held node is given is not out of balance.
+        rows = np.ones(len(y), bool)
+        if result is pushed:
+            node, count = 3 * int(form.clip_nodes[0]), 3 * len(form.field.s)
+            rows[-form.layout.size - count :][node : node + 3] = False
+        for a, b in ((found[0], expected[0]), (found[1][rows], expected[1][rows])):
+            np.testing.assert_allclose(a, b, atol=1e-9 * float(np.max(np.abs(b))))  # the solver's 1e-12
 
 
 @pytest.mark.slow

@@ -74,10 +74,6 @@ PHYSICS = {
     "planar must be False for a moment on a free end": "it twists the rod as it leaves the plane, and has no potential",
     "planar must be False for a rod that is twisted at rest": "bending turns it out of the plane",
 }
-# What is refused as it is not built yet.
-NOT_YET = [
-    "obstacles must be () under loads without a potential",
-]
 
 
 def scene_of(names: dict[str, str]) -> Scene | None:
@@ -113,15 +109,13 @@ def refused(names: dict[str, str]) -> str | None:
 
 
 def test_what_is_refused_is_listed():
-    """Of all pairs of features; the counts are to fall."""
+    """Of all pairs of features."""
     messages = [message for message in map(refused, pairs()) if message is not None]
-    reasons = [*PHYSICS, *NOT_YET]
     for message in messages:
-        assert any(reason in message for reason in reasons), message
-    for reason in reasons:
+        assert any(reason in message for reason in PHYSICS), message
+    for reason in PHYSICS:
         assert any(reason in message for message in messages), reason
-    of_physics = sum(any(reason in message for reason in PHYSICS) for message in messages)
-    assert (len(pairs()), len(messages), of_physics) == (224, 6, 2)
+    assert (len(pairs()), len(messages)) == (224, 2)
 
 
 def solved(names: dict[str, str]) -> rj.Equilibrium:
@@ -148,12 +142,20 @@ TOGETHER = [
     {"ends": "pins", "clip": "position", "obstacle": "floor"},
     {"rod": "flat", "ends": "free and clamp", "clip": "sliding"},
     {"rod": "curved", "clip": "frame", "obstacle": "floor"},
+    {"load": "follower force along", "clip": "sliding", "obstacle": "floor"},
+    {"ends": "pins", "clip": "sliding tangent"},
+    {"ends": "clamp and free", "load": "end moment", "obstacle": "floor"},
 ]
 
 
 @pytest.mark.parametrize("names", TOGETHER, ids=lambda names: ", ".join(names.values()))
 def test_features_compose(names):
     solved(names)
+
+
+# Sections that spin between pins without a change of the energy to second order, or under a load that goes with them: no
+# derivative is a number there.
+CRITICAL = [{"rod": "law", "ends": "pins"}, {"ends": "pins", "load": "follower force along"}]
 
 
 @pytest.mark.slow
@@ -173,4 +175,4 @@ def test_every_pair_solves_and_has_derivatives(names):
         result = rj.solve(scaled, segments=SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
         return jnp.sum(result.nodes**2)
 
-    assert np.isfinite(jax.jvp(tip, (jnp.array(1.0),), (jnp.array(1.0),))[1])
+    assert np.isfinite(jax.jvp(tip, (jnp.array(1.0),), (jnp.array(1.0),))[1]) == (names not in CRITICAL)

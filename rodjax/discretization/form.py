@@ -88,6 +88,10 @@ class Form(eqx.Module):
     def turn(self, point: Any, bases: Float[Array, "3 b m"], axis: Float[Array, "3"]) -> Float[Array, "b m"]:
         """The rotations that turn the whole rod about an axis."""
 
+    def spin(self, bases: Float[Array, "3 b m"]) -> Float[Array, "b m"] | None:
+        """The rotations that spin all sections about their tangents; `None` where that is no unknown."""
+        return None
+
     @abstractmethod
     def holding(self, point: Any) -> Any:
         """The point with what the supports hold."""
@@ -145,6 +149,12 @@ class Form(eqx.Module):
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
         """What a step from a point brings down, where it leads to."""
         return here.energy
+
+    def half_square(self, here: Linearization) -> Float[Array, ""]:
+        """Half of the square of what is out of balance, the closure apart: what a step brings down where no energy is
+        to become least.
+        """
+        return jnp.sum(here.gradient**2 / self.field.weights[None]) / 2
 
     def sought(
         self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]

@@ -198,6 +198,9 @@ class FrameForm(Form):
     def turn(self, point: FramePoint, bases: Float[Array, "3 3 m"], axis: Float[Array, "3"]) -> Float[Array, "3 m"]:
         return components(bases, jnp.broadcast_to(axis[:, None], point.tangents.shape))
 
+    def spin(self, bases: Float[Array, "3 3 m"]) -> Float[Array, "3 m"]:
+        return jnp.zeros_like(bases[0]).at[2].set(1.0) * self.is_free
+
     def holding(self, point: FramePoint) -> FramePoint:
         """The point with the frames and tangents that supports hold."""
         q = point.quaternions

@@ -1,4 +1,4 @@
-"""Changes of an equilibrium, and the turn of a rod that needs no force."""
+"""Changes of an equilibrium, and the motions of a rod that need no force."""
 
 import equinox as eqx
 import jax
@@ -19,6 +19,34 @@ class Motion(eqx.Module):
         squared = jnp.sum(other.rotation**2)
         share = jnp.sum(other.rotation * self.rotation) / jnp.where(squared > 0, squared, 1.0)
         return Motion(self.rotation - share * other.rotation, self.multipliers - share * other.multipliers)
+
+
+class Neutral(eqx.Module):
+    """The motions that leave an equilibrium one: the turn of the whole rod about an axis, and the spin of all sections
+    about their tangents, at right angles to it; no motion, where there is none. `spin`: `None` where it is no unknown.
+    """
+
+    turn: Motion
+    spin: Motion | None
+
+    def taken_from(self, motion: Motion) -> Motion:
+        motion = motion.without(self.turn)
+        return motion if self.spin is None else motion.without(self.spin)
+
+
+def neutral_motions(form: Form, point: Point, here: Linearization) -> Neutral:
+    """Without a potential no turn is looked for: the system has no symmetry, and its transpose another one."""
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+    turn = neutral_turn(form, point, here) if form.has_potential else nothing
+    rotation = form.spin(here.bases)
+    if rotation is None:
+        return Neutral(turn, None)
+    # A section that is round spins between pins and swivels without a force.
+    moments, gaps = here.system.times(rotation, nothing.multipliers)
+    least = NEUTRAL / point.tangents.shape[1]
+    is_neutral = (jnp.max(jnp.abs(moments)) <= least) & jnp.all(jnp.abs(gaps) <= least)
+    spin = Motion(jnp.where(is_neutral, rotation, 0.0), nothing.multipliers)
+    return Neutral(turn, spin.without(turn))
 
 
 def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:

@@ -259,6 +259,11 @@ class TouchingForm(Form):
         pressures = point.touching.pressures - (here.gaps + point.touching.relaxed[:, None]) / softness
         return here.energy + softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
 
+    def half_square(self, here: Linearization) -> Float[Array, ""]:
+        assert isinstance(here.system, ChainSystem)
+        _, _, balance, _ = here.system.parted(here.closure)
+        return super().half_square(here) + jnp.sum(balance**2 / self.field.weights[::2, None]) / 2
+
     def sought(
         self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:

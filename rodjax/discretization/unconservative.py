@@ -8,6 +8,7 @@ it begins; couples on its frames. Their virtual work enters the gradient.
 import functools
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,7 +18,7 @@ from rodjax.discretization.hermite import SIMPSON
 from rodjax.geometry.rotations import inverse, rotated
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Free
+from rodjax.model.supports import Free, Support
 
 
 def following(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "3 3 n"] | None:
@@ -91,3 +92,37 @@ def turned_rows(function: Any, directions: Float[Array, "b 3 3 3 n"]) -> Any:
     flat = directions.reshape(b * points, *zero.shape)
     rows = jax.vmap(lambda direction: jax.jvp(function, (zero,), (direction,))[1])(flat)
     return jax.tree.map(lambda rows: rows.reshape(b, points, *rows.shape[1:]), rows)
+
+
+def without(scene: Scene) -> Scene:
+    """The scene without these loads."""
+    dead = [load for load in scene.distributed if not _is_unconservative(load)]
+
+    def calm(end: Support) -> Support:
+        return Free(None if end.follower else end.force) if isinstance(end, Free) else end
+
+    ends = calm(scene.start), calm(scene.end)
+    return eqx.tree_at(lambda scene: (scene.distributed, scene.start, scene.end), scene, (tuple(dead), *ends))
+
+
+def scaled(scene: Scene, part: Float[Array, ""]) -> Scene:
+    """The scene with a part of these loads."""
+
+    def of(load: Any) -> Any:
+        return jax.tree.map(lambda leaf: part * leaf, load) if _is_unconservative(load) else load
+
+    def at(end: Support) -> Support:
+        if not isinstance(end, Free):
+            return end
+        moment = None if end.moment is None else part * end.moment
+        force = part * end.force if end.follower and end.force is not None else end.force
+        return Free(force, moment, end.follower)
+
+    loads = tuple(of(load) for load in scene.distributed)
+    return eqx.tree_at(
+        lambda scene: (scene.distributed, scene.start, scene.end), scene, (loads, at(scene.start), at(scene.end))
+    )
+
+
+def _is_unconservative(load: Any) -> bool:
+    return isinstance(load, DistributedCouple) or load.follower

@@ -29,6 +29,7 @@ from rodjax.discretization.hermite import Curve
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.scene import has_node_places
 from rodjax.model.supports import Clamp, Free, Pin, Swivel
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.solving.result import Equilibrium
@@ -231,6 +232,12 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
     forces = equilibrium.state.end_force
     if forces.ndim == equilibrium.s.ndim:  # of a rod without clips, until format 8: of its one span
         equilibrium = eqx.tree_at(lambda result: result.state.end_force, equilibrium, forces[..., None])
+    shape = equilibrium.state.shape
+    if isinstance(shape, FramedCurve) and shape.is_of_joints and has_node_places(equilibrium.scene):
+        raise ValueError(
+            f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
+            "rodjax has no longer: solve its scene again"
+        )
     return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
 
 

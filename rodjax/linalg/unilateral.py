@@ -7,9 +7,9 @@ With u the motion of the nodes, a contact of the pressure p0 and the gap g has i
 and the energy softness p(u)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
 Each step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate.
 The first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model
-itself, so that the method cannot cycle. It ends where a whole step closes and opens no contact. Where many contacts
-close or open, it would advance by one or two at a time: then much softer contacts are sought first, and from these
-harder ones.
+itself, so that the method cannot cycle; under loads without a potential, where the model has no value, all are whole.
+It ends where a whole step closes and opens no contact. Where many contacts close or open, it would advance by one or
+two at a time: then much softer contacts are sought first, and from these harder ones.
 """
 
 import equinox as eqx
@@ -89,7 +89,8 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     def improved(state: _State) -> _State:
         softness = state.softness
         is_minimum, x, y = solved(state.is_closed, softness)
-        is_early = state.since < WHOLE_STEPS
+        # Without symmetry there is no model that could be least.
+        is_early = (state.since < WHOLE_STEPS) | (system.loads is not None)
         dx, dy = x - state.x, y - state.y
         _, _, du, _ = open_system.parted(dy)
         # The model along the way from the last iterate to this one: the rows of border and elements hold at both.

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
-from rodjax.model.scene import Scene, slides
+from rodjax.model.scene import Scene, has_node_places, slides
 from rodjax.paths.path import path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -252,7 +252,7 @@ def _solve_here(
         return equilibrium(scene, found, jnp.ones((), int), strain_limit)
 
     starts = jax.vmap(state, in_axes)(scenes, guess)
-    if not isinstance(options.solver, Newton) or slides(scenes) or scenes.obstacles:
+    if not isinstance(options.solver, Newton) or slides(scenes) or has_node_places(scenes):
         return jax.vmap(lambda scene, start: result(scene, solve_from(scene, start[0], start[1], options)))(
             scenes, starts
         )

@@ -47,6 +47,7 @@ from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import differentiable, not_differentiated
+from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solving.nonlinear_cg import NonlinearCG, minimize
 from rodjax.solving.ranges import check_ranges, with_ranges
@@ -666,7 +667,12 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     solver = options.solver
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, first, options)
-        found = search.found(find_equilibrium(search.form, search.point, solver, options.find))
+        if has_node_places(scene) and not has_potential(scene):
+            is_cold = jnp.all(guess.end_force == 0)
+            end = found_under_loads(search.form, search.point, solver, options.find, is_cold)
+        else:
+            end = find_equilibrium(search.form, search.point, solver, options.find)
+        found = search.found(end)
         return _on_one_side(search, found, guess) if scene.obstacles else found
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, first)

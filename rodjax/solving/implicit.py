@@ -138,7 +138,7 @@ def _response(scene: Scene, shape: Shape, point: Point, result: Equilibrium) -> 
         # A factor, as a choice between numbers would leave the transpose without the one that is none.
         sign = jnp.where(result.converged & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
         f, c = sign * f, sign * c
-        motion = Motion(*factors.solve(f, c)).without(neutral)
+        motion = neutral.taken_from(Motion(*factors.solve(f, c)))
         nothing = jax.tree.map(jnp.zeros_like, motion)
         _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
         return changes

@@ -140,7 +140,7 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
     linearization = form.linearized(trial)
     closure = form.closure(linearization.closure)
-    objective = form.objective(linearization, state.point) if descends else _half_square(form, linearization)
+    objective = form.objective(linearization, state.point) if descends else form.half_square(linearization)
     merit = objective + state.weight / 2 * jnp.sum(closure**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
@@ -158,10 +158,6 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
 def _descends(form: Form, find: Find) -> bool:
     """Whether steps are judged by the energy; else by the square of what is out of balance, which a step makes less."""
     return form.has_potential and find == "minimum"
-
-
-def _half_square(form: Form, here: Linearization) -> Float[Array, ""]:
-    return jnp.sum(here.gradient**2 / form.field.weights[None]) / 2
 
 
 def _advanced(
@@ -219,7 +215,7 @@ def _advanced(
     else:
         closure = form.closure(here.closure)
         closure_rate = -closure
-        objective = _half_square(form, here)
+        objective = form.half_square(here)
         along = -2 * objective
     falls = -jnp.sum(closure * closure_rate)
     weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(falls > 0, falls, jnp.inf))

@@ -409,14 +409,14 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
         return nothing
     form, point = form_and_point(equilibrium)
     here = form.linearized(point)
-    _, critical, turn = examined(form, point, here, equilibrium.residual)
+    _, critical, neutral = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
     negative = factor(form.regular(here.system), is_regularized=True).negative
     if slides(equilibrium.scene):
         stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
         negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
-    return _Examination(critical, negative, jnp.any(turn.rotation != 0))
+    return _Examination(critical, negative, jnp.any(neutral.turn.rotation != 0))
 
 
 def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:

@@ -27,6 +27,9 @@ from rodjax.solving.status import Status, is_converged
 # found to a tenth of that.
 AXIAL_TOLERANCE = 0.1
 INNER_TOLERANCE = 0.01
+# Where an axial force changes so steeply that this way [L] through the clip makes more of it, it is none below that: the
+# inner equilibria close to about as much. So does a rod that is nearly taut between its supports.
+PLACE_TOLERANCE = 1e-12
 # The most of the way to the next support that a step takes a clip along the rod.
 LARGEST_STEP = 0.3
 MAX_STEPS = 60
@@ -76,6 +79,7 @@ def slid_free(
         step = _step(here, now, find)
         floor = form.rounding_floor(found.point)
         least = jnp.maximum(AXIAL_TOLERANCE * tolerance, floor)
+        least = jnp.maximum(least, PLACE_TOLERANCE * jnp.max(jnp.abs(now.rates)))
         reached = jnp.where(found.outcome.residual <= tolerance, Status.CONVERGED, found.outcome.status)
         status = jnp.where(is_accepted & (largest <= least), reached, Status.RUNNING)
         status = jnp.where(is_first & ~is_converged(found.outcome.status), found.outcome.status, status)

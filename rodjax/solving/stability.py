@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.joints import generic_field
-from rodjax.discretization.motion import Motion, neutral_turn
+from rodjax.discretization.motion import Motion, Neutral, neutral_motions
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import AnyFactors, factor, factor_and_solve
@@ -47,10 +47,10 @@ def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None =
 
 def examined(
     form: Form, point: Point, here: Linearization, residual: Float[Array, ""]
-) -> tuple[AnyFactors, Bool[Array, ""], Motion]:
-    """The factors at an equilibrium, whether it is critical, and its neutral turn, or no motion where it has none.
+) -> tuple[AnyFactors, Bool[Array, ""], Neutral]:
+    """The factors at an equilibrium, whether it is critical, and its neutral motions.
 
-    Critical: a motion other than the neutral one has no stiffness left, as far as the residual allows to tell.
+    Critical: a motion other than the neutral ones has no stiffness left, as far as the residual allows to tell.
     """
     places = point.tangents.shape[1]
     # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
@@ -73,16 +73,16 @@ def examined(
     def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
         return (stiffness**2 <= least) | ~jnp.isfinite(stiffness)
 
-    def closer(fixed: tuple[Form, Point, Linearization, AnyFactors]) -> tuple[Bool[Array, ""], Motion]:
+    def closer(fixed: tuple[Form, Point, Linearization, AnyFactors]) -> tuple[Bool[Array, ""], Neutral]:
         form, point, here, factors = fixed
-        # Under a dead moment, without symmetry of the system, no turn is looked for.
-        neutral = neutral_turn(form, point, here) if form.has_potential else nothing
-        other = Motion(generic, nothing.multipliers).without(neutral).rotation
-        softest = Motion(*factors.solve(other / places, nothing.multipliers)).without(neutral)
+        neutral = neutral_motions(form, point, here)
+        other = neutral.taken_from(Motion(generic, nothing.multipliers)).rotation
+        softest = neutral.taken_from(Motion(*factors.solve(other / places, nothing.multipliers)))
         return is_soft(_stiffness(other, softest.rotation)) & ~is_lost, neutral
 
     fixed = (form, point, here, jax.lax.stop_gradient(factors))
-    critical, neutral = jax.lax.cond(is_soft(stiffness) | is_lost, closer, lambda _: (jnp.array(False), nothing), fixed)
+    none = Neutral(nothing, None if form.spin(here.bases) is None else nothing)
+    critical, neutral = jax.lax.cond(is_soft(stiffness) | is_lost, closer, lambda _: (jnp.array(False), none), fixed)
     return factors, critical, neutral
 
 

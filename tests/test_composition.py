@@ -153,8 +153,8 @@ def test_features_compose(names):
     solved(names)
 
 
-# Sections that spin between pins without a change of the energy to second order, or under a load that goes with them: no
-# derivative is a number there.
+# Sections that spin between pins without a change of the energy to second order, or under a load that goes with them:
+# no derivative is a number there.
 CRITICAL = [{"rod": "law", "ends": "pins"}, {"ends": "pins", "load": "follower force along"}]
 
 

@@ -96,7 +96,7 @@ def test_a_cable_lifted_by_a_moment_is_the_heavy_elastica(follower):
     free = Free(moment=(0, -0.03, 0), follower=follower)
     result = rj.solve(Scene(cable(), Clamp((0, 0, RADIUS), LEVEL), free, GRAVITY, obstacles=[FLOOR]), segments=64)
     assert result.converged
-    # As a cable that is lifted by a force: a contact at a node may be half an element, 4 % of this length, off its place.
+    # A contact at a node may be half an element off its place, 4 % of this length.
     assert 1.0 - lift_off(result, 0.0) == pytest.approx(length, rel=1e-3)
     assert float(result.nodes[-1, 2]) - RADIUS == pytest.approx(end[2], rel=0.01)
     np.testing.assert_allclose(jnp.sum(result.contact_forces, axis=0) - result.start_force, [0, 0, 1.5], atol=1e-9)

@@ -11,7 +11,7 @@ import pytest
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
-from rodjax.discretization.touching_point import TouchingChange
+from rodjax.discretization.nodal_point import NodalChange
 from rodjax.solving.result import form_and_point
 
 AXIS = jnp.array([1.0, 0.0, 0.0])
@@ -106,7 +106,7 @@ def test_the_slope_of_a_step_in_contact_is_that_of_its_objective(EI):
         bases, here = form.bases_at(point), form.linearized(point)
         is_free = jnp.sum(bases**2, axis=0)  # by rotations that no support holds
         rotation = is_free * numbers[: is_free.size].reshape(is_free.shape)
-        step = TouchingChange(displacements, jnp.zeros_like(point.touching.pressures))
+        step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
         _, _, _, more = form.under_force(point, here, rotation, change, step)
 
         def objective(part):

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.error import Errors
 from rodjax.discretization.form_results import positions_between_nodes
-from rodjax.discretization.touching import TouchingForm
+from rodjax.discretization.nodal import NodalForm
 from rodjax.geometry.vectors import dot, root
 
 # A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
@@ -18,7 +18,7 @@ CONTACT_MOMENT = 8.0
 DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
-def with_contacts(errors: Errors, form: TouchingForm, point: Any) -> Errors:
+def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
     """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node.
 
     And how deep the rod lies between the nodes.
@@ -38,11 +38,11 @@ def with_contacts(errors: Errors, form: TouchingForm, point: Any) -> Errors:
     return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
 
 
-def depths_of_elements(form: TouchingForm, point: Any) -> Float[Array, "n"]:
+def depths_of_elements(form: NodalForm, point: Any) -> Float[Array, "n"]:
     """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
     beside a held place so much more than it is held there.
     """
-    s, nodes = form.field.s, point.touching.places
+    s, nodes = form.field.s, point.nodal.places
     at_nodes = form.depths_at(nodes, form.radius)
     held = jnp.where(form.is_held, at_nodes, 0.0)
     parts = jnp.array(DEPTH_PLACES, s.dtype)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
-from rodjax.discretization.touching_point import Touching
+from rodjax.discretization.nodal_point import Nodal
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.model.scene import Scene
@@ -62,7 +62,7 @@ class Point(Protocol):
         ...
 
     @property
-    def touching(self) -> Touching | None: ...
+    def nodal(self) -> Nodal | None: ...
 
 
 class Form(eqx.Module):
@@ -111,13 +111,13 @@ class Form(eqx.Module):
     ) -> Any:
         """The point turned by rotations in its bases, and under another force; `others`: as of `others`."""
 
-    def touching_held(self, touching: Any) -> Any:
+    def nodal_held(self, nodal: Any) -> Any:
         """With held nodes where the supports are."""
-        return touching
+        return nodal
 
-    def touching_moved(self, point: Any, others: Any) -> Any:
+    def nodal_moved(self, point: Any, others: Any) -> Any:
         """Of a step."""
-        return point.touching
+        return point.nodal
 
     def others(self, multipliers: Float[Array, "k"]) -> Any:
         """What a step changes beside rotations and forces; `None` where that is all."""
@@ -222,7 +222,7 @@ class Form(eqx.Module):
         return point
 
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
-        return self.nodes(self.edges(point)) if point.touching is None else point.touching.places
+        return self.nodes(self.edges(point)) if point.nodal is None else point.nodal.places
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""

@@ -6,9 +6,9 @@ from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve, cells_of
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.nodal_forms import NodalFrames, NodalTangents
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.touching_forms import TouchingFrames, TouchingTangents
 from rodjax.model.scene import Scene, has_node_places
 
 
@@ -16,9 +16,9 @@ def form_of(scene: Scene, shape: Shape) -> Form:
     """Of a nondimensional scene."""
     if isinstance(shape, FramedCurve):
         cells = cells_of(scene, shape)
-        return TouchingFrames.of(scene, cells) if has_node_places(scene) else FrameForm.of(scene, cells)
+        return NodalFrames.of(scene, cells) if has_node_places(scene) else FrameForm.of(scene, cells)
     if has_node_places(scene):
-        return TouchingTangents.of(scene, field_of(scene, shape))
+        return NodalTangents.of(scene, field_of(scene, shape))
     return MixedForm.of(scene, field_of(scene, shape))
 
 

@@ -10,7 +10,7 @@ A frame turns by a vector in its own axes, so that L and its derivatives are sum
 frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
 rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
 
-Loads without a potential are those of `touching_forms.TouchingFrames`.
+Loads without a potential are those of `nodal_forms.NodalFrames`.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
+from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.rest_ways import RestWays, part
-from rodjax.discretization.touching_point import Touching
 from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import product as block_product
@@ -51,7 +51,7 @@ class FramePoint(eqx.Module):
     quaternions: Float[Array, "4 m"]
     end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
-    touching: Touching | None = None
+    nodal: Nodal | None = None
 
     @property
     def tangents(self) -> Float[Array, "3 m"]:
@@ -66,8 +66,8 @@ class FramePoint(eqx.Module):
         seen = rotated(inverse(swung_into), jnp.broadcast_to(normal[:, None], tangents.shape))
         turn = jnp.arctan2(seen[1], seen[0]) - jnp.arctan2(across[1], across[0])
         force = self.end_force - normal[:, None] * (normal @ self.end_force)[None]
-        touching = None if self.touching is None else self.touching.without(normal)
-        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist), touching)
+        nodal = None if self.nodal is None else self.nodal.without(normal)
+        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist), nodal)
 
 
 class Strained(eqx.Module):
@@ -207,11 +207,11 @@ class FrameForm(Form):
         for k, direction, frame in self.held_frames:
             held = swung(q[:, k], direction) if frame is None else nearer(from_frame(frame), q[:, k])
             q = q.at[:, k].set(held)
-        return FramePoint(q, point.end_force, point.total_twist, self.touching_held(point.touching))
+        return FramePoint(q, point.end_force, point.total_twist, self.nodal_held(point.nodal))
 
     def settled(self, point: FramePoint) -> FramePoint:
         twist = self.total_twist(point.quaternions)
-        return FramePoint(point.quaternions, point.end_force, twist, point.touching)
+        return FramePoint(point.quaternions, point.end_force, twist, point.nodal)
 
     def total_twist(self, quaternions: Float[Array, "4 m"]) -> Float[Array, ""]:
         return jnp.sum(self.field.lengths * strains_between(self.field, quaternions)[2])
@@ -226,8 +226,8 @@ class FrameForm(Form):
     ) -> FramePoint:
         # Rounding would grow with every step.
         quaternions = unit(turned(point.quaternions, rotation))
-        touching = self.touching_moved(point, others)
-        return FramePoint(quaternions, point.end_force + force_change, point.total_twist, touching)
+        nodal = self.nodal_moved(point, others)
+        return FramePoint(quaternions, point.end_force + force_change, point.total_twist, nodal)
 
     # --- forces, and what the spans lack -----------------------------------------------------------------------------
 

@@ -33,9 +33,9 @@ from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import rotated, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
+from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
-from rodjax.discretization.touching_point import Touching
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import short_sum
@@ -54,15 +54,15 @@ class MixedPoint(eqx.Module):
     tangents: Float[Array, "3 m"]
     end_force: Float[Array, "3 parts"]
     total_twist: Float[Array, ""]
-    touching: Touching | None = None
+    nodal: Nodal | None = None
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "MixedPoint":
         """The point without what leaves the plane of these two axes, and without twist."""
         in_plane = axes.T @ self.tangents
         sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
         in_plane = jnp.where(sizes > 0, in_plane / jnp.where(sizes > 0, sizes, 1.0), jnp.eye(2, 1, dtype=sizes.dtype))
-        touching = None if self.touching is None else self.touching.flattened(axes)
-        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist), touching)
+        nodal = None if self.nodal is None else self.nodal.flattened(axes)
+        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist), nodal)
 
 
 class Elastic(NamedTuple):
@@ -150,7 +150,7 @@ class MixedForm(Form):
         """The point with the tangents that supports hold, and the total twist of the scene."""
         tangents = self.field.as_held(self.scene, point.tangents)
         twist = self.twist_near(tangents, point.total_twist)
-        return MixedPoint(tangents, point.end_force, twist, self.touching_held(point.touching))
+        return MixedPoint(tangents, point.end_force, twist, self.nodal_held(point.nodal))
 
     def settled(self, point: MixedPoint) -> MixedPoint:
         """The point where a solver stopped, with all that is known of it."""
@@ -248,7 +248,7 @@ class MixedForm(Form):
             twist += self.field.swept(self.scene, point.tangents, tangents)
         elif not self.has_potential:
             twist = twist_under_moment(self.scene, tangents)
-        return MixedPoint(tangents, point.end_force + force_change, twist, self.touching_moved(point, others))
+        return MixedPoint(tangents, point.end_force + force_change, twist, self.nodal_moved(point, others))
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 

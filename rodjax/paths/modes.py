@@ -10,7 +10,7 @@ from rodjax.checks import instance, is_known, whole_number
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.framed_curve import FramedCurve, cells_of
 from rodjax.discretization.motion import Motion
-from rodjax.discretization.touching_forms import TouchingFrames
+from rodjax.discretization.nodal_forms import NodalFrames
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
 from rodjax.model.scene import nondimensional, slides
@@ -89,7 +89,7 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     scene, state = nondimensional(equilibrium.scene)[0], equilibrium.state
     assert isinstance(state.shape, FramedCurve)
     # Forces on nodes are right sides where these have places of their own.
-    form = TouchingFrames.of(scene, cells_of(scene, state.shape))
+    form = NodalFrames.of(scene, cells_of(scene, state.shape))
     point = form.begun(state.point(equilibrium.total_twist), state.shape.nodes, state.pressures)
     here = form.linearized(point)
     # A rod that can spin, or turn as a whole, is held softly.
@@ -102,8 +102,8 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
         _, multipliers = factors.solve(jnp.zeros_like(here.gradient), given)
         return form.others(multipliers).displacements.reshape(-1)
 
-    is_free = jnp.repeat(~form.is_held, 3)
-    forces = jnp.eye(count, dtype=here.closure.dtype) * is_free[None]
+    is_free = jnp.repeat(jnp.where(form.is_held, 0.0, 1.0).astype(here.closure.dtype), 3)
+    forces = jnp.diag(is_free)
     s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
     mass = form.scene.rod.mass_per_length
     masses = mass.integral(s) if isinstance(mass, Along) else s

@@ -25,9 +25,9 @@ from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.touching import TouchingForm
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.passage import PLACES, Before
 from rodjax.model.plane import check_planar, is_planar, plane
@@ -658,7 +658,7 @@ class Search(eqx.Module):
             status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
-        pressures = point.touching.pressures if self.form.scene.obstacles else None
+        pressures = point.nodal.pressures if self.form.scene.obstacles else None
         state = SolverState(shape, point.end_force, self.units, places, pressures=pressures)
         return Found(state, point, outcome, stable)
 
@@ -689,10 +689,10 @@ def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
     stayed there, however far it slid around one; of others the shape in the end is compared with the last sound one.
     """
     form, before = search.form, guess.before
-    assert isinstance(form, TouchingForm)
+    assert isinstance(form, NodalForm)
     assert before is not None
-    assert search.point.touching is not None
-    places = search.point.touching.places
+    assert search.point.nodal is not None
+    places = search.point.nodal.places
     begin, _, _ = form.places(places, search.point)
     begin = guess.units.origin[None] + guess.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))

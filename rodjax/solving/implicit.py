@@ -72,8 +72,8 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        touching = point.touching if scene.obstacles else None
-        pressures = None if touching is None else touching.pressures
+        nodal = point.nodal if scene.obstacles else None
+        pressures = None if nodal is None else nodal.pressures
         state = SolverState(shape, point.end_force, units, places, before=before, pressures=pressures)
         found = Found(state, point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)

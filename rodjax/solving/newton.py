@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import not_negative, plain_number, whole_number
 from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
-from rodjax.discretization.touching_point import TouchingChange
+from rodjax.discretization.nodal_point import NodalChange
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.scene import scene_axes
@@ -288,7 +288,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),
-        others=None if point.touching is None else TouchingChange.nothing(point.touching),
+        others=None if point.nodal is None else NodalChange.nothing(point.nodal),
         weight=zero,
         merit=zero,
         slope=zero,

@@ -37,9 +37,9 @@ from rodjax.discretization.framed_results import (
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
+from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.touching import TouchingForm
-from rodjax.discretization.touching_point import Touching
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
@@ -105,7 +105,7 @@ class SolverState(eqx.Module):
         if self.pressures is None:
             return point
         relaxed = jnp.zeros_like(self.pressures[:, 0])
-        return dataclasses.replace(point, touching=Touching(self.shape.nodes, self.pressures, relaxed))
+        return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed))
 
 
 class Equilibrium(eqx.Module):
@@ -377,7 +377,7 @@ def _errors_of(equilibrium: Equilibrium, axis: Float[Array, "3"]) -> Errors:
     else:
         assert isinstance(form, MixedForm)
         errors = errors_of_differences(form, point, state.shape.nodes, equilibrium.tangents.T, axis)
-    if isinstance(form, TouchingForm) and form.scene.obstacles:
+    if isinstance(form, NodalForm) and form.scene.obstacles:
         errors = with_contacts(errors, form, point)
     if errors.axial is None:
         return errors
@@ -429,7 +429,7 @@ def _penetration(equilibrium: Equilibrium) -> Float[np.ndarray, "..."]:
 @over_leading_axes
 def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
     form, point = form_and_point(equilibrium)
-    assert isinstance(form, TouchingForm)
+    assert isinstance(form, NodalForm)
     return jnp.max(depths_of_elements(form, point))
 
 
@@ -437,7 +437,7 @@ def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
 def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Float[Array, "n+1 3"]]:
     """What clips and what obstacles apply to the rod, of a scene whose nodes have places of their own."""
     form, point = form_and_point(equilibrium)
-    assert isinstance(form, TouchingForm)
+    assert isinstance(form, NodalForm)
     forces = form.applied(point).T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
@@ -580,7 +580,7 @@ def _passages(equilibrium: Equilibrium) -> str:
 @over_leading_axes
 def _passage_of(equilibrium: Equilibrium) -> Passage:
     form, point = form_and_point(equilibrium)
-    assert isinstance(form, TouchingForm)
+    assert isinstance(form, NodalForm)
     state = equilibrium.state
     if state.before is None:  # of a file of an earlier version
         return Passage(
@@ -591,7 +591,7 @@ def _passage_of(equilibrium: Equilibrium) -> Passage:
 
 
 def passage_to(
-    form: TouchingForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
+    form: NodalForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
 ) -> tuple[Passage, Before]:
     """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
     points, radius, held = form.places(nodes, point)

@@ -27,8 +27,8 @@ from rodjax.solving.status import Status, is_converged
 # found to a tenth of that.
 AXIAL_TOLERANCE = 0.1
 INNER_TOLERANCE = 0.01
-# Where an axial force changes so steeply that this way [L] through the clip makes more of it, it is none below that: the
-# inner equilibria close to about as much. So does a rod that is nearly taut between its supports.
+# Nor is it below what this way [L] through the clip makes of it, to which equilibria at given arclengths close: it is
+# steep where the rod is nearly taut.
 PLACE_TOLERANCE = 1e-12
 # The most of the way to the next support that a step takes a clip along the rod.
 LARGEST_STEP = 0.3

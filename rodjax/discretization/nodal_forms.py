@@ -1,6 +1,6 @@
-"""The two forms of a rod that touches obstacles: by tangents and by frames.
+"""The two forms with positions of nodes: by tangents and by frames, the latter with loads that have no potential.
 
-Both differ from those of rods that touch nothing in the system and in what L is under other forces alone.
+Both differ from those with a force a span in the system and in what L is under other forces alone.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.discretization.touching import TouchingForm
 from rodjax.geometry.rotations import turned
 from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import short_sum
@@ -28,15 +28,15 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Held
 
 
-class TouchingTangents(TouchingForm, MixedForm):
+class NodalTangents(NodalForm, MixedForm):
     """By tangents."""
 
     @classmethod
-    def of(cls, scene: Scene, field: TangentField) -> "TouchingTangents":
+    def of(cls, scene: Scene, field: TangentField) -> "NodalTangents":
         layout = CellForces(len(field.s) - 1)
         return cls(scene=scene, field=field, layout=layout, loads_beyond=field.loads_beyond(scene))
 
-    def out_of_plane(self, normal: Float[Array, "3"]) -> "TouchingTangents":
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "NodalTangents":
         return dataclasses.replace(self, axes=None, layout=self.layout.in_axes(None))
 
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
@@ -50,7 +50,7 @@ class TouchingTangents(TouchingForm, MixedForm):
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         contacts = self.contacts(point)
-        assert point.touching is not None
+        assert point.nodal is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
@@ -82,7 +82,7 @@ class TouchingTangents(TouchingForm, MixedForm):
             gradient=gradient,
             closure=jnp.concatenate(closure),
             system=system,
-            energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.touching.places, axis=0)),
+            energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
             residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, residual)),
             gaps=contacts.gaps,
         )
@@ -103,11 +103,11 @@ class TouchingTangents(TouchingForm, MixedForm):
         return energy, short_sum(lengths[None] * self.field.of_sides(elements), axis=1).T
 
 
-class TouchingFrames(TouchingForm, FrameForm):
+class NodalFrames(NodalForm, FrameForm):
     """By frames."""
 
     @classmethod
-    def of(cls, scene: Scene, field: Cells) -> "TouchingFrames":
+    def of(cls, scene: Scene, field: Cells) -> "NodalFrames":
         parts = parts_of(scene, field)
         return cls(**{**parts, "layout": CellForces(len(field.s) - 1)})
 
@@ -184,7 +184,7 @@ class TouchingFrames(TouchingForm, FrameForm):
             gradient = self._moments(point)
         assert across is not None, "elements, not joints"
         contacts = self.contacts(point)
-        assert point.touching is not None
+        assert point.nodal is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         dtype = gradient.dtype
         system = ChainSystem(
@@ -207,7 +207,7 @@ class TouchingFrames(TouchingForm, FrameForm):
             gradient=gradient,
             closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=system,
-            energy=jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.touching.places, axis=0)),
+            energy=jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
             residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, self._residual(gradient))),
             gaps=contacts.gaps,
         )

@@ -1,13 +1,16 @@
-"""A rod that touches obstacles: the forms with a force of its own in each element, and pressures on the nodes.
+"""Rods whose nodes have positions of their own, and a force in each element: beside obstacles, or under loads without a
+potential, where what acts on the rod depends on where it is or how it turns.
+
+The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
+unknowns of their own: so what acts on an element depends on what is local, the system is a chain, and a step of Newton's
+method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
 
 No node is nearer to an obstacle than the rod is thick: gap g >= 0. The pressure p >= 0 [a force, for each obstacle and
 node] is the multiplier of that, without friction:
 
     L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
 
-The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
-unknowns of their own: so a gap depends on what is local, and a step of Newton's method moves nodes along straight
-lines. A step is the minimum of a model, L to second order with each gap to first: every node stays on its side of the
+A step is the minimum of a model, L to second order with each gap to first: every node stays on its side of the
 tangent plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which
 contacts are closed in the model is sought to its end before a step is taken (`linalg.unilateral`). Elements only.
 
@@ -26,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.layout import SpanForces
-from rodjax.discretization.touching_point import Touching, TouchingChange
+from rodjax.discretization.nodal_point import Nodal, NodalChange
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows
@@ -66,9 +69,9 @@ class Contacts(NamedTuple):
     stiffness: Float[Array, "n+1 3 3"]
 
 
-class TouchingForm(Form):
-    """A nondimensional scene with obstacles; the `end_force` of its points is (3, n): that through each element, and
-    their `touching` is there.
+class NodalForm(Form):
+    """A nondimensional scene; the `end_force` of its points is (3, n): that through each element, and their `nodal` is
+    there.
     """
 
     @abstractmethod
@@ -91,7 +94,7 @@ class TouchingForm(Form):
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
         places, _ = self.held_places
-        arms = jnp.where(self.is_held[:, None], 0.0, point.touching.places - places[:, 0][None])
+        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.places - places[:, 0][None])
         by_node = jnp.cross(axis[None], arms).reshape(-1)
         of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
@@ -105,19 +108,19 @@ class TouchingForm(Form):
     def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return super().is_closed(self.closure(closure), tolerance)
 
-    def others(self, multipliers: Float[Array, "k"]) -> TouchingChange:
+    def others(self, multipliers: Float[Array, "k"]) -> NodalChange:
         nodes, obstacles = len(self.field.s), len(self.scene.obstacles)
         pressures, displacements = jnp.split(
             multipliers[-3 * (2 * nodes - 1) - obstacles * nodes : -3 * (nodes - 1)], [obstacles * nodes]
         )
-        return TouchingChange(displacements.reshape(nodes, 3), pressures.reshape(obstacles, nodes))
+        return NodalChange(displacements.reshape(nodes, 3), pressures.reshape(obstacles, nodes))
 
-    def touching_moved(self, point: Any, others: TouchingChange | None) -> Touching:
-        touching = point.touching
+    def nodal_moved(self, point: Any, others: NodalChange | None) -> Nodal:
+        nodal = point.nodal
         if others is None:
-            return touching
-        places, pressures = touching.places + others.displacements, touching.pressures + others.pressures
-        return Touching(places, pressures, touching.relaxed)
+            return nodal
+        places, pressures = nodal.places + others.displacements, nodal.pressures + others.pressures
+        return Nodal(places, pressures, nodal.relaxed)
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
@@ -126,31 +129,31 @@ class TouchingForm(Form):
 
     def accepted(self, point: Any, here: Linearization) -> Any:
         assert here.gaps is not None
-        touching = dataclasses.replace(point.touching, relaxed=self.led_out(here.gaps))
-        return dataclasses.replace(point, touching=touching)
+        nodal = dataclasses.replace(point.nodal, relaxed=self.led_out(here.gaps))
+        return dataclasses.replace(point, nodal=nodal)
 
-    def touching_held(self, touching: Touching | None) -> Touching | None:
-        if touching is None:
+    def nodal_held(self, nodal: Nodal | None) -> Nodal | None:
+        if nodal is None:
             return None
         positions, held = self.held_places
-        return dataclasses.replace(touching, places=touching.places.at[held].set(positions.T))
+        return dataclasses.replace(nodal, places=nodal.places.at[held].set(positions.T))
 
     def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
         if point.end_force.shape[1] != len(nodes) - 1:
             point = dataclasses.replace(point, end_force=self._in_elements(point))
         nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
-        touching = self.touching_held(Touching(nodes, nothing, nothing[:, 0]))
-        assert touching is not None
+        nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0]))
+        assert nodal is not None
         if not self.scene.obstacles:
-            return dataclasses.replace(point, touching=touching)
-        gaps, normals = self.gaps_and_normals(touching.places)
+            return dataclasses.replace(point, nodal=nodal)
+        gaps, normals = self.gaps_and_normals(nodal.places)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
         known = nothing + jnp.nan if pressures is None else pressures
         pressures = jnp.where(jnp.isnan(known), pushing, known)
-        touching = dataclasses.replace(touching, pressures=pressures, relaxed=self.led_out(gaps))
-        return dataclasses.replace(point, touching=touching)
+        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=self.led_out(gaps))
+        return dataclasses.replace(point, nodal=nodal)
 
     def _in_elements(self, point: Any) -> Float[Array, "3 n"]:
         """The forces through the elements, of those in the spans, as files until format 10 have them."""
@@ -212,12 +215,12 @@ class TouchingForm(Form):
         return jnp.where(self.is_held[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
 
     def contacts(self, point: Any) -> Contacts:
-        touching = point.touching
-        gaps, normals = self.gaps_and_normals(touching.places)
+        nodal = point.nodal
+        gaps, normals = self.gaps_and_normals(nodal.places)
         is_free = jnp.where(self.is_held, 0.0, 1.0).astype(normals.dtype)[:, None]
-        is_closed = touching.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None])
+        is_closed = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None])
         rows = ContactRows(normals * is_free[None], self.softness, is_closed)
-        curving = is_free[..., None] * self._curving(touching.places, touching.pressures)
+        curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures)
         return Contacts(gaps, rows, curving)
 
     def _curving(self, places: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3 3"]:
@@ -237,7 +240,7 @@ class TouchingForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        pressures = point.touching.pressures
+        pressures = point.nodal.pressures
         balance = self.applied(point).T - contacts.rows.pushed(pressures)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
         rows = -jnp.where(contacts.rows.is_closed, contacts.gaps, pressures)
@@ -248,7 +251,7 @@ class TouchingForm(Form):
 
     def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """What the elements lack of the ways between their nodes."""
-        return jnp.diff(point.touching.places, axis=0) - ways
+        return jnp.diff(point.nodal.places, axis=0) - ways
 
     # --- the search --------------------------------------------------------------------------------------------------
 
@@ -256,7 +259,7 @@ class TouchingForm(Form):
         """L with the contacts as of the model, with the pressures of a point."""
         assert here.gaps is not None
         softness = self.softness
-        pressures = point.touching.pressures - (here.gaps + point.touching.relaxed[:, None]) / softness
+        pressures = point.nodal.pressures - (here.gaps + point.nodal.relaxed[:, None]) / softness
         return here.energy + softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
@@ -269,13 +272,13 @@ class TouchingForm(Form):
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
         assert isinstance(system, ChainSystem)
         assert here.gaps is not None
-        touching = point.touching
+        nodal = point.nodal
         first, _, balance, gaps = system.parted(-here.closure)
-        balance -= system.contacts.pushed(touching.pressures)  # which the model has
-        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(touching.pressures), balance, gaps)])
+        balance -= system.contacts.pushed(nodal.pressures)  # which the model has
+        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(nodal.pressures), balance, gaps)])
         if not self.scene.obstacles:
             return super().sought(here, point, system, push)
-        contacts = Unilateral(here.gaps + touching.relaxed[:, None], touching.pressures)
+        contacts = Unilateral(here.gaps + nodal.relaxed[:, None], nodal.pressures)
         # What lies on an obstacle without pressure is more likely to press on it than to leave it.
         system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
         found = minimized(system, push - here.gradient, c, contacts)
@@ -287,7 +290,7 @@ class TouchingForm(Form):
         here: Linearization,
         rotation: Float[Array, "b m"],
         change: Float[Array, "3 n"],
-        others: TouchingChange,
+        others: NodalChange,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         elements, rates = self.turning_elements(point, rotation, here.bases)
 
@@ -298,7 +301,7 @@ class TouchingForm(Form):
             force = point.end_force + change
             return value + jnp.sum(force.T * jnp.diff(places, axis=0)), gap
 
-        places = point.touching.places
+        places = point.nodal.places
         (energy, gaps), (rate, gap_rates) = jax.jvp(
             lambda elements, places: parts(elements, places, change),
             (elements, places),
@@ -310,8 +313,8 @@ class TouchingForm(Form):
         )
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        contacts, touching = here.system.contacts, point.touching
-        seen = touching.pressures - (here.gaps + touching.relaxed[:, None]) / self.softness
+        contacts, nodal = here.system.contacts, point.nodal
+        seen = nodal.pressures - (here.gaps + nodal.relaxed[:, None]) / self.softness
         rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(others.displacements))
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
@@ -352,7 +355,7 @@ class TouchingForm(Form):
         return is_better & ~is_blocked & jnp.all(gone >= lengths)
 
     def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
-        nodes, slopes = point.touching.places, point.tangents[:, ::2].T
+        nodes, slopes = point.nodal.places, point.tangents[:, ::2].T
         s = self.field.s
         between = s[None, :-1] + jnp.asarray(LOOKED_AT, s.dtype)[:, None] * jnp.diff(s)[None]
         return jnp.concatenate([nodes, cubic(s, nodes, slopes, between.reshape(-1))])

@@ -2,8 +2,8 @@
 potential, where what acts on the rod depends on where it is or how it turns.
 
 The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
-unknowns of their own: so what acts on an element depends on what is local, the system is a chain, and a step of Newton's
-method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
+unknowns of their own: so what acts on an element depends on what is local, the system is a chain, and a step of
+Newton's method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
 
 No node is nearer to an obstacle than the rod is thick: gap g >= 0. The pressure p >= 0 [a force, for each obstacle and
 node] is the multiplier of that, without friction:

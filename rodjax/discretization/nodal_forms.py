@@ -19,13 +19,13 @@ from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.geometry.rotations import turned
+from rodjax.geometry.rotations import rotated, turned
 from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Held
+from rodjax.model.supports import Free, Held
 
 
 class NodalTangents(NodalForm, MixedForm):
@@ -132,8 +132,13 @@ class NodalFrames(NodalForm, FrameForm):
     def end_forces(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         if self.has_potential:
             return super().end_forces(point)
-        forces = self.forces(point.quaternions, point.end_force)
-        return forces[:, 0, 0], forces[:, -1, -1]
+        q, forces = point.quaternions, self.forces(point.quaternions, point.end_force)
+        found = [forces[:, 0, 0], forces[:, -1, -1]]
+        for end, k, sign in ((self.scene.start, 0, -1), (self.scene.end, -1, 1)):
+            if isinstance(end, Free):
+                given = jnp.zeros_like(found[k]) if end.force is None else end.force
+                found[k] = sign * (rotated(q[:, k], given) if end.follower else given)
+        return found[0], found[1]
 
     @property
     def _elements(self) -> ElementCells:

@@ -157,14 +157,15 @@ class Rod(eqx.Module):
     def bending_scale(self) -> Float[Array, ""]:
         """The bending stiffness in whose units a scene is solved: the geometric mean of two, means along the rod."""
         if isinstance(self.EI, tuple):
-            return jnp.sqrt(self._mean(self.EI[0]) * self._mean(self.EI[1]))
-        return self._mean(self.EI)
+            return jnp.sqrt(self.mean(self.EI[0]) * self.mean(self.EI[1]))
+        return self.mean(self.EI)
 
     @property
     def mean_mass_per_length(self) -> Float[Array, ""]:
-        return self._mean(self.mass_per_length)
+        return self.mean(self.mass_per_length)
 
-    def _mean(self, value: Value) -> Float[Array, ""]:
+    def mean(self, value: Value) -> Float[Array, ""]:
+        """Along the rod."""
         return value.mean(jnp.zeros_like(self.length), self.length) if isinstance(value, Along) else value
 
     def in_units(self, units: Units) -> "Rod":

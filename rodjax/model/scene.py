@@ -329,6 +329,14 @@ def needs_frames(scene: Scene) -> bool:
     return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames or twists
 
 
+def with_plain_rod(scene: Scene) -> Scene:
+    """The same scene with a straight isotropic rod of its mean stiffnesses."""
+    rod = scene.rod
+    EI1, EI2, GJ, EA = (rod.mean(stiffness) for stiffness in rod.stiffnesses)
+    plain = Rod(rod.length, (EI1 + EI2) / 2, GJ, EA, rod.mean_mass_per_length)
+    return Scene(plain, scene.start, scene.end, scene.gravity, scene.point_forces, scene.turns)
+
+
 def has_node_places(scene: Scene) -> bool:
     """Whether forces along the rod depend on where it is or how it turns, so that the positions of the nodes, and a
     force in each element, are unknowns: beside obstacles, and of rods by frames under loads without a potential.

@@ -41,6 +41,7 @@ from rodjax.model.scene import (
     slid,
     slides,
     sliding_places,
+    with_plain_rod,
 )
 from rodjax.model.supports import Clamp
 from rodjax.programs.answers import one_answer
@@ -587,7 +588,10 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         return SolverState(shape, no_force, units, places, before=before, pressures=pressures)
 
     if guess is None:
-        return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
+        shape, first = first_frames(scene, s, of_joints), FirstTwist(rest_twist(scene))
+        if _begins_plain(given, options):
+            shape, first = _as_plain(given, options)
+        return state(shape), first
     if isinstance(guess, Guess):
         shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
         return state(shape), FirstTwist(guess.total_twist)
@@ -606,6 +610,28 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     if isinstance(start, Clamp):
         return state(framed_through(scene, points, of_joints, (start.frame, guess.total_twist))), first
     return state(framed_through(scene, points, of_joints)), FirstTwist(guess.total_twist)
+
+
+def _begins_plain(scene: Scene, options: Options) -> bool:
+    """Whether a rod by frames begins in the equilibrium of the plain one: where turns are stated, with which a rod may
+    take one of several shapes, so that EI and (EI, EI) take the same.
+    """
+    others = scene.distributed or scene.clips or scene.obstacles
+    return scene.turns is not None and scene.rod.rest_shape is None and not others and not options.planar
+
+
+def _as_plain(scene: Scene, options: Options) -> tuple[FramedCurve, FirstTwist]:
+    """The frames of the plain rod, and its total twist."""
+    plain = with_plain_rod(scene)
+    state, twist = _unsettled_state(plain, None, options)
+    state, total_twist = settled_state(plain, state, twist)
+    found = solve_from(plain, state, FirstTwist(total_twist, last_of(plain)), options)
+    of_joints = options.discretization == "finite_difference"
+    points = found.state.shape.points(options.segments if of_joints else 2 * options.segments)
+    twist = found.point.total_twist
+    assert isinstance(scene.start, Clamp)
+    shape = framed_through(nondimensional(scene)[0], points, of_joints, (scene.start.frame, twist))
+    return shape, FirstTwist(twist, last_of(scene))
 
 
 def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:

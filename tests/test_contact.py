@@ -11,8 +11,10 @@ from scipy.integrate import solve_bvp
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
+from rodjax.discretization.nodal_point import NodalChange
 from rodjax.model.supports import Support
 from rodjax.solving.equilibrium import checked_options
+from rodjax.solving.result import form_and_point
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
 DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)
@@ -264,6 +266,34 @@ def test_derivatives_are_those_of_differences(touching):
     weights = jnp.linspace(1.0, 2.0, len(forward))
     backward = jax.grad(lambda p: weights @ seen(p))(NOMINAL)
     np.testing.assert_allclose(backward, weights @ forward, rtol=1e-9, atol=1e-9 * np.max(sizes))
+
+
+def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
+    """With what the curvature of the cylinder changes as nodes slide on it."""
+    form, point = form_and_point(touching)
+    here = form.linearized(point)
+    generator = np.random.default_rng(0)
+    rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
+    change = jnp.asarray(generator.normal(size=point.end_force.shape))
+    displacements = jnp.asarray(generator.normal(size=point.nodal.places.shape))
+    displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
+    # Pressures stay, as their contacts are soft in the system.
+    step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
+
+    def moved(part):
+        others = jax.tree.map(lambda change: part * change, step)
+        return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
+
+    (_, rows), (_, expected) = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
+    before = len(rows) - form.layout.size - displacements.size - step.pressures.size
+    multipliers = jnp.concatenate(
+        [jnp.zeros(before), step.pressures.ravel(), displacements.ravel(), form.layout.components(change)]
+    )
+    _, found = here.system.times(rotation, multipliers)
+    nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
+    # Where a node is held the system holds its displacement, which is none.
+    np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
+    assert float(jnp.max(jnp.abs(form.contacts(point).stiffness))) > 1.0  # the cylinder curves where it is touched
 
 
 def test_what_is_far_away_changes_nothing():

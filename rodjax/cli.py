@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 import rodjax
+from rodjax.analysis.curvature import curvature_along
 from rodjax.atomic_write import replace_file
 from rodjax.io.files import SUFFIX, load, save
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
@@ -473,20 +474,42 @@ def _header(path: Path, file: SceneFile, result: Equilibrium) -> str:
 
 
 def _table(result: Equilibrium) -> list[str]:
-    def vector(values: jax.Array) -> str:
+    def vector(values: Any) -> str:
         # Adding zero makes zeros of -0.
         return "".join(f"{float(value) + 0.0:12.4g}" for value in values)
 
-    twist = float(result.total_twist)
+    twist, elastic, scene = float(result.total_twist), float(result.elastic_energy), result.scene
+    forces, moments = np.asarray(result.clip_forces), np.asarray(result.clip_moments)
+    rows = [f"{f'clip {k}':9}{vector(forces[k])}   {vector(moments[k])}" for k in range(len(scene.clips))]
+    for k, forces in enumerate(np.asarray(result.obstacle_forces)):
+        rows.append(f"{'':9}{vector(forces.sum(0))}   {_named(result, k)}")
     return [
         rodjax.describe(result),
-        f"energy       {float(result.energy):.6g} J, of this elastic {float(result.elastic_energy):.6g} J",
+        f"energy       {elastic:.6g} J elastic, {float(result.energy) - elastic:.6g} J of the loads",
         f"total twist  {twist:.6g} rad ({np.degrees(twist):.4g} deg)",
         "The part of the rod beyond s exerts on the part before it, at the end the support on the rod:",
         f"{'':9}{'force [N]':>36}   {'moment [N m]':>36}",
         f"{'s = 0':9}{vector(result.start_force)}   {vector(result.start_moment)}",
         f"{'s = L':9}{vector(result.end_force)}   {vector(result.end_moment)}",
+        *(["Clips and obstacles exert on the rod:"] if rows else []),
+        *rows,
+        *_bends_and_clearances(result),
     ]
+
+
+def _bends_and_clearances(result: Equilibrium) -> list[str]:
+    largest = float(np.max(curvature_along(result)[1]))
+    first, last = (round(float(s), 4) for s in rodjax.most_curved(result))
+    rows = [f"smallest bend radius  {1 / largest:.4g} m, between s = {first:g} and {last:g} m"] if largest else []
+    if result.scene.obstacles:
+        found = rodjax.clearance(result, result.scene.obstacles)
+        for k, (distance, s) in enumerate(zip(np.asarray(found.distance), np.asarray(found.s), strict=True)):
+            rows.append(f"clearance to {_named(result, k)}  {distance:.4g} m at s = {s:.4g} m")
+    return rows
+
+
+def _named(result: Equilibrium, k: int) -> str:
+    return f"obstacles[{k}] ({type(result.scene.obstacles[k]).__name__})"
 
 
 def _rows(path: Equilibrium) -> list[str]:

@@ -34,7 +34,9 @@ def test_solve_prints_and_writes_the_equilibrium(tmp_path, capsys):
     assert "clamp to clamp, 1 m, 50 segments" in out
     assert "converged" in out
     expected = rodjax.solve(rodjax.problems.hanging_cable(), segments=50)
-    assert f"{float(expected.energy):.6g} J" in out
+    elastic = float(expected.elastic_energy)
+    assert f"{elastic:.6g} J elastic, {float(expected.energy) - elastic:.6g} J of the loads" in out
+    assert f"smallest bend radius  {1 / float(np.max(expected.curvature)):.4g} m" in out
     assert f"{float(expected.end_force[2]):.4g}" in out
     np.testing.assert_allclose(load(result).nodes, expected.nodes, atol=1e-9)
     assert picture.read_bytes().startswith(b"\x89PNG")

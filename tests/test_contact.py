@@ -240,6 +240,27 @@ def test_clips_and_obstacles_share_the_weight(touching):
     np.testing.assert_allclose(clip, [0.68, 0.02, 0.09], rtol=0, atol=1e-14)
 
 
+def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):
+    """A gap or a force is zero at each node that no support holds; the box is not touched."""
+    of_each, gaps = np.asarray(touching.obstacle_forces), np.asarray(touching.gaps)
+    # The residual of 1e-8 EI/L^2.
+    np.testing.assert_allclose(of_each.sum(0), touching.contact_forces, rtol=0, atol=1e-9)
+    pushes = np.linalg.norm(of_each, axis=-1) > 0
+    np.testing.assert_array_equal(pushes.any(1), [True, True, False])
+    np.testing.assert_allclose(gaps[pushes], 0.0, atol=1e-12)  # roundings
+    nearest = np.asarray(rj.clearance(touching, touching.scene.obstacles, points=0).distance)
+    np.testing.assert_allclose(np.min(gaps, axis=1), nearest, rtol=0, atol=1e-12)
+    sizes, s, told = np.linalg.norm(of_each.sum(1), axis=-1), np.asarray(touching.s), rj.describe(touching)
+    for k, kind in enumerate(("Cylinder", "Plane")):
+        (place,) = s[pushes[k]]
+        assert f"obstacles[{k}] ({kind}) pushes with {sizes[k]:.4g} N at s = {place:.4g} m" in told
+    assert "(Box)" not in told
+    forces = np.linalg.norm(lying.contact_forces, axis=-1)
+    first, *_, last = np.asarray(lying.s)[forces > 0]
+    size = np.linalg.norm(np.sum(lying.contact_forces, axis=0))
+    assert f"(Plane) pushes with {size:.4g} N between s = {first:.4g} and {last:.4g} m" in rj.describe(lying)
+
+
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences(touching):
     def seen(p):

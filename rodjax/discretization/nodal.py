@@ -206,13 +206,19 @@ class NodalForm(Form):
         h = jnp.diff(self.field.s)
         return SOFTNESS * h[jnp.argmin(h)] ** 3
 
+    def distances_and_normals(
+        self, places: Float[Array, "n+1 3"]
+    ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
+        """From the obstacles to the nodes."""
+        found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
+        return jnp.stack([distance for distance, _ in found]), jnp.stack([normals for _, normals in found])
+
     def gaps_and_normals(self, places: Float[Array, "n+1 3"]) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
         if not self.scene.obstacles:
             return jnp.zeros((0, len(places)), places.dtype), jnp.zeros((0, *places.shape), places.dtype)
-        found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
-        gaps = jnp.stack([distance for distance, _ in found]) - self.radius[None]
-        return jnp.where(self.is_held[None], 1.0, gaps), jnp.stack([normals for _, normals in found])
+        distances, normals = self.distances_and_normals(places)
+        return jnp.where(self.is_held[None], 1.0, distances - self.radius[None]), normals
 
     def contacts(self, point: Any) -> Contacts:
         nodal = point.nodal

@@ -127,7 +127,9 @@ class Equilibrium(eqx.Module):
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
       when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
       just beyond it, and tension the mean of both sides
-    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node
+    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
+      n+1, 3] N: what each of them does; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to
+      each obstacle, negative within it. Computed when asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
       whose largest |axial_strain| is above the `strain_limit` of the solve
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
@@ -196,6 +198,14 @@ class Equilibrium(eqx.Module):
         if not self.scene.obstacles:
             return jnp.zeros_like(self.nodes)
         return _node_forces(self)[1]
+
+    @property
+    def obstacle_forces(self) -> Float[Array, "... obstacles n+1 3"]:
+        return _contacts(self)[0]
+
+    @property
+    def gaps(self) -> Float[Array, "... obstacles n+1"]:
+        return _contacts(self)[1]
 
     @property
     def clip_moments(self) -> Float[Array, "... clips 3"]:
@@ -443,6 +453,24 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 
 
+def _contacts(equilibrium: Equilibrium) -> tuple[Float[Array, "... k n+1 3"], Float[Array, "... k n+1"]]:
+    """The forces of each obstacle on the nodes, and their gaps."""
+    if equilibrium.scene.obstacles:
+        return _contacts_of(equilibrium)
+    shape = *equilibrium.s.shape[:-1], 0, equilibrium.s.shape[-1]
+    return jnp.zeros((*shape, 3), equilibrium.s.dtype), jnp.zeros(shape, equilibrium.s.dtype)
+
+
+@over_leading_axes
+def _contacts_of(equilibrium: Equilibrium) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1"]]:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, NodalForm)
+    units = equilibrium.state.units
+    distances, normals = form.distances_and_normals(point.nodal.places)
+    forces = point.nodal.pressures[..., None] * normals
+    return forces * units.force, (distances - form.radius[None]) * units.length
+
+
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
@@ -510,7 +538,7 @@ def describe(equilibrium: Equilibrium) -> str:
     told = _errors_told(equilibrium)
     if converged.ndim == 0:
         special = [remark for remark, count in counts.items() if count]
-        return "; ".join([_outcome(equilibrium), *strain, *special, *told])
+        return "; ".join([_outcome(equilibrium), *strain, *special, *_contacts_told(equilibrium), *told])
     special = [f"{count} {remark}" for remark, count in counts.items() if count]
     return "\n".join([_outcome(equilibrium), *strain, *special, *told])
 
@@ -527,6 +555,22 @@ def _largest_strain(equilibrium: Equilibrium) -> str:
     place = f"{100 * strain[(*case, node)]:+.3g} % at s = {float(np.asarray(equilibrium.s)[(*case, node)]):.4g} m"
     numbers = ", ".join(str(int(k)) for k in case)
     return f"largest axial strain {place}" + (f" of case {numbers}" if case else "")
+
+
+def _contacts_told(equilibrium: Equilibrium) -> list[str]:
+    """Of one equilibrium, which obstacles push on the rod, how much and where."""
+    told = []
+    if not equilibrium.scene.obstacles or not bool(equilibrium.converged):
+        return told
+    s = np.asarray(equilibrium.s)
+    for k, forces in enumerate(np.asarray(equilibrium.obstacle_forces)):
+        touched = s[np.linalg.norm(forces, axis=-1) > 0]
+        if touched.size:
+            first, last = float(touched[0]), float(touched[-1])
+            where = f"at s = {first:.4g} m" if first == last else f"between s = {first:.4g} and {last:.4g} m"
+            kind = type(equilibrium.scene.obstacles[k]).__name__
+            told.append(f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}")
+    return told
 
 
 def _errors_told(equilibrium: Equilibrium) -> list[str]:

@@ -131,6 +131,22 @@ def test_meshes_are_chosen_with_contacts():
     assert deepest(result) < DEEPEST
 
 
+@pytest.mark.slow
+def test_meshes_are_chosen_over_a_pipe():
+    """A heavy cable over a pipe, started above it: where it touches elements are short, but none so short that contacts
+    on both sides of it, which press on each other by its stiffness, cost all digits.
+    """
+    s = np.linspace(0, 1, 65)
+    above = np.stack([0.7 * s, 0.02 * np.sin(np.pi * s), 1.6 * s * (1 - s)], axis=1)
+    ends = rj.Swivel((0, 0, 0), (0.9, 0, 0.4)), rj.Swivel((0.7, 0, 0), (1, 0, 0))
+    pipe = rj.Capsule((0.3, -1, -0.1), (0.4, 1, -0.1), 0.03)
+    scene = Scene(Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=RADIUS), *ends, (0, 0, -1.0), obstacles=[pipe])
+    result = rj.solve(scene, guess=rj.Guess(above))
+    assert result.converged
+    assert deepest(result) < DEEPEST
+    assert float(result.contact_forces[:, 2].sum()) > 100.0
+
+
 def deepest(result: rj.Equilibrium) -> float:
     """Of all places, at nodes and between them, by the radius."""
     return -float(jnp.min(rj.clearance(result, result.scene.obstacles, points=9).distance)) / RADIUS

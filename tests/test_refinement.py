@@ -155,6 +155,10 @@ def test_elements_gather_where_the_defects_are():
     np.testing.assert_allclose(lengths[0], np.min(lengths), rtol=1e-12)
     assert np.max(lengths) <= LONGEST / 32 * 1.5  # where others need more, the longest ones may too
     assert np.max(lengths[1:] / lengths[:-1]) <= GRADING * 1.01
+    # Never shorter than a part of equal ones, to what longest elements take of the others.
+    bounded = np.diff(graded(jnp.linspace(0, 1, 9), defects, 32, shortest=1 / 2))
+    assert np.min(lengths) < 1 / 64
+    assert np.min(bounded) * 1.5 >= 1 / 64
 
 
 @pytest.mark.parametrize(

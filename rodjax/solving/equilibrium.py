@@ -52,7 +52,17 @@ from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solving.nonlinear_cg import NonlinearCG, minimize
 from rodjax.solving.ranges import check_ranges, with_ranges
-from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, first_size, graded, next_size, shares
+from rodjax.solving.refinement import (
+    SAFETY,
+    SHORTEST_IN_CONTACT,
+    SIZES,
+    Depth,
+    error_by_rtol,
+    first_size,
+    graded,
+    next_size,
+    shares,
+)
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -90,6 +100,9 @@ CONTACT_SEGMENTS = 32
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # A scene that does not converge on so many meshes in turn would not on others, each of which takes seconds to compile.
 MOST_FAILURES = 3
+# Where no finer mesh has an equilibrium, that of a coarser one is one if the rod lies no deeper than this part of its
+# radius within an obstacle between nodes.
+MOST_DEPTH_LEFT = 0.05
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
@@ -188,12 +201,15 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
     """Solved again, each time from the last, on meshes of more segments until the estimated error is below `rtol`, and
     contacts press the rod in between its nodes no deeper than at them.
     """
-    failures, depth = 0, Depth()
+    failures, depth, last = 0, Depth(), None
     while True:
         failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
         error = float(error_by_rtol(errors))
         sinks = depth.lacking(errors, options.segments)
+        depths = np.zeros(1) if errors.depths is None else np.asarray(errors.depths)
+        if result.converged and np.max(depths) < MOST_DEPTH_LEFT:
+            last = result, error, options
         is_fine = bool(result.converged) and max(SAFETY * error / rtol, sinks) <= 1
         if is_fine or _is_finest(options) or failures == MOST_FAILURES:
             break
@@ -210,7 +226,9 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
             finer,
             (_sum(finer.iterations, result.iterations), _sum(finer.evaluations, result.evaluations)),
         )
-    if result.converged:
+    if last is not None:
+        # Where no finer mesh had an equilibrium, that of the finest which had one.
+        result, error, options = last
         _warn_if_inaccurate(error, rtol, options)
     return result
 
@@ -270,16 +288,16 @@ def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str 
 def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Options) -> SolverState:
     """On a mesh of more segments; elements where the coarse solution, if it is one, shows defects."""
     state = coarse.state
-    shape = state.shape
+    shape, shortest = state.shape, SHORTEST_IN_CONTACT if coarse.scene.obstacles else 0.0
     if isinstance(shape, FramedCurve):
         s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=shape.s.dtype)
         if defects is not None:
             is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
-            s = graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments)
+            s = graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments, shortest)
         shape = shape.on(s, shape.is_of_joints)
     elif isinstance(shape, Curve) and defects is not None:
         is_usable = coarse.converged & jnp.all(jnp.isfinite(defects))
-        shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments))
+        shape = shape.on(graded(shape.s, jnp.where(is_usable, defects, 1.0), options.segments, shortest))
     else:
         shape = Polyline.through(shape.points(options.segments))
     end_force = state.end_force

@@ -26,6 +26,9 @@ LEAST_GROWTH, MOST_GROWTH = 1.2, 4.0
 # The longest element is at most so many times as long as one of equal elements, and neighbours differ by this factor.
 LONGEST = 2.0
 GRADING = 2.0
+# The shortest where a rod lies deeper within an obstacle between nodes than at them, as contacts on both sides of an
+# element press on each other by its stiffness, EI/h^3.
+SHORTEST_IN_CONTACT = 1 / 8
 # Contacts press in with so high an order of the mesh, or not because of it.
 LEAST_ORDER = 1.5
 
@@ -55,11 +58,17 @@ def _at_least(wanted: float, discretization: str) -> int:
     return next((size for size in sizes if size >= wanted), sizes[-1])
 
 
-def graded(s: Float[Array, "n+1"], defects: Float[Array, "n"], segments: int) -> Float[Array, "k+1"]:
-    """Nodes of a mesh on which all elements would have the same defect, of fifth order in their length."""
+def graded(
+    s: Float[Array, "n+1"], defects: Float[Array, "n"], segments: int, shortest: float = 0.0
+) -> Float[Array, "k+1"]:
+    """Nodes of a mesh on which all elements would have the same defect, of fifth order in their length; `shortest`:
+    element, as a part of one of equal elements.
+    """
     h = jnp.diff(s)
     density = (defects + jnp.finfo(h.dtype).tiny) ** (1 / (ORDERS["hermite"] + 1)) / h
     density /= jnp.sum(density * h)
+    if shortest:
+        density = jnp.minimum(density, 1 / shortest)
     density = jnp.maximum(density, 1 / LONGEST)
 
     def spread(density, _):

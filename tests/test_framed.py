@@ -480,6 +480,10 @@ def test_a_column_under_a_tangential_force_flutters():
 
     # The cantilever's lowest is 3.51602, twice, in both planes; masses at 33 nodes leave 1e-3.
     np.testing.assert_allclose(squares(0.0)[:2], 2 * [3.51602**2], rtol=3e-3)
+    # By finite differences too, without a follower load: of second order.
+    clamped = rj.Rod(2.0, (3.0, 3.0), 2.0, 1e8, mass_per_length=0.5)
+    by_edges = rj.solve(rj.Scene(clamped, clamp, rj.Free()), segments=32, discretization="finite_difference")
+    np.testing.assert_allclose(rj.squared_frequencies(by_edges, 2) / unit, 2 * [3.51602**2], rtol=3e-3)
     below, above = squares(19.8), squares(20.3)
     assert np.max(np.abs(below.imag)) < 1e-6 * np.max(np.abs(below))
     assert np.min(below.real) > 0

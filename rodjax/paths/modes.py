@@ -7,8 +7,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, whole_number
+from rodjax.discretization.cells import JointCells
 from rodjax.discretization.form import Form, Linearization, Point
+from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve, cells_of
+from rodjax.discretization.framed_results import framed_on_elements
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.nodal_forms import NodalFrames
 from rodjax.linalg.saddle_point import factor
@@ -88,9 +91,13 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     """The displacements of the nodes under forces on them, nondimensional, and the mass that each node stands for."""
     scene, state = nondimensional(equilibrium.scene)[0], equilibrium.state
     assert isinstance(state.shape, FramedCurve)
+    cells, point = cells_of(scene, state.shape), state.point(equilibrium.total_twist)
+    if isinstance(cells, JointCells):
+        on_elements, point = framed_on_elements(FrameForm.of(scene, cells), point)
+        cells = on_elements.field
     # Forces on nodes are right sides where these have places of their own.
-    form = NodalFrames.of(scene, cells_of(scene, state.shape))
-    point = form.begun(state.point(equilibrium.total_twist), state.shape.nodes, state.pressures)
+    form = NodalFrames.of(scene, cells)
+    point = form.begun(point, state.shape.nodes, state.pressures)
     here = form.linearized(point)
     # A rod that can spin, or turn as a whole, is held softly.
     factors = factor(form.regular(here.system))

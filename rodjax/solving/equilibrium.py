@@ -480,7 +480,7 @@ def _discretization(
     """The one to take where none is asked for."""
     if isinstance(solver, NonlinearCG):
         return "finite_difference"
-    if scene.clips and needs_frames(scene):
+    if has_node_places(scene) or (scene.clips and needs_frames(scene)):
         return "hermite"
     if segments is None and isinstance(guess, Equilibrium) and _is_by_differences(guess.state.shape):
         return "finite_difference"

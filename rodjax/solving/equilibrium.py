@@ -154,8 +154,9 @@ def solve(
         curvature. The mesh of a guess that is an `Equilibrium` comes first. Where the numbers of the scene are not
         known, as inside `jit`, `vmap` and `grad`, it is that of the guess or one of 32 elements whatever `rtol`, of
         which a `MeshWarning` tells once; `error_estimate` says what that gives.
-    - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order.
-        `None`: that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
+    - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order,
+        not beside obstacles, and not with clips or under loads without a potential where frames are needed. `None`:
+        that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
         supports and gravity.

@@ -3,7 +3,8 @@
     python experiments/general_rods.py [--out docs] [--part bend princeton ...]
 
 Each row names what was computed, the mesh, the value, the reference and the relative difference. `time` compares a rod
-of two equal bending stiffnesses (frames) with the same rod of one (tangents): warm solves in turn, medians.
+of two equal bending stiffnesses (frames) with the same rod of one (tangents): warm solves in turn, medians; `pressure`
+those under a follower load on finer and finer meshes; `equal` counts where cold starts of both end.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from measuring import conditions, save_rows, set_up
+from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 
@@ -194,6 +196,50 @@ def timed() -> Iterator[Row]:
             yield row("time of a warm solve by frames, reference by tangents [ms]", mesh, frames, tangents, "")
 
 
+def pressure() -> Iterator[Row]:
+    """Warm solves under a pressure that grows by 2 %; the reference is 16 elements' time in proportion."""
+    rod, clamp = rj.Rod(1.0, (1.0, 2.0), 0.7, 1e6, mass_per_length=0.1), rj.Clamp((0, 0, 0), rj.frame((1, 0, 0)))
+    proportion = math.nan
+    for segments in (16, 64, 256, 512):
+
+        def scene(part: float) -> rj.Scene:
+            load = rj.DistributedForce((-8.0 * part, 0.0, 1.0), follower=True)
+            return rj.Scene(rod, clamp, rj.Free(), (0, 0, -9.81), distributed=[load])
+
+        result, seconds = rj.solve(scene(1.0), segments=segments), []
+        for k in range(1, 13):
+            begin = time.perf_counter()
+            result = jax.block_until_ready(rj.solve(scene(1.0 + 0.02 * k), segments=segments, guess=result))
+            seconds.append(time.perf_counter() - begin)
+        found = 1e3 * statistics.median(seconds[2:])
+        proportion = found / segments if segments == 16 else proportion
+        yield row("time of a warm solve under pressure [ms]", f"{segments} elements", found, proportion * segments, "")
+
+
+def equal(count: int = 350) -> Iterator[Row]:
+    """Cold starts with up to four turns: how many of rods (EI, EI) end in another minimum than EI."""
+
+    def scene(seed: int, EI: Any) -> rj.Scene:
+        generator = np.random.default_rng(seed)
+        frames = Rotation.from_quat(generator.normal(size=(2, 4))).as_matrix()
+        way = generator.normal(size=3)
+        way *= generator.uniform(0.2, 0.95) / np.linalg.norm(way)
+        rod = rj.Rod(1.0, EI, generator.uniform(0.5, 1.5), 1e6, generator.uniform(0, 3))
+        ends = rj.Clamp((0, 0, 0), frames[0]), rj.Clamp(way, frames[1])
+        return rj.Scene(rod, *ends, (0, 0, -9.81), turns=int(generator.integers(-4, 5)))
+
+    one, two = (
+        rj.solve_batch([scene(seed, EI) for seed in range(count)], segments=24, strain_limit=None)
+        for EI in (1.0, (1.0, 1.0))
+    )
+    # Beyond the errors of the mesh, and the energy of an almost straight rod.
+    differ = np.abs(np.asarray(two.energy) - one.energy) > 0.01 * (1 + np.abs(np.asarray(one.energy)))
+    case = f"(EI, EI) beside EI, {count} random starts with turns: in another minimum"
+    yield row(case, "24 elements", float(np.sum(differ)), 0.0, "")
+    frames, tangents = (float(np.mean(result.iterations)) for result in (two, one))
+    yield row("the same: iterations, reference of EI", "24 elements", frames, tangents, "")
+
+
 PARTS = {
     "bend": bend,
     "princeton": princeton,
@@ -203,6 +249,8 @@ PARTS = {
     "halves": halves,
     "follower": follower,
     "time": timed,
+    "pressure": pressure,
+    "equal": equal,
 }
 
 

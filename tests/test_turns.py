@@ -139,9 +139,9 @@ def test_equal_stiffnesses_and_one_come_to_the_same_shape():
     """A rod between clamps with stated turns may have several minima: a cold start by frames begins in the
     plain rod's. Random scenes in which both once came to different ones.
     """
-    for seed in (67, 105, 148):
+    for seed in (5, 34, 43):
         generator = np.random.default_rng(seed)
-        frames = Rotation.random(2, random_state=seed).as_matrix()
+        frames = Rotation.from_quat(generator.normal(size=(2, 4))).as_matrix()
         way = generator.normal(size=3)
         way *= generator.uniform(0.2, 0.95) / np.linalg.norm(way)
         GJ, mass = generator.uniform(0.5, 1.5), generator.uniform(0, 3)

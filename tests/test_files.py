@@ -247,7 +247,7 @@ def test_forces_of_spans_are_read(ends):
 @pytest.mark.slow
 def test_a_path_with_frames_comes_back(tmp_path):
     scenes = [dataclasses.replace(general_scene("steps"), gravity=jnp.array([0.0, 0.0, g])) for g in (-0.5, -0.6, -0.7)]
-    path = solve_path(scenes, segments=4, discretization="finite_difference")
+    path = solve_path(scenes, segments=4)
     assert np.all(path.converged)
     save(path, tmp_path / "rod.vtkhdf")
     assert_same(load(tmp_path / "rod.vtkhdf"), path)

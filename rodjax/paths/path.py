@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
-from rodjax.model.scene import Scene, between, has_potential, nondimensional, slides
+from rodjax.discretization.nodal_point import Nodal
+from rodjax.model.scene import Scene, between, has_node_places, has_potential, nondimensional, slides
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -267,7 +268,11 @@ def _step(
         )
 
     zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
-    nowhere = jax.tree.map(jnp.zeros_like, last.state.point(zero))
+    point = last.state.point(zero)
+    if point.nodal is None and has_node_places(scene):
+        nodes = last.state.shape.nodes
+        point = dataclasses.replace(point, nodal=Nodal(nodes, jnp.zeros((0, len(nodes)), nodes.dtype), nodes[:0, 0]))
+    nowhere = jax.tree.map(jnp.zeros_like, point)
     progress = _Progress(
         reached=last.state,
         begin=_predicted(last, before, scene),

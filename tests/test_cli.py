@@ -42,6 +42,34 @@ def test_solve_prints_and_writes_the_equilibrium(tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_solve_prints_what_clips_and_obstacles_do(tmp_path, capsys):
+    text = (SCENES / "hanging_cable.toml").read_text().replace("segments = 50", "segments = 16")
+    text += """
+[[clips]]
+at = "0.3 m"
+position = "[0.25, 0, -0.02] m"
+[[obstacles]]
+kind = "plane"
+point = "[0, 0, -0.12] m"
+normal = [0, 0, 1]
+"""
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    assert main(["solve", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    floor = next(line for line in out.splitlines() if line.endswith("obstacles[0] (Plane)"))
+    clip = next(line for line in out.splitlines() if line.startswith("clip 0"))
+    ends = [next(line for line in out.splitlines() if line.startswith(name)) for name in ("s = 0 ", "s = L")]
+    (_, _, up), (_, _, held) = (list(map(float, line.split()[k : k + 3])) for line, k in ((floor, 0), (clip, 2)))
+    first, last = (float(line.split()[5]) for line in ends)
+    # All together the weight, to the four digits that are printed.
+    weight = 1200 * np.pi * 0.005**2 * 9.81
+    assert up > 0.05 * weight
+    assert up + held + last - first == pytest.approx(weight, rel=2e-3)
+    assert "clearance to obstacles[0] (Plane)  " in out
+
+
 def test_solve_prints_one_row_a_scene_of_a_path_and_draws_the_last(tmp_path, capsys):
     picture = tmp_path / "a.png"
     assert main(["solve", str(SCENES / "figure_1.toml"), "--plot", str(picture)]) == 0

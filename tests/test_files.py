@@ -244,6 +244,16 @@ def test_forces_of_spans_are_read(ends):
     np.testing.assert_allclose(read.end_force, point.end_force, atol=1e-8)
 
 
+def test_results_that_no_form_has_are_refused(tmp_path):
+    """Rods by frames under loads without a potential by finite differences, as files until format 10 may have them."""
+    solved = solve(general_scene("numbers"), segments=4, discretization="finite_difference")
+    follower = (DistributedForce((0, 0.001, 1 / 300), follower=True),)
+    older = eqx.tree_at(lambda result: result.scene.distributed, solved, follower)
+    save(older, tmp_path / "rod.vtkhdf")
+    with pytest.raises(ValueError, match=r"rod\.vtkhdf is a result by finite differences .* solve its scene again"):
+        load(tmp_path / "rod.vtkhdf")
+
+
 @pytest.mark.slow
 def test_a_path_with_frames_comes_back(tmp_path):
     scenes = [dataclasses.replace(general_scene("steps"), gravity=jnp.array([0.0, 0.0, g])) for g in (-0.5, -0.6, -0.7)]

@@ -421,6 +421,15 @@ def elastica_from_the_end(end_force: float, pressure: float) -> np.ndarray:
     return np.array([-cosine * x + sine * z, 0, -sine * x - cosine * z])
 
 
+@pytest.mark.parametrize(
+    "load", [{"end": rj.Free((0, 0, 1), follower=True)}, {"distributed": [rj.DistributedCouple((0, 1, 0))]}]
+)
+def test_finite_differences_are_refused_under_loads_without_a_potential(load):
+    scene = rj.Scene(isotropic(True), START, **({"end": rj.Free()} | load))
+    with pytest.raises(ValueError, match="discretization must be 'hermite' under couples along the rod"):
+        rj.solve(scene, segments=8, discretization="finite_difference")
+
+
 def test_follower_loads_and_couples():
     """Inextensible references, of which EA = 1e6 is off by some 1e-6."""
     rod, clamp, tolerance = rj.Rod(1.0, 1.0, 0.7, 1e6), rj.Clamp((0, 0, 0), LEVEL), 3e-6

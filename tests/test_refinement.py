@@ -1,5 +1,6 @@
 """Estimated errors against true ones, meshes for a tolerance, and what is refused."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.interpolate import CubicSpline
 import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
 from rodjax.programs.compilation import program_count
+from rodjax.solving import equilibrium
 from rodjax.solving.equilibrium import TRACED_SEGMENTS, Discretization
 from rodjax.solving.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
@@ -202,3 +204,24 @@ def test_a_scene_that_does_not_converge_is_given_up():
 )
 def test_first_size(rtol, discretization, expected):
     assert first_size(rtol, discretization) == expected
+
+
+def test_the_finest_mesh_that_has_an_equilibrium_is_taken(monkeypatch):
+    """Where finer meshes fail it stays, with what it lacks told."""
+    coarse = rj.solve(rj.problems.hanging_cable(), segments=8)
+    solve, sizes = equilibrium._solve, []
+
+    def failing(scene, state, first, strain_limit, options):
+        result = solve(scene, state, first, strain_limit, options)
+        sizes.append(options.segments)
+        if len(sizes) == 1:
+            return result
+        broken = (rj.Status.LINE_SEARCH_FAILED + 0 * result.status, result.converged & False)
+        return eqx.tree_at(lambda result: (result.status, result.converged), result, broken)
+
+    monkeypatch.setattr(equilibrium, "_solve", failing)
+    with pytest.warns(rj.NotConvergedWarning, match="above rtol = 1e-06 on the finest mesh with an equilibrium"):
+        result = rj.solve(rj.problems.hanging_cable(), rtol=1e-6, guess=coarse)
+    assert len(sizes) > 1
+    assert result.s.shape == (9,)
+    assert result.converged

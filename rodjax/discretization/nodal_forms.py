@@ -5,10 +5,11 @@ Both differ from those with a force a span in the system and in what L is under 
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization import unconservative
+from rodjax.discretization import nonconservative
 from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
 from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
@@ -118,15 +119,15 @@ class NodalFrames(NodalForm, FrameForm):
     # --- loads without a potential -----------------------------------------------------------------------------------
 
     def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
-        return unconservative.following(self.scene, self._elements, self.field.of_cells(quaternions))
+        return nonconservative.following(self.scene, self._elements, self.field.of_cells(quaternions))
 
     def couples_along(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
-        return unconservative.couples_along(self.scene, self._elements, self.field.of_cells(quaternions))
+        return nonconservative.couples_along(self.scene, self._elements, self.field.of_cells(quaternions))
 
     def loads_on_nodes(self, point: FramePoint) -> Float[Array, "3 n+1"] | None:
         if self.has_potential:
             return None
-        loads = unconservative.on_nodes(self.scene, self._elements, self.field.of_cells(point.quaternions))
+        loads = nonconservative.on_nodes(self.scene, self._elements, self.field.of_cells(point.quaternions))
         return jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
 
     def end_forces(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -149,29 +150,31 @@ class NodalFrames(NodalForm, FrameForm):
         """The derivative of L by the rotations, less couples."""
         gradient = self.by_rotations(point.quaternions, point.end_force)
         if not self.has_potential:
-            gradient -= unconservative.couples(self.scene, self._elements, self.field.of_cells(point.quaternions))
+            gradient -= nonconservative.couples(self.scene, self._elements, self.field.of_cells(point.quaternions))
         return self.projected(self.field.assembled(gradient))
 
     def _load_rows(self, point: FramePoint) -> LoadRows:
         field, scene = self._elements, self.scene
         q = field.of_cells(point.quaternions)
         cells, base = self._cells(point.quaternions, point.end_force), self.through(point.end_force) + self.loads
-        kinematics, couples = self._kinematics(q), unconservative.couples(scene, field, q)
+        kinematics, couples = self._kinematics(q), nonconservative.couples(scene, field, q)
 
         def rows(turn: Float[Array, "3 3 n"]) -> tuple[Array, Array, Array]:
             """Of what the loads change alone: moments, gaps and the balance of nodes."""
             there = turned(q, turn)
-            following = unconservative.following(scene, field, there)
+            following = nonconservative.following(scene, field, there)
             forces = base if following is None else base + following
             # By the virtual work in what turns the frames, of which only half is a turn of the couple beside its frame.
             moments = first_derivatives(cells._replace(forces=forces)) - cross(turn, couples) / 2
-            moments -= unconservative.couples(scene, field, there)
+            moments -= nonconservative.couples(scene, field, there)
             ways = short_sum(self._strained(kinematics, forces).ways, axis=1)
-            return moments, -ways, -unconservative.on_nodes(scene, field, there)
+            return moments, -ways, -nonconservative.on_nodes(scene, field, there)
 
         along = field.of_cells(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
         alone = jnp.eye(q.shape[1], dtype=q.dtype)[None, :, None, :, None]
-        moments, ways, balance = unconservative.turned_rows(rows, along[:, None] * alone)
+        zero, turns = jnp.zeros_like(q[1:]), (along[:, None] * alone).reshape(-1, *q[1:].shape)
+        derivatives = jax.vmap(lambda turn: jax.jvp(rows, (zero,), (turn,))[1])(turns)
+        moments, ways, balance = (rows.reshape(3, 3, *rows.shape[1:]) for rows in derivatives)
         moments = jnp.einsum("xain,bjain->xibjn", along, moments)
         return LoadRows(moments, jnp.einsum("bjan->abjn", ways), jnp.einsum("bjkan->kabjn", balance))
 

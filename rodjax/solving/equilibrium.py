@@ -229,8 +229,9 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         )
     if last is not None:
         # Where no finer mesh had an equilibrium, that of the finest which had one.
+        mesh = "the finest mesh" if result is last[0] else "the finest mesh with an equilibrium"
         result, error, options = last
-        _warn_if_inaccurate(error, rtol, options)
+        _warn_if_inaccurate(error, rtol, options, mesh=mesh)
     return result
 
 
@@ -276,11 +277,13 @@ def _is_finest(options: Options) -> bool:
     return options.segments >= SIZES[options.discretization][-1]
 
 
-def _warn_if_inaccurate(error: float, rtol: float, options: Options, where: str = "") -> None:
+def _warn_if_inaccurate(
+    error: float, rtol: float, options: Options, where: str = "", mesh: str = "the finest mesh"
+) -> None:
     if not error <= rtol:
         warn(
             f"the estimated error {error:.1e} (of the shape, or a tenth of that of forces, moments or curvature) is "
-            f"above rtol = {rtol:g}{where} on the finest mesh, of {options.segments} segments",
+            f"above rtol = {rtol:g}{where} on {mesh}, of {options.segments} segments",
             NotConvergedWarning,
         )
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import Form, Point
-from rodjax.discretization.unconservative import scaled, without
+from rodjax.discretization.nonconservative import conservative, scaled
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium
 from rodjax.solving.status import Outcome, is_converged
 
@@ -34,12 +34,12 @@ class _State(eqx.Module):
 
 def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> NewtonEnd:
     """The equilibrium of a form with node places, from a point, which is one under other loads if it is not cold."""
-    calm: Form = dataclasses.replace(form, scene=without(form.scene))
+    without: Form = dataclasses.replace(form, scene=conservative(form.scene))
     count = jnp.zeros((), int)
     outcome = Outcome(jnp.zeros_like(point.total_twist), count, count, count)
     begin = jax.lax.cond(
         is_cold,
-        lambda: find_equilibrium(calm, point, solver, find),
+        lambda: find_equilibrium(without, point, solver, find),
         lambda: NewtonEnd(point, outcome, jnp.array(False)),
     )
 

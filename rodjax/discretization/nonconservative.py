@@ -83,25 +83,14 @@ def couples(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"
     return total
 
 
-def turned_rows(function: Any, directions: Float[Array, "b 3 3 3 n"]) -> Any:
-    """The derivatives of a function of rotations of the frames of elements, by rotations along b axes of each of the
-    three: as its results, with two leading axes.
-    """
-    b, points = directions.shape[:2]
-    zero = jnp.zeros_like(directions[0, 0])
-    flat = directions.reshape(b * points, *zero.shape)
-    rows = jax.vmap(lambda direction: jax.jvp(function, (zero,), (direction,))[1])(flat)
-    return jax.tree.map(lambda rows: rows.reshape(b, points, *rows.shape[1:]), rows)
-
-
-def without(scene: Scene) -> Scene:
+def conservative(scene: Scene) -> Scene:
     """The scene without these loads."""
-    dead = [load for load in scene.distributed if not _is_unconservative(load)]
+    dead = [load for load in scene.distributed if not _is_nonconservative(load)]
 
-    def calm(end: Support) -> Support:
+    def dead_alone(end: Support) -> Support:
         return Free(None if end.follower else end.force) if isinstance(end, Free) else end
 
-    ends = calm(scene.start), calm(scene.end)
+    ends = dead_alone(scene.start), dead_alone(scene.end)
     return eqx.tree_at(lambda scene: (scene.distributed, scene.start, scene.end), scene, (tuple(dead), *ends))
 
 
@@ -109,7 +98,7 @@ def scaled(scene: Scene, part: Float[Array, ""]) -> Scene:
     """The scene with a part of these loads."""
 
     def of(load: Any) -> Any:
-        return jax.tree.map(lambda leaf: part * leaf, load) if _is_unconservative(load) else load
+        return jax.tree.map(lambda leaf: part * leaf, load) if _is_nonconservative(load) else load
 
     def at(end: Support) -> Support:
         if not isinstance(end, Free):
@@ -124,5 +113,5 @@ def scaled(scene: Scene, part: Float[Array, ""]) -> Scene:
     )
 
 
-def _is_unconservative(load: Any) -> bool:
+def _is_nonconservative(load: Any) -> bool:
     return isinstance(load, DistributedCouple) or load.follower

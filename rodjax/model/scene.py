@@ -323,10 +323,11 @@ def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
 
 def needs_frames(scene: Scene) -> bool:
     """Whether the rod, its loads or clips ask for the angle of the sections about the tangent, all along the rod."""
-    holds_frames = any(clip.frame is not None for clip in scene.clips)
-    follows = _follows(scene.start) or _follows(scene.end)
-    twists = bool(scene.obstacles) and dead_end_moment(scene) is not None
-    return bool(scene.distributed) or not scene.rod.is_plain or follows or holds_frames or twists
+    if scene.distributed or not scene.rod.is_plain or _follows(scene.start) or _follows(scene.end):
+        return True
+    if scene.clips and any(clip.frame is not None for clip in scene.clips):
+        return True
+    return bool(scene.obstacles) and dead_end_moment(scene) is not None
 
 
 def with_plain_rod(scene: Scene) -> Scene:

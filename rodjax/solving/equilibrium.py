@@ -501,6 +501,8 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
         state = guess.state
         first = last_twist(guess)
         if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
+            if not scene.obstacles and state.clip_moments is None:
+                return state, first
             before = _before(scene, guess)
             pressures = _pressures(scene, options, state)
             return dataclasses.replace(state, clip_moments=None, before=before, pressures=pressures), first

@@ -2,13 +2,27 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax import Clamp, Clip, DistributedCouple, DistributedForce, Free, Pin, PointForce, Rod, Scene, Steps, Swivel
+from rodjax import (
+    Clamp,
+    Clip,
+    DistributedCouple,
+    DistributedForce,
+    Free,
+    Pin,
+    PointForce,
+    Potential,
+    Rod,
+    Scene,
+    Steps,
+    Swivel,
+)
 from rodjax.solving.equilibrium import checked_options
 
 SEGMENTS = 8
@@ -22,6 +36,10 @@ class Stiffening(rj.Law):
     def __call__(self, curvature, twist, axial_strain, s):
         bending = curvature[0] ** 2 / 2 + curvature[1] ** 2 / 2 + 0.01 * curvature[1] ** 4
         return bending + 0.35 * twist**2 + 5e3 * axial_strain**2
+
+
+def bedding(position, s):
+    return 10.0 * position[2] ** 2
 
 
 def rod(EI=1.0, **more) -> Rod:
@@ -52,6 +70,7 @@ FEATURES = {
         "point force": {"point_forces": [PointForce(0.6, (0.0, 0.0, 2.0))]},
         "uniform force": {"distributed": [DistributedForce((0.0, 0.0, 2.0))]},
         "follower force along": {"distributed": [DistributedForce((0.5, 0.0, 0.0), follower=True)]},
+        "field": {"potentials": [Potential(bedding)]},
         "couple along": {"distributed": [DistributedCouple((0.0, 0.5, 0.0))]},
         "end force": {"end": {"force": (0.0, 0.0, 2.0)}},
         "end moment": {"end": {"moment": (0.0, 1.0, 0.0)}},
@@ -115,7 +134,7 @@ def test_what_is_refused_is_listed():
         assert any(reason in message for reason in PHYSICS), message
     for reason in PHYSICS:
         assert any(reason in message for message in messages), reason
-    assert (len(pairs()), len(messages)) == (224, 2)
+    assert (len(pairs()), len(messages)) == (241, 2)
 
 
 def solved(names: dict[str, str]) -> rj.Equilibrium:
@@ -123,7 +142,7 @@ def solved(names: dict[str, str]) -> rj.Equilibrium:
     assert scene is not None
     result = rj.solve(scene, segments=SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
     assert result.converged, rj.describe(result)
-    if "follower" in names.get("load", ""):
+    if any(kind in names.get("load", "") for kind in ("follower", "field")):
         return result
     loads = scene.rod.mass_per_length * scene.gravity
     loads += sum((load.force for load in scene.point_forces), jnp.zeros(3))
@@ -144,6 +163,7 @@ TOGETHER = [
     {"rod": "curved", "clip": "frame", "obstacle": "floor"},
     {"load": "follower force along", "clip": "sliding", "obstacle": "floor"},
     {"ends": "pins", "clip": "sliding tangent"},
+    {"rod": "curved", "load": "field", "clip": "sliding", "obstacle": "floor"},
     {"ends": "clamp and free", "load": "end moment", "obstacle": "floor"},
 ]
 
@@ -168,10 +188,7 @@ def test_every_pair_solves_and_has_derivatives(names):
 
     def tip(scale):
         scene = scene_of(names)
-        scaled = Scene(
-            scene.rod, scene.start, scene.end, scale * scene.gravity, scene.point_forces, None, scene.distributed,
-            scene.clips, scene.obstacles,
-        )  # fmt: skip
+        scaled = eqx.tree_at(lambda scene: scene.gravity, scene, scale * scene.gravity)
         result = rj.solve(scaled, segments=SEGMENTS, planar=FEATURES["planar"][names.get("planar", "no")])
         return jnp.sum(result.nodes**2)
 

@@ -226,6 +226,7 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
         jnp.asarray(stiffness + stiffness.transpose(0, 2, 1)),
         ContactRows(jnp.asarray(normals), jnp.asarray(1e-5), jnp.asarray(is_closed)),
         jnp.asarray(held),
+        turning=jnp.asarray(rng.normal(size=(2, 3, elements + 1)) / 2),
     )
 
 

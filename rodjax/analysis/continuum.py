@@ -132,6 +132,8 @@ def solve_continuum(
         raise ValueError("clips must be () in the continuum for a rod, loads or clips that need frames along the rod")
     if scene.obstacles:
         raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
+    if scene.potentials:
+        raise ValueError("potentials must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)

@@ -23,7 +23,7 @@ from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import HermiteElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
-from rodjax.discretization.results import clip_moments, resultants
+from rodjax.discretization.results import clip_moments, resultants, with_fields_by_tangent
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
 from rodjax.linalg.blocks import partial_sums, short_sum
@@ -194,14 +194,17 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     def at_ends(by_point: Float[Array, "3 m"]) -> Float[Array, "3 2 n"]:
         return jnp.stack([by_point[:, 0:-1:2], by_point[:, 2::2]], axis=1)
 
-    forces, ends = forces_of(point.end_force), at_ends(tangents)
-    by_ends, further = field.by_end_tangents_linearized(scene, tangents, forces[:, ::2], torque)
+    ends = at_ends(tangents)
+    through = forces_of(point.end_force)
+    by_ends, further = field.by_end_tangents_linearized(scene, tangents, through[:, ::2], torque)
+    by_ends = with_fields_by_tangent(form.fields_on_elements(point), by_ends)
+    forces = form.with_fields(point, through)
     bending_moments = turned_about(ends, by_ends)
     moments = jnp.concatenate([bending_moments[:, 0, :1], bending_moments[:, 1]], axis=1)
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
-    last, passed = _integrated(form, field, point, torque, first)
+    last, passed = _integrated(form, field, forces, torque, first)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
     # a twist.
@@ -246,7 +249,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
 
     # The first multiplier is the torque, where there is one.
     torque_change = motion.multipliers[0] if form.has_torsion or not form.has_potential else jnp.zeros_like(torque)
-    section_change = jnp.broadcast_to(forces_of(end_force) - forces, forces.shape)
+    section_change = jnp.broadcast_to(forces_of(end_force) - through, forces.shape)
     turned_ends = at_ends(turned)
     bending_change = turned_about(turned_ends, by_ends) + jnp.stack([-at_start, at_end], axis=1)
     bending_change += turned_about(ends, further(turned, section_change[:, ::2], torque_change))
@@ -279,17 +282,20 @@ def _axial_error(
 
 
 def _integrated(
-    form: MixedForm, field: HermiteElements, point: MixedPoint, torque: Float[Array, ""], first: Section
+    form: MixedForm, field: HermiteElements, forces: Float[Array, "3 3 n"], torque: Float[Array, ""], first: Section
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
     scene, rod = form.scene, form.scene.rod
-    force = form.forces(point)[:, 0]
-    weight = jnp.zeros(3, force.dtype) if scene.gravity is None else scene.gravity
+    start, middle, end = (forces[:, k] for k in range(3))
+    weight = jnp.zeros(3, start.dtype) if scene.gravity is None else scene.gravity
     step = field.h / STEPS
 
     def slope(section: Section, s: Float[Array, "n"]) -> Section:
         """Derivatives by arclength, at s from the first node."""
-        n = force - weight[:, None] * s[None]
+        n = start - weight[:, None] * s[None]
+        if scene.potentials:
+            x = (s / field.h)[None]
+            n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
         way = (1 + axial_strain_under(rod, dot(n, tangent)))[None] * tangent
         turn = cross(curvature_under(rod, section.moment), tangent)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
 from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.potentials import OnElements
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.model.scene import Scene
@@ -220,6 +221,16 @@ class Form(eqx.Module):
     def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """The point with what it has beside obstacles, of nodes and pressures."""
         return point
+
+    def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
+        """The forces through the rod at start, middle and end of the elements, where `forces` leave the fields out that
+        act along them.
+        """
+        return forces
+
+    def fields_on_elements(self, point: Any) -> OnElements | None:
+        """`None` without fields."""
+        return None
 
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
         return self.nodes(self.edges(point)) if point.nodal is None else point.nodal.places

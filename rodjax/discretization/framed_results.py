@@ -77,7 +77,16 @@ def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
     couples = form.couples_along(q)
     if couples is not None:
         by_cells -= couples
-    return rotated(form.field.of_cells(q), by_cells)
+    own, fields = rotated(form.field.of_cells(q), by_cells), form.fields_on_elements(point)
+    if fields is None:
+        return own
+    ends = tangent(form.field.of_cells(q)[:, ::2])
+    return own.at[:, ::2].add(cross(ends, fields.by_tangent))
+
+
+def section_forces(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
+    """The forces through the rod at the strain points."""
+    return form.with_fields(point, form.forces(point.quaternions, point.end_force))
 
 
 def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
@@ -90,7 +99,7 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
     if form.clip_nodes is not None:
         moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
-    forces = form.forces(point.quaternions, point.end_force)
+    forces = section_forces(form, point)
     first, last = forces[:, 0], forces[:, 2]
     # On the side of the element beyond, at the end of the one before.
     beyond = jnp.concatenate([first, last[:, -1:]], axis=1)
@@ -130,7 +139,7 @@ def _strains_at_ends(
     """Curvature along d1 and d2 and twist at both ends of each element under these moments, and axial strain."""
     field = form.field
     q = field.of_cells(point.quaternions)[:, ::2]
-    tension = dot(form.forces(point.quaternions, point.end_force)[:, ::2], tangent(q))
+    tension = dot(section_forces(form, point)[:, ::2], tangent(q))
     sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
     sections = eqx.combine(sections, form.sections)
     strains, axial = sections.strains_under(rotated(inverse(q), moments), tension)
@@ -252,7 +261,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     turn = 2 * jnp.where(turn[0] < 0, -1.0, 1.0).astype(q.dtype)[None] * turn[1:]  # small
     edges = form.edges(point).T
     middles = q[:, 1::2]
-    force = form.forces(q, point.end_force)[:, 1]
+    force = section_forces(form, point)[:, 1]
     gap = last.way - edges - field.h[None] / 2 * cross(turn, tangent(middles))
     couple = last.moment - ends[:, 1] + cross(last.way - edges, force)
 
@@ -284,9 +293,9 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
 
     # A difference, as a derivative of these would be a third one of the energy.
     there = form.moved(point, here.bases, motion.rotation, change)
-    before = form.forces(q, point.end_force), ends, _strains_at_ends(form, point, ends)[0][:2]
+    before = section_forces(form, point), ends, _strains_at_ends(form, point, ends)[0][:2]
     moments = _end_moments(lacking(1.0), there).at[:, 1].add(couple)
-    after = form.forces(there.quaternions, there.end_force), moments, _strains_at_ends(form, there, moments)[0][:2]
+    after = section_forces(form, there), moments, _strains_at_ends(form, there, moments)[0][:2]
     changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
@@ -298,7 +307,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
     """The sections at the ends of the elements, by the rule of Runge and Kutta."""
     h = field.h
     # Between the three points of an element, all along the rod that varies is a parabola; so are forces.
-    forces = form.forces(point.quaternions, point.end_force)
+    forces = section_forces(form, point)
     sections = form.sections
     rest = form.scene.rod.rest_shape
     couples = form.couples_along(point.quaternions)

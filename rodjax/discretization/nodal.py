@@ -27,9 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rodjax.discretization import potentials
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal_point import Nodal, NodalChange
+from rodjax.discretization.potentials import NodeEnergy, OnElements
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows
@@ -77,6 +79,10 @@ class NodalForm(Form):
     @abstractmethod
     def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
         """The derivative of the centerline by arclength at the nodes."""
+
+    @abstractmethod
+    def node_axes(self, point: Any) -> Float[Array, "3 b n+1"]:
+        """About which the tangents of the nodes turn, by rotations that are unknown."""
 
     @abstractmethod
     def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
@@ -140,13 +146,14 @@ class NodalForm(Form):
 
     def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
-        if point.end_force.shape[1] != len(nodes) - 1:
-            point = dataclasses.replace(point, end_force=self._in_elements(point))
         nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
         nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0]))
         assert nodal is not None
+        point = dataclasses.replace(point, nodal=nodal)
+        if point.end_force.shape[1] != len(nodes) - 1:
+            point = dataclasses.replace(point, end_force=self._in_elements(point))
         if not self.scene.obstacles:
-            return dataclasses.replace(point, nodal=nodal)
+            return point
         gaps, normals = self.gaps_and_normals(nodal.places)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
@@ -170,7 +177,42 @@ class NodalForm(Form):
 
     def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
         """By which the forces of two elements differ, beside what is applied to the node between; `None` for none."""
-        return None
+        if not self.scene.potentials:
+            return None
+        return -potentials.by_place(self.scene, self.field.s, *self._node_lines(point)).T
+
+    def _node_lines(self, point: Any) -> tuple[Float[Array, "n+1 3"], Float[Array, "3 n+1"]]:
+        return point.nodal.places, point.tangents[:, ::2]
+
+    def at_nodes(self, point: Any) -> NodeEnergy | None:
+        """What fields are at the nodes, by the rotations that are unknown; `None` without fields."""
+        if not self.scene.potentials:
+            return None
+        return potentials.at_nodes(self.scene, self.field.s, *self._node_lines(point), self.node_axes(point))
+
+    def fields_on_elements(self, point: Any) -> OnElements | None:
+        if not self.scene.potentials:
+            return None
+        return potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
+
+    def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
+        fields = self.fields_on_elements(point)
+        return forces if fields is None else potentials.section_forces(forces, fields, jnp.diff(self.field.s))
+
+    def load_energy(self, point: Any) -> Float[Array, ""]:
+        energy = super().load_energy(point)  # pyright: ignore
+        if not self.scene.potentials:
+            return energy
+        return energy + jnp.sum(potentials.node_energies(self.scene, self.field.s, *self._node_lines(point)))
+
+    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        start, end = super().end_forces(point)
+        if not self.scene.potentials:
+            return start, end
+        loads = -potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
+        # Of those that are held; a given force is one.
+        start = start + loads[0] if isinstance(self.scene.start, Held) else start
+        return start, end - loads[-1] if isinstance(self.scene.end, Held) else end
 
     def applied(self, point: Any) -> Float[Array, "3 n+1"]:
         """What clips, contacts and supports apply at the nodes."""
@@ -322,6 +364,9 @@ class NodalForm(Form):
         contacts, nodal = here.system.contacts, point.nodal
         seen = nodal.pressures - (here.gaps + nodal.relaxed[:, None]) / self.softness
         rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(others.displacements))
+        if self.scene.potentials:
+            by_place = potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
+            rate += jnp.sum(by_place * others.displacements)
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:

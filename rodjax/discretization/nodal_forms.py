@@ -7,22 +7,22 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization import nonconservative
 from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
 from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
-from rodjax.discretization.framed import FrameForm, FramePoint, Kinematics
+from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm, FramePoint, Kinematics
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.geometry.rotations import rotated, turned
+from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
-from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.blocks import product, short_sum
 from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene
@@ -40,8 +40,15 @@ class NodalTangents(NodalForm, MixedForm):
     def out_of_plane(self, normal: Float[Array, "3"]) -> "NodalTangents":
         return dataclasses.replace(self, axes=None, layout=self.layout.in_axes(None))
 
+    def stays_in_plane(self, point: MixedPoint) -> Bool[Array, ""]:
+        residual = dataclasses.replace(self, axes=None).linearized(point).residual
+        return residual <= OUT_OF_PLANE * (1 + jnp.max(jnp.abs(self.forces(point))))
+
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
         return self.slopes(point)[:, ::2].T
+
+    def node_axes(self, point: MixedPoint) -> Float[Array, "3 b n+1"]:
+        return cross(point.tangents[:, None, ::2], self.bases_at(point)[..., ::2])
 
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
@@ -58,6 +65,12 @@ class NodalTangents(NodalForm, MixedForm):
         columns = [] if torque_column is None else [torque_column]
         by_point = map(field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *columns))
         gradient, diagonal, lengths, *columns = by_point
+        fields, stiffness = self.at_nodes(point), contacts.stiffness
+        if fields is not None:
+            gradient = gradient.at[:, ::2].add(fields.by_rotation)
+            diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
+            stiffness += fields.by_places
+            energy += jnp.sum(fields.energy)
         if softness is None:
             border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
@@ -73,9 +86,10 @@ class NodalTangents(NodalForm, MixedForm):
             compliance,
             cells.by_force,
             self.layout.compliance(cells.compliance),
-            contacts.stiffness,
+            stiffness,
             contacts.rows,
             self.is_held,
+            turning=None if fields is None else fields.turning,
             is_backward=not isinstance(self.scene.start, Held),
         )
         return Linearization(
@@ -116,6 +130,9 @@ class NodalFrames(NodalForm, FrameForm):
         strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
         return ((1 + strain)[None] * point.tangents)[:, ::2].T
 
+    def node_axes(self, point: FramePoint) -> Float[Array, "3 3 n+1"]:
+        return product(columns(point.quaternions[:, ::2]), self._projections[..., ::2])
+
     # --- loads without a potential -----------------------------------------------------------------------------------
 
     def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
@@ -125,15 +142,18 @@ class NodalFrames(NodalForm, FrameForm):
         return nonconservative.couples_along(self.scene, self._elements, self.field.of_cells(quaternions))
 
     def loads_on_nodes(self, point: FramePoint) -> Float[Array, "3 n+1"] | None:
+        of_fields = super().loads_on_nodes(point)
         if self.has_potential:
-            return None
+            return of_fields
         loads = nonconservative.on_nodes(self.scene, self._elements, self.field.of_cells(point.quaternions))
-        return jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
+        total = jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
+        return total if of_fields is None else total + of_fields
 
     def end_forces(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         if self.has_potential:
             return super().end_forces(point)
-        q, forces = point.quaternions, self.forces(point.quaternions, point.end_force)
+        q = point.quaternions
+        forces = self.with_fields(point, self.forces(q, point.end_force))
         found = [forces[:, 0, 0], forces[:, -1, -1]]
         for end, k, sign in ((self.scene.start, 0, -1), (self.scene.end, -1, 1)):
             if isinstance(end, Free):
@@ -190,6 +210,10 @@ class NodalFrames(NodalForm, FrameForm):
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         if not self.has_potential:
             gradient = self._moments(point)
+        fields = self.at_nodes(point)
+        if fields is not None:
+            gradient = gradient.at[:, ::2].add(fields.by_rotation)
+            diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
         assert across is not None, "elements, not joints"
         contacts = self.contacts(point)
         assert point.nodal is not None
@@ -203,19 +227,21 @@ class NodalFrames(NodalForm, FrameForm):
             jnp.zeros((0, 0), dtype),
             self._by_force(cells),
             self.layout.compliance(cells.compliance),
-            contacts.stiffness,
+            contacts.stiffness if fields is None else contacts.stiffness + fields.by_places,
             contacts.rows,
             self.is_held,
             None if self.has_potential else self._load_rows(point),
+            None if fields is None else fields.turning,
             is_backward=not isinstance(self.scene.start, Held),
         )
         gaps = self.gap_of_elements(point, cells.way.T)
+        energy = jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0))
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
             closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=system,
-            energy=jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
+            energy=energy if fields is None else energy + jnp.sum(fields.energy),
             residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, self._residual(gradient))),
             gaps=contacts.gaps,
         )
@@ -227,7 +253,9 @@ class NodalFrames(NodalForm, FrameForm):
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
-        gradient = self._moments(point)
+        gradient, fields = self._moments(point), self.at_nodes(point)
+        if fields is not None:
+            gradient = gradient.at[:, ::2].add(fields.by_rotation)
         contacts = self.contacts(point)
         rows, balance, _ = self.unbalanced_contacts(point, contacts)
         gaps = self.gap_of_elements(point, self.edges(point))

@@ -10,6 +10,7 @@ from rodjax.discretization.hermite import HermiteElements
 from rodjax.discretization.joints import Joints, bending_derivatives, tangent_bases, twist_derivatives
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import held_nodes
+from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.twist import angle_about, transport, transport_along
 from rodjax.geometry.vectors import cross, dot, root
 from rodjax.mechanics.energy import axial_strain_under, curvature_under, torque_at
@@ -46,14 +47,17 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
     torque = torque_at(rod, point.total_twist)
-    section_forces = form.forces(point)[:, ::2]
-    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
+    by_start, by_end = _by_ends(form, field, point, torque)
     moments = cross(nodes, jnp.concatenate([-by_start[:, :1], by_end], axis=1))
     curvatures = curvature_under(rod, moments)
     curvature = root(dot(curvatures, curvatures))
     moments += torque * nodes
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
+    if scene.potentials:
+        sections = form.with_fields(point, form.forces(point))[:, ::2] * field.h[None, None]
+        beside = jnp.pad(sections[:, 0], ((0, 0), (0, 1))) + jnp.pad(sections[:, 1], ((0, 0), (1, 0)))
+        tension = dot(beside, nodes) / (jnp.pad(field.h, (0, 1)) + jnp.pad(field.h, (1, 0)))
     number = jnp.arange(len(tension))
     for k, force in zip((0, len(tension) - 1), forces, strict=True):
         tension = jnp.where(number == k, dot(force[:, None], nodes), tension)
@@ -71,6 +75,23 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     )
 
 
+def _by_ends(
+    form: MixedForm, field: HermiteElements, point: MixedPoint, torque: Float[Array, ""]
+) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
+    """The derivatives of L of each element by the tangents of its nodes."""
+    by_ends = field.by_end_tangents(form.scene, point.tangents, form.forces(point)[:, ::2], torque)
+    return with_fields_by_tangent(form.fields_on_elements(point), by_ends)
+
+
+def with_fields_by_tangent(
+    fields: OnElements | None, by_ends: tuple[Float[Array, "3 n"], Float[Array, "3 n"]]
+) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
+    """With what fields add to these."""
+    if fields is None:
+        return by_ends
+    return by_ends[0] + fields.by_tangent[:, 0], by_ends[1] + fields.by_tangent[:, 1]
+
+
 def positions_between(
     form: MixedForm, point: MixedPoint, nodes: Float[Array, "n+1 3"], s: Float[Array, "k"]
 ) -> Float[Array, "k 3"]:
@@ -81,24 +102,28 @@ def positions_between(
     assert isinstance(field, HermiteElements)
     rod, tangents = scene.rod, point.tangents
     torque = torque_at(rod, point.total_twist)
-    section_forces = form.forces(point)[:, ::2]
-    by_start, by_end = field.by_end_tangents(scene, tangents, section_forces, torque)
-    forces = form.forces(point)
+    by_start, by_end = _by_ends(form, field, point, torque)
+    forces = form.with_fields(point, form.forces(point))
     weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
+    fields = form.fields_on_elements(point)
+    weights = [weight[:, None], weight[:, None]]
     cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
 
-    def derivatives(tangent, force, moment) -> tuple[Float[Array, "3 k"], Float[Array, "3 k"]]:
+    if fields is not None:
+        weights = [weight[:, None] + fields.density[:, k, cell] for k in range(2)]
+
+    def derivatives(tangent, force, moment, weight) -> tuple[Float[Array, "3 k"], Float[Array, "3 k"]]:
         turn = cross(curvature_under(rod, moment), tangent)
         strain, softening = jax.jvp(
             lambda tension: axial_strain_under(rod, tension),
             (dot(force, tangent),),
-            (dot(force, turn) - weight @ tangent,),
+            (dot(force, turn) - dot(jnp.broadcast_to(weight, tangent.shape), tangent),),
         )
         return (1 + strain)[None] * tangent, (1 + strain)[None] * turn + softening[None] * tangent
 
     start, end = tangents[:, 0:-1:2][:, cell], tangents[:, 2::2][:, cell]
-    slope, bend = derivatives(start, forces[:, 0, cell], -cross(start, by_start[:, cell]))
-    end_slope, end_bend = derivatives(end, forces[:, 2, cell], cross(end, by_end[:, cell]))
+    slope, bend = derivatives(start, forces[:, 0, cell], -cross(start, by_start[:, cell]), weights[0])
+    end_slope, end_bend = derivatives(end, forces[:, 2, cell], cross(end, by_end[:, cell]), weights[1])
     h = field.h[cell]
     x = (s - field.s[cell]) / h
     # From the first node: what the way, the slopes and the second derivatives add.
@@ -120,8 +145,7 @@ def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
     moments = [jnp.zeros(3, tangents.dtype)] * len(scene.clips)
     directed = held_nodes(scene, field.clip_nodes)
     if isinstance(field, HermiteElements):
-        section_forces = form.forces(point)[:, ::2]
-        by_ends = field.by_end_tangents(scene, tangents, section_forces, torque_at(scene.rod, point.total_twist))
+        by_ends = _by_ends(form, field, point, torque_at(scene.rod, point.total_twist))
         for k, node, _ in directed:
             moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])
     else:

@@ -177,6 +177,8 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
             f"equilibrium.scene.rod.law must be None, got a {type(equilibrium.scene.rod.law).__name__}: "
             "a law is code, which cannot be saved"
         )
+    if equilibrium.scene.potentials:
+        raise ValueError("equilibrium.scene.potentials must be (): a potential is code, which cannot be saved")
     _check_obstacles(equilibrium.scene.obstacles, "equilibrium.scene.obstacles", MOST_UNIONS)
     leading = equilibrium.s.shape[:-1]
     if len(leading) > 1:

@@ -22,8 +22,8 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
     """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
 
     The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, for a rod of
-    `Rod.from_centerline` or with a law, and for meshes and obstacles of one's own, which a file cannot hold; `OSError`
-    where it cannot be written.
+    `Rod.from_centerline` or with a law, and for potentials, meshes and obstacles of one's own, which a file cannot
+    hold; `OSError` where it cannot be written.
 
     Of the loads along the rod the file keeps the order among the forces and among the couples.
     """
@@ -35,6 +35,10 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
     if scene.rod.law is not None:
         raise ValueError("scene.rod.law must be None to be written: a law is code, which a scene file cannot hold")
+    if scene.potentials:
+        raise ValueError(
+            "scene.potentials must be () to be written: a potential is code, which a scene file cannot hold"
+        )
     if scene.rod.rest_centerline is not None:
         raise ValueError(
             "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "

@@ -6,9 +6,9 @@ multiplier of its way from node to node, the pressure that of a gap. Pressures a
 then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
 displacement, coupled with those of its neighbours only: O(n).
 
-    rotation     H theta + B F + border y = f
+    rotation     H theta + B F + T u + border y = f
     gap          B^T theta - C F + u_after - u_before = gap,       for each element
-    balance      S u - N p + F_before - F_after = balance,         for each node that is not held
+    balance      S u + T^T theta - N p + F_before - F_after = balance,   for each node that is not held
     border       border^T theta - compliance y = c
     pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
 
@@ -75,7 +75,8 @@ class ChainSystem(eqx.Module):
 
     `diagonal`, `lower`, `across`: the blocks of H, as in `saddle_point.SaddlePointSystem`; `by_force`: those of B at
     start, middle and end of each element; `cell_compliance`: C; `stiffness`: S; `contacts`: N; `held`: the nodes whose
-    place is given. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
+    place is given; `turning`: T, of what a field of forces has of both the place and the rotation of a node, `None` for
+    none. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
     `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or touches has no
     pivot. `loads`: `None` where all have a potential.
     """
@@ -91,6 +92,7 @@ class ChainSystem(eqx.Module):
     contacts: ContactRows
     held: Bool[Array, "n+1"]
     loads: LoadRows | None = None
+    turning: Float[Array, "b 3 n+1"] | None = None
     is_backward: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> "ChainSystem":
@@ -109,6 +111,7 @@ class ChainSystem(eqx.Module):
             stiffness=self.stiffness[::-1],
             held=self.held[::-1],
             loads=None if self.loads is None else self.loads.mirrored(),
+            turning=None if self.turning is None else self.turning[..., ::-1],
         )
 
     def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
@@ -147,6 +150,9 @@ class ChainSystem(eqx.Module):
             gap += jnp.einsum("acjn,cjn->na", self.loads.way, ends)
             of_nodes = jnp.einsum("kacjn,cjn->kna", self.loads.balance, ends)
             balance += _on_nodes(*of_nodes)
+        if self.turning is not None:
+            f = f.at[:, ::2].add(jnp.einsum("icn,nc->in", self.turning, moved))
+            balance += jnp.einsum("icn,in->nc", self.turning, x[:, ::2])
         balance = jnp.where(self.held[:, None], u, balance)
         gaps = -jnp.where(is_closed, self.contacts.rates(moved) + self.contacts.softness * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
@@ -302,6 +308,9 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     pushed = free[1:, None, None] * identity[None]
     blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
     blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
+    if system.turning is not None:
+        turning = system.turning.transpose(2, 0, 1) * free[:, None, None]
+        blocks = blocks.at[:, turn, place].set(turning).at[:, place, turn].set(turning.transpose(0, 2, 1))
     below = jnp.zeros((n, b + 6, b + 6), dtype)
     below = below.at[:, turn, turn].set(elements[:, end, start]).at[:, pull, turn].set(elements[:, gap, start])
     below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])

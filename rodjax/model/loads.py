@@ -1,11 +1,15 @@
 """Loads along the rod. Gravity is a vector of the scene; loads on a free end belong to `Free`."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, leaf, not_negative, vector
+from rodjax.checks import instance, leaf, not_negative, shown, vector
 from rodjax.units import Units
 
 
@@ -59,3 +63,68 @@ class DistributedCouple(eqx.Module):
 
     def in_units(self, units: Units) -> "DistributedCouple":
         return DistributedCouple(self.couple * (units.length / units.energy), self.follower)
+
+
+class Potential(eqx.Module):
+    """A field of forces all along the rod: buoyancy, an elastic bedding, a magnet.
+
+    `density`: from a position (3,) [m] and the arclength [m] to the energy per reference length () [J/m], in JAX; the
+    force per length on the rod is the reverse of its gradient by the position. It is differentiated three times, and
+    must be smooth: the error of a field that has kinks is of lower order. Numbers in it are differentiable where it is
+    a pytree, such as an `equinox.Module` with a `__call__` or a `jax.tree_util.Partial` of a function and its numbers;
+    a plain function is part of the program, compiled for it: make it once, not for each scene.
+
+    Raises `TypeError` or `ValueError` for a density that cannot be called so or gives no single real number.
+    """
+
+    density: Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, ""]]
+
+    def __init__(self, density: Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, ""]]):
+        if not callable(density):
+            raise TypeError(f"density must be a function of a position (3,) and an arclength, got {shown(density)}")
+        if any(callable(part) for part in jax.tree.leaves(density)):
+            density = jax.tree_util.Partial(density)
+        self.density = jax.tree.map(leaf, density)
+
+    def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+        return self.density(position, s)
+
+    def in_units(self, units: Units) -> "ScaledPotential":
+        return ScaledPotential(self, units.origin, units.length, units.energy)
+
+
+class ScaledPotential(Potential):
+    """The same in other units: seen from `origin` (3,) [m], in parts of `length` [m] and `energy` [J]."""
+
+    origin: Float[Array, "3"]
+    length: Float[Array, ""]
+    energy: Float[Array, ""]
+
+    def __init__(
+        self, potential: Potential, origin: Float[Array, "3"], length: Float[Array, ""], energy: Float[Array, ""]
+    ):
+        self.density, self.origin, self.length, self.energy = potential.density, origin, length, energy
+
+    def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+        return self.density(self.origin + self.length * position, self.length * s) * (self.length / self.energy)
+
+
+def check_potential(potential: Potential, name: str) -> None:
+    """Raises `ValueError` where a potential does not give one real number."""
+    leaves, structure = jax.tree.flatten(potential)
+    try:
+        found = _given_by(structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+    except TypeError as error:
+        raise TypeError(f"{name} must be a function of a position (3,) and an arclength in JAX: {error}") from error
+    if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
+        raise ValueError(f"{name} must give one real number for a position (3,) and an arclength, got {shown(found)}")
+
+
+@functools.lru_cache
+def _given_by(structure: Any, leaves: tuple[Any, ...]) -> Any:
+    """What a potential of these leaves, shapes and types, gives for one place."""
+    dtype = leaves[0][1] if leaves else jnp.zeros(()).dtype
+    arrays = [jax.ShapeDtypeStruct(*leaf) for leaf in leaves]
+    place, s = jax.ShapeDtypeStruct((3,), dtype), jax.ShapeDtypeStruct((), dtype)
+    potential = jax.tree.unflatten(structure, arrays)
+    return jax.eval_shape(lambda potential, place, s: potential(place, s), potential, place, s)

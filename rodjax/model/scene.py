@@ -12,7 +12,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential, check_potential
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
 from rodjax.model.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
@@ -51,6 +51,7 @@ class Scene(eqx.Module):
         path, or whose centerline lies within one, is not converged. Where no obstacle touches the rod they only cost
         time: to see how far it is from what it stays away from, `rodjax.clearance` needs none in the scene. Double
         precision only.
+    - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
@@ -66,6 +67,7 @@ class Scene(eqx.Module):
     distributed: tuple[DistributedForce | DistributedCouple, ...]
     clips: tuple[Clip, ...]
     obstacles: tuple[Obstacle, ...]
+    potentials: tuple[Potential, ...]
 
     def __init__(
         self,
@@ -78,6 +80,7 @@ class Scene(eqx.Module):
         distributed: Sequence[DistributedForce | DistributedCouple] = (),
         clips: Sequence[Clip] = (),
         obstacles: Sequence[Obstacle] = (),
+        potentials: Sequence[Potential] = (),
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -94,9 +97,15 @@ class Scene(eqx.Module):
         for k, clip in enumerate(clips):
             instance(clip, f"clips[{k}]", Clip)
         obstacles = checked_obstacles(obstacles, least=0)
-        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles))
+        potentials = sequence(potentials, "potentials", "Potential")
+        for k, potential in enumerate(potentials):
+            instance(potential, f"potentials[{k}]", Potential)
+        along = (distributed, clips, obstacles, potentials)
+        parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, *along))
         self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
-        self.distributed, self.clips, self.obstacles = rest
+        self.distributed, self.clips, self.obstacles, self.potentials = rest
+        for k, potential in enumerate(self.potentials):
+            check_potential(potential, f"potentials[{k}]")
         _check_supports(self)
         _check_obstacles(self)
         _check_numbers(self)
@@ -172,6 +181,7 @@ def _check_turning(scene: Scene, length: float) -> None:
     if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
         return
     loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
+    loaded |= bool(scene.potentials)
     loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
     if loaded or any(clip.direction is not None for clip in scene.clips):
         return
@@ -327,7 +337,7 @@ def needs_frames(scene: Scene) -> bool:
         return True
     if scene.clips and any(clip.frame is not None for clip in scene.clips):
         return True
-    return bool(scene.obstacles) and dead_end_moment(scene) is not None
+    return bool(scene.obstacles or scene.potentials) and dead_end_moment(scene) is not None
 
 
 def with_plain_rod(scene: Scene) -> Scene:
@@ -340,9 +350,10 @@ def with_plain_rod(scene: Scene) -> Scene:
 
 def has_node_places(scene: Scene) -> bool:
     """Whether forces along the rod depend on where it is or how it turns, so that the positions of the nodes, and a
-    force in each element, are unknowns: beside obstacles, and of rods by frames under loads without a potential.
+    force in each element, are unknowns: beside obstacles, in fields of forces, and of rods by frames under loads
+    without a potential.
     """
-    return bool(scene.obstacles) or (needs_frames(scene) and not has_potential(scene))
+    return bool(scene.obstacles or scene.potentials) or (needs_frames(scene) and not has_potential(scene))
 
 
 def _follows(end: Support) -> bool:
@@ -374,5 +385,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         [load.in_units(units) for load in scene.distributed],
         [clip.in_units(units) for clip in scene.clips],
         [InUnits(obstacle, units.origin, units.length) for obstacle in scene.obstacles],
+        [potential.in_units(units) for potential in scene.potentials],
     )
     return scaled, units

@@ -124,6 +124,8 @@ def _check_stop(scenes: Scene) -> None:
         raise ValueError("at_critical must be 'jump' for scenes with sliding clips")
     if scenes.obstacles:
         raise ValueError("at_critical must be 'jump' for scenes with obstacles")
+    if scenes.potentials:
+        raise ValueError("at_critical must be 'jump' for scenes with potentials")
 
 
 def _before_critical(scenes: Scene, path: Equilibrium) -> int:

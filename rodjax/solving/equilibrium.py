@@ -402,6 +402,8 @@ def checked_options(
         )
     if scene.obstacles and discretization == "finite_difference":
         raise ValueError("discretization must be 'hermite' for a scene with obstacles")
+    if scene.potentials and discretization == "finite_difference":
+        raise ValueError("discretization must be 'hermite' for a scene with potentials")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
         raise ValueError("solver must be a Newton for a dead moment on a free end, which no energy is minimal under")
     if rtol is not None:

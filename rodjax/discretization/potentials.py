@@ -1,0 +1,138 @@
+"""Fields of forces: potentials that depend on where the rod is, at nodes that have positions of their own.
+
+The energy of a field along an element is that of the cubic through the positions and slopes of its nodes, by the
+trapezoidal rule with the correction of its ends, of fourth order:
+
+    h/2 (V_start + V_end) + h^2/12 (V'_start - V'_end),    V' = grad V . t + dV/ds
+
+So each node has a part of its own, a function of its position and tangent, and no node is coupled with another; between
+elements of one length the corrections cancel. Stretch is left out of V', where it would be h^2 times the strain.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.model.scene import Scene
+
+
+class NodeEnergy(NamedTuple):
+    """Of the fields at the nodes: energy, its derivatives by the positions (c) and the rotations (b) of the nodes, and
+    the second ones.
+    """
+
+    energy: Float[Array, "n+1"]
+    by_place: Float[Array, "n+1 3"]
+    by_rotation: Float[Array, "b n+1"]
+    by_places: Float[Array, "n+1 3 3"]
+    turning: Float[Array, "b 3 n+1"]
+    by_rotations: Float[Array, "b b n+1"]
+
+
+class OnElements(NamedTuple):
+    """Of the fields at both ends of each element: the derivatives of its energy by the positions and the tangents of
+    its nodes, and the force per length there.
+    """
+
+    by_place: Float[Array, "3 2 n"]
+    by_tangent: Float[Array, "3 2 n"]
+    density: Float[Array, "3 2 n"]
+
+
+def _density(scene: Scene, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+    return sum((potential(position, s) for potential in scene.potentials), jnp.zeros_like(s))
+
+
+def _beside(
+    scene: Scene,
+    position: Float[Array, "3"],
+    tangent: Float[Array, "3"],
+    s: Float[Array, ""],
+    weight: Float[Array, ""],
+    correction: Float[Array, ""],
+) -> Float[Array, ""]:
+    def density(position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+        return _density(scene, position, s)
+
+    value, rate = jax.jvp(density, (position, s), (tangent, jnp.ones_like(s)))
+    return weight * value + correction * rate
+
+
+def _weights(s: Float[Array, "n+1"]) -> tuple[Float[Array, "n+1"], Float[Array, "n+1"]]:
+    h = jnp.diff(s)
+    before, after = jnp.pad(h, (1, 0)), jnp.pad(h, (0, 1))
+    return (before + after) / 2, (after**2 - before**2) / 12
+
+
+def node_energies(
+    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+) -> Float[Array, "n+1"]:
+    """Of a nondimensional scene."""
+    weights = _weights(s)
+    return jax.vmap(lambda *node: _beside(scene, *node))(places, tangents.T, s, *weights)
+
+
+def by_place(
+    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+) -> Float[Array, "n+1 3"]:
+    return jax.grad(lambda places: jnp.sum(node_energies(scene, s, places, tangents)))(places)
+
+
+def at_nodes(
+    scene: Scene,
+    s: Float[Array, "n+1"],
+    places: Float[Array, "n+1 3"],
+    tangents: Float[Array, "3 n+1"],
+    axes: Float[Array, "3 b n+1"],
+) -> NodeEnergy:
+    """`axes`: about which the tangents turn, zero where they are held."""
+
+    def of_node(position, tangent, axes, s, weight, correction):
+        def energy(change: Float[Array, "3+b"]) -> Float[Array, ""]:
+            turn = axes @ change[3:]
+            across = jnp.cross(turn, tangent)
+            turned = tangent + across + jnp.cross(turn, across) / 2
+            return _beside(scene, position + change[:3], turned, s, weight, correction)
+
+        nothing = jnp.zeros(3 + axes.shape[1], position.dtype)
+        return *jax.value_and_grad(energy)(nothing), jax.hessian(energy)(nothing)
+
+    energy, first, second = jax.vmap(of_node)(places, tangents.T, axes.transpose(2, 0, 1), s, *_weights(s))
+    return NodeEnergy(
+        energy,
+        first[:, :3],
+        first[:, 3:].T,
+        second[:, :3, :3],
+        second[:, 3:, :3].transpose(1, 2, 0),
+        second[:, 3:, 3:].transpose(1, 2, 0),
+    )
+
+
+def on_elements(
+    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+) -> OnElements:
+    h = jnp.diff(s)
+
+    def at_end(k: int, sign: int) -> tuple[Array, Array, Array]:
+        nodes = slice(k, len(s) - 1 + k)
+
+        def of_node(position, tangent, s, h):
+            def energy(position, tangent):
+                return _beside(scene, position, tangent, s, h / 2, sign * h**2 / 12)
+
+            density = jax.grad(lambda position: _density(scene, position, s))(position)
+            return *jax.grad(energy, argnums=(0, 1))(position, tangent), -density
+
+        return jax.vmap(of_node)(places[nodes], tangents.T[nodes], s[nodes], h)
+
+    ends = zip(at_end(0, 1), at_end(1, -1), strict=True)
+    return OnElements(*(jnp.stack([start.T, end.T], axis=1) for start, end in ends))
+
+
+def section_forces(forces: Float[Array, "3 3 n"], fields: OnElements, h: Float[Array, "n"]) -> Float[Array, "3 3 n"]:
+    """The forces through start, middle and end of the elements, of those without the fields: parabolas."""
+    start, end = -fields.by_place[:, 0], fields.by_place[:, 1]
+    mean = h[None] / 12 * (fields.density[:, 0] - fields.density[:, 1])
+    return forces + jnp.stack([start, 3 / 2 * mean - (start + end) / 4, end], axis=1)

@@ -1,0 +1,218 @@
+"""Fields of forces along the rod: against gravity, closed forms, an integrated elastica and finite differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+from scipy.integrate import solve_ivp
+
+import rodjax as rj
+from rodjax import Clamp, Free, Pin, Potential, Rod, Scene
+from rodjax.discretization.nodal_point import NodalChange
+from rodjax.solving.result import form_and_point
+
+X = (1.0, 0.0, 0.0)
+START = Clamp((0, 0, 0), rj.frame(X))
+FAR = Clamp((0.8, 0.1, 0.1), rj.frame((1, 0, 0.3)))
+
+
+class Uniform(eqx.Module):
+    force: Float[Array, "3"]
+
+    def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+        return -self.force @ position
+
+
+class Bedding(eqx.Module):
+    """Springs from the plane z = 0, per length, stiffer along the rod by a part."""
+
+    stiffness: Float[Array, ""]
+    growth: float = 0.0
+
+    def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
+        return self.stiffness * (1 + self.growth * s) / 2 * position[2] ** 2
+
+
+def bedding(stiffness, growth=0.0) -> Potential:
+    return Potential(Bedding(jnp.asarray(stiffness), growth))
+
+
+def rod(EI=1.0, EA=1e6, **more) -> Rod:
+    return Rod(1.0, EI, 0.7, EA, mass_per_length=1.0, **more)
+
+
+ENDS = {"clamps": (START, FAR), "free start": (Free((0, 0, 1.0)), START), "pins": (Pin((0, 0, 0)), Pin((0.7, 0, 0.2)))}
+FIELDS = ("nodes", "tension", "curvature", "start_force", "start_moment", "end_force", "end_moment", "energy")
+
+
+@pytest.mark.parametrize(
+    ("EI", "ends"),
+    [(1.0, "clamps"), (1.0, "free start"), ((1.0, 2.0), "pins")],
+)
+def test_a_uniform_field_is_gravity(EI, ends):
+    """Whose forces stand elsewhere in the equations: of fourth order apart, on elements of unequal lengths too."""
+    force = np.array([0.3, 0.2, -9.0])
+    field = [Potential(Uniform(jnp.asarray(force)))]
+    clips = [rj.Clip(0.37, (0.3, 0.0, 0.1))] if ends == "clamps" else []
+    apart = []
+    for segments in (16, 32):
+        known = rj.solve(Scene(rod(EI), *ENDS[ends], force, clips=clips), segments=segments)
+        result = rj.solve(Scene(rod(EI), *ENDS[ends], clips=clips, potentials=field), segments=segments)
+        assert result.converged
+        assert result.stable
+        sizes = [max(1.0, float(np.max(np.abs(getattr(known, name))))) for name in FIELDS]
+        changes = [np.max(np.abs(getattr(result, name) - getattr(known, name))) for name in FIELDS]
+        apart.append(np.array(changes) / sizes)
+    # Seen are 2e-4 at most on 16 elements.
+    assert np.max(apart[0]) < 5e-4
+    # Halved, a sixteenth; down to what the residual of 1e-8 EI/L^2, and stretch in the rule for the field, leave.
+    assert np.all((apart[1] < apart[0] / 10) | (apart[1] < 1e-7))
+
+
+@pytest.mark.parametrize("EI", [1.0, (1.0, 1.0)])
+def test_a_cantilever_on_an_elastic_bedding(EI):
+    """Hetenyi, Beams on Elastic Foundation (1946): the deflection of its end under a force there, small."""
+    stiffness, force = 400.0, 1e-4
+    scene = Scene(rod(EI, EA=1e9), START, Free((0, 0, force)), potentials=[bedding(stiffness)])
+    result = rj.solve(scene, segments=32)
+    c = (stiffness / 4) ** 0.25
+    ratio = (np.sinh(c) * np.cosh(c) - np.sin(c) * np.cos(c)) / (np.cosh(c) ** 2 + np.cos(c) ** 2)
+    # Of fourth order: 1e-5 on 16 elements, 7e-7 on 32.
+    assert float(result.nodes[-1, 2]) == pytest.approx(2 * force * c / stiffness * ratio, rel=1e-6)
+
+
+def test_a_rod_in_a_field_is_the_integrated_elastica():
+    """From its start, with the force and moment there, to its end, in a field that varies along space and rod."""
+
+    def wave(position, s):
+        return (20.0 + 10.0 * s) * jnp.sin(3.0 * position[0]) * position[2]
+
+    scene = Scene(rod(EA=1e4), START, Free(), potentials=[Potential(wave)])
+    result = rj.solve(scene, segments=64)
+    assert result.converged
+    assert float(jnp.max(result.curvature)) > 1.0
+
+    def slope(s, y):
+        x, z, angle, nx, nz, moment = y
+        t = np.array([np.cos(angle), np.sin(angle)])
+        way = (1 + t @ [nx, nz] / 1e4) * t
+        push = (20 + 10 * s) * np.array([3 * np.cos(3 * x) * z, np.sin(3 * x)])
+        return [*way, moment, *push, way[1] * nx - way[0] * nz]
+
+    # Positive about -y, as angles are from x to z.
+    begin = [0, 0, 0, result.start_force[0], result.start_force[2], -result.start_moment[1]]
+    end = solve_ivp(slope, (0, 1), begin, rtol=1e-11, atol=1e-12).y[:, -1]
+    # Forces of 30 and moments of 5, to a few parts in 1e7: on 32 elements sixteen times as much.
+    np.testing.assert_allclose(end[:2], result.nodes[-1, [0, 2]], rtol=0, atol=5e-7)
+    np.testing.assert_allclose(end[3:], 0.0, atol=2e-5)
+    assert float(result.error_estimate) < 5e-7
+
+
+@pytest.mark.parametrize("EI", [1.0, (1.0, 2.0)])
+def test_derivatives_by_the_numbers_of_a_field(EI):
+    def seen(stiffness):
+        result = rj.solve(Scene(rod(EI), START, FAR, potentials=[bedding(stiffness, 0.5)]), segments=12)
+        return result.end_force[2] + result.end_moment[1] + result.energy + result.curvature[3]
+
+    values = [float(seen(jnp.asarray(50.0 + k))) for k in (-2, -1, 1, 2)]
+    difference = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / 12
+    # Of fourth order in steps of 2 %.
+    assert float(jax.grad(seen)(jnp.asarray(50.0))) == pytest.approx(difference, rel=1e-5)
+
+
+@pytest.mark.parametrize("EI", [1.0, (1.0, 2.0)])
+def test_the_system_is_the_derivative_of_what_is_out_of_balance(EI):
+    """In space, with a free end, which the field turns too."""
+    scene = Scene(rod(EI, EA=1e3), START, Free((0.0, 3.0, 5.0)), potentials=[bedding(300.0, 0.5)])
+    form, point = form_and_point(rj.solve(scene, segments=4, strain_limit=None))
+    generator = np.random.default_rng(0)
+    displacements = jnp.asarray(generator.normal(size=point.nodal.places.shape))
+    displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
+    change = jnp.asarray(generator.normal(size=point.end_force.shape))
+
+    @jax.jit
+    def both(point, rotation):
+        here = form.linearized(point)
+        rotation = jnp.where(jnp.sum(here.bases**2, axis=0) > 0, rotation, 0.0)
+
+        def moved(part):
+            others = NodalChange(part * displacements, point.nodal.pressures)
+            return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
+
+        _, expected = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
+        multipliers = jnp.concatenate([displacements.ravel(), form.layout.components(change)])
+        return expected, here.system.times(rotation, multipliers), jnp.max(jnp.abs(here.system.turning))
+
+    expected, found, turning = both(point, jnp.asarray(generator.normal(size=form.bases_at(point).shape[1:])))
+    for given, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(given, wanted, rtol=0, atol=1e-9 * float(jnp.max(jnp.abs(wanted))))
+    assert float(turning) > 0.01
+
+
+def test_a_magnet_presses_a_cable_on_the_floor():
+    pull = Potential(Uniform(jnp.array([0.0, 0.0, -20.0])))
+    floor = rj.Plane((0, 0, -0.1), (0, 0, 1))
+    ends = START, Clamp((0.9, 0, 0), rj.frame(X))
+    result = rj.solve(Scene(rod(radius=0.01), *ends, potentials=[pull], obstacles=[floor]), segments=32)
+    assert result.converged
+    pushes = np.asarray(result.contact_forces).sum(0)
+    assert pushes[2] > 1.0
+    # To the residual of 1e-8 EI/L^2 at each of 33 nodes.
+    np.testing.assert_allclose(pushes + result.end_force - result.start_force, [0, 0, 20.0], rtol=0, atol=1e-6)
+
+
+def test_what_pushes_out_of_a_plane_is_told():
+    ends = START, Clamp((0.8, 0, 0.1), rj.frame((1, 0, 0.3)))
+    aside = Potential(Uniform(jnp.array([0.0, 3.0, 0.0])))
+    with pytest.warns(rj.NotConvergedWarning, match="leave the plane"):
+        result = rj.solve(Scene(rod(), *ends, potentials=[aside]), segments=16, planar=True)
+    assert not result.converged
+    within = Scene(rod(), *ends, potentials=[bedding(30.0)])
+    planar, space = (rj.solve(within, segments=16, planar=planar) for planar in (True, False))
+    np.testing.assert_allclose(planar.nodes, space.nodes, rtol=0, atol=1e-9)
+
+
+def test_numbers_in_functions_and_paths():
+    """Functions and partial ones are potentials too; a path's numbers vary."""
+    of_function = Potential(lambda position, s: 15.0 * position[2] ** 2)
+    partial = Potential(jax.tree_util.Partial(lambda k, position, s: k / 2 * position[2] ** 2, 30.0))
+    assert [leaf.shape for leaf in jax.tree.leaves(partial)] == [()]
+    scenes = [Scene(rod(), START, FAR, potentials=[field]) for field in (bedding(30.0), of_function, partial)]
+    first, *others = (rj.solve(scene, segments=8) for scene in scenes)
+    for other in others:
+        np.testing.assert_allclose(other.nodes, first.nodes, rtol=0, atol=1e-13)
+    path = rj.solve_path([Scene(rod(), START, FAR, potentials=[bedding(k)]) for k in (10.0, 30.0)], segments=8)
+    # Both to a residual of 1e-8 EI/L^2.
+    np.testing.assert_allclose(path.nodes[1], first.nodes, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("density", "error", "message"),
+    [
+        (3.0, TypeError, "density must be a function of a position"),
+        (lambda position: position[0], TypeError, r"potentials\[0\] must be a function of a position"),
+        (lambda position, s: position, ValueError, r"potentials\[0\] must give one real number"),
+        (lambda position, s: position[0] > 0, ValueError, r"potentials\[0\] must give one real number"),
+    ],
+)
+def test_densities_that_are_none(density, error, message):
+    with pytest.raises(error, match=message):
+        Scene(rod(), START, FAR, potentials=[Potential(density)])
+
+
+def test_what_takes_no_fields_says_so(tmp_path):
+    scene = Scene(rod(), START, FAR, potentials=[bedding(30.0)])
+    result = rj.solve(scene, segments=8)
+    for refused, message in (
+        (lambda: rj.solve(scene, discretization="finite_difference"), "discretization must be 'hermite'"),
+        (lambda: rj.solve_continuum(scene), r"potentials must be \(\) in the continuum"),
+        (lambda: rj.follow([scene, scene]), "without potentials"),
+        (lambda: rj.save(result, tmp_path / "result.vtkhdf"), r"potentials must be \(\): a potential is code"),
+        (lambda: rj.write_scene(scene, tmp_path / "scene.toml"), r"potentials must be \(\) to be written"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            refused()
+    with pytest.raises(TypeError, match=r"potentials\[0\] must be a Potential"):
+        Scene(rod(), START, FAR, potentials=[lambda position, s: s])  # pyright: ignore

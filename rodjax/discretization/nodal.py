@@ -50,11 +50,14 @@ GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
 LEAST_RELAXED = 1e-3
 # A step takes no place deeper than this, in parts of the radius, into an obstacle; one that is there already so much
-# deeper. Looked at are the nodes and these parts of elements; their way at most so often, further on each time by the
-# distance, or so much at least.
+# deeper. Into one that is less thick than the rod none nearer than a part of the radius, else short steps would lead
+# through in turn. Looked at are the nodes and these parts of elements; their way at most so often, further on each time
+# by the distance, or so much at least.
 DEEPEST = 0.5
 DEEPER = 0.125
-LOOKED_AT = (0.25, 0.5, 0.75)
+NEAREST = 0.25
+THIN = 0.5
+LOOKED_AT = tuple(k / 8 for k in range(1, 8))
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
 # A node lies on an obstacle where its gap is below this [L].
@@ -387,6 +390,21 @@ class NodalForm(Form):
         first = distances(before)
         bound = least(DEEPEST * rim, first - DEEPER * rim)
 
+        def pierces() -> Bool[Array, ""]:
+            """Whether a place ends too near to something thin."""
+            is_near = (distances(after) < NEAREST * rim) & (first >= NEAREST * rim)
+
+            def is_thin(place: Float[Array, "3"], rim: Float[Array, ""]) -> Bool[Array, ""]:
+                def nearest(place: Float[Array, "3"]) -> Float[Array, ""]:
+                    return least(*(obstacle.at(place) for obstacle in self.scene.obstacles))
+
+                distance, normal = jax.value_and_grad(nearest)(place)
+                return nearest(place - (distance + rim) * normal) > -THIN * rim
+
+            return jax.lax.cond(
+                jnp.any(is_near), lambda: jnp.any(is_near & jax.vmap(is_thin)(after, rim)), lambda: jnp.array(False)
+            )
+
         # No place is nearer than its distance: so far each may go, and is looked at again.
         def ahead(gone: Float[Array, "k"], gaps: Float[Array, "k"]) -> Float[Array, "k"]:
             return gone + jnp.maximum(gaps, LEAST_WAY * rim)
@@ -401,7 +419,7 @@ class NodalForm(Form):
             gone, is_blocked, count = state
             return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
 
-        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
+        begin = ahead(jnp.zeros_like(lengths), first - bound), pierces(), jnp.zeros((), int)
         gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
         return is_better & ~is_blocked & jnp.all(gone >= lengths)
 

@@ -320,17 +320,13 @@ def test_the_file_of_a_shape_that_no_cold_solve_finds_says_so():
 def test_the_tube_is_closed_and_has_the_volume_of_the_rod(session):
     """Strips, bands and caps together: by Gauss' theorem, and from its outside."""
     reading = session.reading
-    points = tube.rings(reading.centerline, reading.d1, reading.d2, 5e-3)
+    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
     scale = tube.scale_over(0.0, float(np.max(reading.values["curvature"])))
-    parts = [
-        *tube.strips(points),
-        *tube.bands(points, reading.values["curvature"], scale),
-        tube.caps(points, reading.centerline),
-    ]
+    parts = [*surface.strips, *surface.bands(reading.values["curvature"], scale), surface.caps]
     corners = np.concatenate([part.vertices.astype(float)[part.faces] for part in parts])
     volume = np.sum(np.linalg.det(corners)) / 6
     length = np.sum(np.linalg.norm(np.diff(reading.centerline, axis=0), axis=1))
-    around = tube.FACES_AROUND
+    around = tube.AROUND
     area = around / 2 * math.sin(2 * math.pi / around) * 5e-3**2
     # Pappus, but that each piece between two rings is bent by up to 0.12 rad from its middle: 1 - cos(0.12) = 7e-3 at
     # the most, a fifth of that on average.
@@ -342,14 +338,14 @@ def test_the_tube_is_closed_and_has_the_volume_of_the_rod(session):
 def test_bands_show_the_values_between_their_edges(session):
     reading = session.reading
     values = reading.values["curvature"]
-    points = tube.rings(reading.centerline, reading.d1, reading.d2, 5e-3)
+    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
     scale = tube.scale_over(float(values.min()), float(values.max()))
     assert tube.covers(scale, values)
     assert 4 <= len(scale.colors) <= tube.MOST_BANDS
     middles = (values[1:] + values[:-1]) / 2
-    for k, part in enumerate(tube.bands(points, values, scale)):
+    for k, part in enumerate(surface.bands(values, scale)):
         inside = np.sum((scale.edges[k] <= middles) & (middles < scale.edges[k + 1]))
-        assert len(part.faces) == max(1, 2 * inside * (tube.FACES_AROUND - 2 * tube.STRIP_FACES))
+        assert len(part.faces) == max(1, 2 * inside * (tube.AROUND - 2 * tube.STRIP))
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 0.0), (3.0, 3.0), (-1e-12, 1e-12), (-5.0, 2e6)])

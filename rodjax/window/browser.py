@@ -1,6 +1,7 @@
 """The window in the browser: a session, a viser server that shows it, and one thread between the two."""
 
 import contextlib
+import gc
 import io
 import logging
 import socket
@@ -40,6 +41,8 @@ class Window:
     - `port`: 0 for any that is free. `host`: who may connect; the default only programs of this machine.
     - `limits`: of `rodjax.Limits`, against which numbers are shown; `None` for none.
 
+    `on_drawn` is called with the report of each move whose shape has been sent, in the window's own thread.
+
     Raises `ImportError` without viser, `OSError` where nothing can be opened at host and port.
     """
 
@@ -48,7 +51,8 @@ class Window:
         self.quantity, self.with_loads = "curvature", True
         self.scales: dict[str, Scale] = {}
         self.report = Report(session.reading, "", True, False, int(session.result.iterations), 0.0)
-        self._mailbox, self._closed = Mailbox(), threading.Event()
+        self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
+        self.on_drawn: Callable[[Report], None] = lambda report: None
         self._numbers_at = self._stability_at = 0.0
         self.server = started(port, host)
         self.url = f"http://{'localhost' if host == '127.0.0.1' else host}:{self.server.get_port()}"
@@ -56,7 +60,7 @@ class Window:
             self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         # A tunnel through a server of viser's would let anybody in.
         self.server.request_share_url = _no_tunnel
-        self.stage = Stage(self.server, session, self._dragged)
+        self.stage = Stage(self.server, session, self.drag)
         self.panel = self._panel()
         self._draw()
         self._thread = threading.Thread(target=self._run, name="rodjax window", daemon=True)
@@ -73,6 +77,7 @@ class Window:
         self._mailbox.close()
         self._closed.set()
         self._thread.join()
+        gc.unfreeze()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -113,7 +118,8 @@ class Window:
         numbers = dict(self.session.now.controls.numbers)
         return Panel(self.server.gui, list(self.session.sliders.values()), numbers, colors, buttons)
 
-    def _dragged(self, name: str, pose: Pose, phase: str) -> None:
+    def drag(self, name: str, pose: Pose, phase: str = "update") -> None:
+        """A handle has been dragged to a pose, as the browser tells it: at the "start", an "update" or the "end"."""
         if phase == "start":
             self._mailbox.command(self.session.mark)
         self._mailbox.move(name, pose)
@@ -152,7 +158,15 @@ class Window:
         self.panel.say("compiling: a few seconds, once for this kind of scene")
         self.session.warm_up(lambda: not self._mailbox.is_closed)
         self._settle()
-        self.panel.say(self._hint)
+        # A full collection would look at millions of objects of JAX, for a tenth of a second in the middle of a move.
+        gc.collect()
+        gc.freeze()
+        self._ready.set()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether all that moves need is compiled."""
+        return self._ready.is_set()
 
     @property
     def _hint(self) -> str:
@@ -171,6 +185,7 @@ class Window:
         self.report = self.session.move(moves)
         self.stage.place(handles=False)
         self._draw()
+        self.on_drawn(self.report)
         now = time.monotonic()
         if self._mailbox.is_empty and now - self._stability_at > STABILITY:
             self._look_at_stability()

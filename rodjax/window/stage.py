@@ -38,6 +38,7 @@ class Stage:
         self.length = float(session.scene.rod.length)
         self.parts: dict[str, Any] = {}
         self.obstacles: dict[str, Any] = {}
+        self.placed = dict(session.now.controls.poses)  # where obstacles are drawn
         self.handles = {name: self._handle(name, moved) for name in session.handles}
         self.arrows: dict[str, Any] = {}
         self._draw_obstacles()
@@ -76,10 +77,10 @@ class Stage:
 
     def draw(self, reading: Reading, quantity: str, scale: tube.Scale) -> None:
         """The rod, coloured by a quantity."""
-        points = tube.rings(reading.centerline, reading.d1, reading.d2, self._radii(reading))
-        shown = {f"/rod/strip {k}": part for k, part in enumerate(tube.strips(points))}
-        shown["/rod/caps"] = tube.caps(points, reading.centerline)
-        for k, part in enumerate(tube.bands(points, reading.values[quantity], scale)):
+        surface = tube.Surface(reading.centerline, reading.d1, reading.d2, self._radii(reading))
+        shown = {f"/rod/strip {k}": part for k, part in enumerate(surface.strips)}
+        shown["/rod/caps"] = surface.caps
+        for k, part in enumerate(surface.bands(reading.values[quantity], scale)):
             shown[f"/rod/band {k}"] = part
         for name in set(self.parts) - set(shown):
             self.parts.pop(name).remove()
@@ -91,7 +92,7 @@ class Stage:
         if name == "/rod/caps":
             return CAP_COLOR
         k = int(name.split()[-1])
-        red, green, blue = tube.strip_colors()[k] if "strip" in name else scale.colors[k]
+        red, green, blue = tube.STRIP_COLORS[k] if "strip" in name else scale.colors[k]
         return int(red), int(green), int(blue)
 
     def _show_part(self, name: str, part: tube.Part, color: tuple[int, int, int]) -> None:
@@ -101,7 +102,9 @@ class Stage:
             )
             return
         drawn = self.parts[name]
-        drawn.vertices, drawn.color = part.vertices, color
+        drawn.vertices = part.vertices
+        if drawn.color != color:
+            drawn.color = color
         if drawn.faces.shape != part.faces.shape or not np.array_equal(drawn.faces, part.faces):
             drawn.faces = part.faces
 
@@ -167,13 +170,19 @@ class Stage:
     def place(self, handles: bool) -> None:
         """Obstacles, and handles where these too shall go, to where the session has them."""
         for name, pose in self.session.now.controls.poses.items():
-            for drawn in (self.obstacles.get(name), self.handles[name] if handles else None):
-                if drawn is not None:
-                    drawn.position, drawn.wxyz = tuple(pose.position), quaternion(pose.frame)
+            if name in self.obstacles and pose is not self.placed.get(name):
+                _place(self.obstacles[name], pose)
+                self.placed[name] = pose
+            if handles:
+                _place(self.handles[name], pose)
 
     def show_handles(self, visible: bool) -> None:
         for drawn in self.handles.values():
             drawn.visible = visible
+
+
+def _place(drawn: Any, pose: Pose) -> None:
+    drawn.position, drawn.wxyz = tuple(pose.position), quaternion(pose.frame)
 
 
 def quaternion(frame: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:

@@ -7,12 +7,22 @@ from jaxtyping import Float, Int
 from matplotlib import colormaps
 from matplotlib.ticker import MaxNLocator
 
-from rodjax.plot import COLOR_MAP, FACES_AROUND, STRIP_FACES, STRIPS
+from rodjax.plot import COLOR_MAP
 
+# Faces around the rod, and of them those of each strip: along d1, and on the other side.
+AROUND, STRIP = 16, 2
+STRIP_COLORS = ((30, 30, 30), (245, 245, 245))
 # So many bands of colour at most: more cannot be told from one another, nor read off a legend.
 MOST_BANDS = 12
 # Ranges narrower than this part of their values, or than this, are rounding.
 LEAST_RANGE, LEAST_VALUE = 1e-3, 1e-9
+
+
+_ANGLES = 2 * np.pi / AROUND * (np.arange(AROUND) - STRIP / 2)
+_COSINE, _SINE = np.cos(_ANGLES)[:, None], np.sin(_ANGLES)[:, None]
+# The points of a ring that are those of each strip, and of both sides between them.
+_STRIPS = [np.arange(first, first + STRIP + 1) for first in (0, AROUND // 2)]
+_BETWEEN = np.concatenate([np.arange(first + STRIP, first + AROUND // 2 + 1) % AROUND for first in (0, AROUND // 2)])
 
 
 class Part(NamedTuple):
@@ -43,60 +53,56 @@ def covers(scale: Scale, values: Float[np.ndarray, "k"]) -> bool:
     return bool(scale.edges[0] <= np.min(values) and np.max(values) <= scale.edges[-1])
 
 
-def rings(
-    centerline: Float[np.ndarray, "k 3"],
-    d1: Float[np.ndarray, "k 3"],
-    d2: Float[np.ndarray, "k 3"],
-    radius: float | Float[np.ndarray, "k"],
-) -> Float[np.ndarray, "k m 3"]:
-    """Points around the rod, right-handed about its tangent; the middle of the first `STRIP_FACES` is along d1."""
-    angle = 2 * np.pi / FACES_AROUND * (np.arange(FACES_AROUND) - STRIP_FACES / 2)
-    around = np.cos(angle)[:, None] * d1[:, None] + np.sin(angle)[:, None] * d2[:, None]
-    return centerline[:, None] + np.broadcast_to(radius, len(centerline))[:, None, None] * around
+class Surface:
+    """The surface of one rod: strips along its directors, caps, and bands of colour between the strips."""
+
+    def __init__(
+        self,
+        centerline: Float[np.ndarray, "k 3"],
+        d1: Float[np.ndarray, "k 3"],
+        d2: Float[np.ndarray, "k 3"],
+        radius: float | Float[np.ndarray, "k"],
+    ):
+        self.centerline = centerline.astype(np.float32)
+        radii = np.broadcast_to(radius, len(centerline))[:, None, None]
+        around = _COSINE * d1[:, None] + _SINE * d2[:, None]
+        self.rings = (centerline[:, None] + radii * around).astype(np.float32)
+
+    @property
+    def strips(self) -> list[Part]:
+        """Along d1 and along -d1."""
+        rows = np.arange(len(self.rings) - 1)
+        return [_part(self.rings[:, columns], rows) for columns in _STRIPS]
+
+    def bands(self, values: Float[np.ndarray, "k"], scale: Scale) -> list[Part]:
+        """By the band of the mean value of each pair of rings, on both sides of the strips. A band may be empty."""
+        means = (values[1:] + values[:-1]) / 2
+        band = np.clip(np.searchsorted(scale.edges, means, side="right") - 1, 0, len(scale.colors) - 1)
+        between = self.rings[:, _BETWEEN]
+        return [_part(between, np.flatnonzero(band == k), sides=2) for k in range(len(scale.colors))]
+
+    @property
+    def caps(self) -> Part:
+        """The two ends."""
+        vertices = np.concatenate([self.rings[0], self.rings[-1], self.centerline[[0, -1]]])
+        around = np.arange(AROUND)
+        onward, middle = (around + 1) % AROUND, 2 * AROUND
+        first = np.stack([np.full_like(around, middle), onward, around], axis=1)
+        last = np.stack([np.full_like(around, middle + 1), AROUND + around, AROUND + onward], axis=1)
+        return Part(vertices, np.concatenate([first, last]).astype(np.uint32))
 
 
-def strip_columns() -> list[Int[np.ndarray, "c"]]:
-    """The columns of faces of each strip."""
-    return [(first + np.arange(STRIP_FACES)) % FACES_AROUND for first, _ in STRIPS]
-
-
-def strip_colors() -> list[tuple[int, int, int]]:
-    # Not quite black and white, which would hide the shading.
-    return [(30, 30, 30) if sum(color) == 0 else (245, 245, 245) for _, color in STRIPS]
-
-
-def strips(points: Float[np.ndarray, "k m 3"]) -> list[Part]:
-    """The strips all along the rod."""
-    return [_part(points, np.arange(len(points) - 1), columns) for columns in strip_columns()]
-
-
-def bands(points: Float[np.ndarray, "k m 3"], values: Float[np.ndarray, "k"], scale: Scale) -> list[Part]:
-    """What is between the strips, by the band of the mean value of each pair of rings. A band may be empty."""
-    between = np.setdiff1d(np.arange(FACES_AROUND), np.concatenate(strip_columns()))
-    means = (values[1:] + values[:-1]) / 2
-    band = np.clip(np.searchsorted(scale.edges, means, side="right") - 1, 0, len(scale.colors) - 1)
-    return [_part(points, np.flatnonzero(band == k), between) for k in range(len(scale.colors))]
-
-
-def caps(points: Float[np.ndarray, "k m 3"], centerline: Float[np.ndarray, "k 3"]) -> Part:
-    """The two ends."""
-    vertices = np.concatenate([points[0], points[-1], centerline[[0, -1]]])
-    around = np.arange(FACES_AROUND)
-    onward, middle = (around + 1) % FACES_AROUND, 2 * FACES_AROUND
-    first = np.stack([np.full_like(around, middle), onward, around], axis=1)
-    last = np.stack([np.full_like(around, middle + 1), FACES_AROUND + around, FACES_AROUND + onward], axis=1)
-    return Part(vertices.astype(np.float32), np.concatenate([first, last]).astype(np.uint32))
-
-
-def _part(points: Float[np.ndarray, "k m 3"], rows: Int[np.ndarray, "r"], columns: Int[np.ndarray, "c"]) -> Part:
-    """The faces from these rows of rings to the next, at these columns; neighbours share their vertices."""
+def _part(rings: Float[np.ndarray, "k m 3"], rows: Int[np.ndarray, "r"], sides: int = 1) -> Part:
+    """The faces from these rows of rings to the next; neighbours share their vertices. Each ring is of so many sides,
+    between which there are no faces.
+    """
     if not len(rows):
         # One triangle without an area: a mesh that is empty has no middle.
-        return Part(points[0, [0, 0, 0]].astype(np.float32), np.array([[0, 1, 2]], np.uint32))
-    onward = (columns + 1) % points.shape[1]
-    used, around = np.union1d(rows, rows + 1), np.union1d(columns, onward)
-    at = np.searchsorted(used, rows)[:, None] * len(around)
-    left, right = np.searchsorted(around, columns)[None], np.searchsorted(around, onward)[None]
-    a, b, c, d = at + left, at + right, at + len(around) + right, at + len(around) + left
-    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-    return Part(points[np.ix_(used, around)].reshape(-1, 3).astype(np.float32), faces.astype(np.uint32))
+        return Part(np.repeat(rings[0, :1], 3, axis=0), np.array([[0, 1, 2]], np.uint32))
+    count = rings.shape[1]
+    is_used = np.zeros(len(rings), bool)
+    is_used[rows] = is_used[rows + 1] = True
+    at = (np.cumsum(is_used) - 1)[rows, None] * count
+    left = np.arange(count).reshape(sides, -1)[:, :-1].reshape(-1)
+    corners = np.stack([left, left + 1, left + count + 1, left, left + count + 1, left + count], axis=-1).reshape(-1)
+    return Part(rings[is_used].reshape(-1, 3), (at + corners).reshape(-1, 3).astype(np.uint32))

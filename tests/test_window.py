@@ -1,6 +1,8 @@
 """The window's session, without a browser."""
 
 import math
+import socket
+import sys
 import threading
 import tomllib
 
@@ -10,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
+from rodjax.cli import main
 from rodjax.io.scene_file import read_scene
 from rodjax.window import tube
 from rodjax.window.bounds import out_of_reach, reaches
@@ -404,3 +407,49 @@ def test_arguments_that_make_no_sense_are_refused():
         Session(hanging(), segments=1)
     with pytest.raises(ValueError, match="scene must have an equilibrium to begin with, got none: not converged"):
         Session(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), segments=SEGMENTS)  # too large to go around
+
+
+@pytest.fixture
+def scene_toml(tmp_path):
+    rj.write_scene(hanging(), tmp_path / "scene.toml", segments=SEGMENTS)
+    return str(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--port", "70000"], "argument --port: must be a whole number from 0 to 65535, got '70000'"),
+        (["--port", "x"], "argument --port: must be a whole number from 0 to 65535, got 'x'"),
+        (["--host", "no.such.host.invalid"], "port 8080 of no.such.host.invalid cannot be opened: "),
+    ],
+)
+def test_the_command_says_what_is_wrong_in_one_line(options, said, scene_toml, capsys):
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    assert main(["view", scene_toml, "--no-browser", *options]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"rodjax: {said}")
+    assert err.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert main(["view", scene_toml, "--no-browser", "--port", str(port)]) == 2
+    said = capsys.readouterr().err
+    assert said == f"rodjax: port {port} of 127.0.0.1 cannot be opened: Address already in use\n"
+
+
+def test_without_viser_the_command_says_what_to_install(scene_toml, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", scene_toml]) == 2
+    assert capsys.readouterr().err == "rodjax: view needs viser, got none: pip install 'rodjax[view]'\n"
+
+
+def test_a_scene_without_an_equilibrium_exits_with_3(tmp_path, capsys):
+    rj.write_scene(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), tmp_path / "scene.toml", segments=SEGMENTS)
+    assert main(["view", str(tmp_path / "scene.toml")]) == 3
+    assert "scene must have an equilibrium to begin with, got none: not converged" in capsys.readouterr().err

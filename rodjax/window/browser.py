@@ -303,7 +303,7 @@ def started(port: int, host: str) -> Any:
         try:
             probe.bind((host, port))
         except OSError as error:
-            raise OSError(error.errno, f"port {port} of {host} cannot be opened: {error.strerror}") from None
+            raise OSError(f"port {port} of {host} cannot be opened: {error.strerror}") from None
     with contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer(host=host, port=port, label="rodjax", verbose=False)
 

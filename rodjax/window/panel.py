@@ -99,12 +99,16 @@ class Panel:
             f'<div style="flex:1;height:1em;background:rgb({",".join(map(str, color))})"></div>'
             for color in scale.colors
         )
-        edges = scale.edges
-        marks = "".join(f"<span>{edge:.4g}</span>" for edge in (edges[0], edges[len(edges) // 2], edges[-1]))
+        last = len(scale.colors)
+        marks = "".join(
+            f'<span style="position:absolute;left:{100 * k / last:.4g}%;transform:translateX(-{100 * k / last:.4g}%)">'
+            f"{scale.edges[k]:.4g}</span>"
+            for k in (0, last // 2, last)
+        )
         self._set(
             self.legend,
             f'<div style="margin:0 0.8em;font-size:0.8em"><div style="display:flex">{cells}</div>'
-            f'<div style="display:flex;justify-content:space-between">{marks}</div></div>',
+            f'<div style="position:relative;height:1.4em">{marks}</div></div>',
         )
 
     def show_numbers(self, values: dict[str, float]) -> None:

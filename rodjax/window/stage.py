@@ -18,7 +18,7 @@ from rodjax.window.session import Session
 
 # By the length of the rod: the least radius that can be seen, that of a rod without one, the longest arrow, and the
 # size of handles. By the extent of what is seen: how far away the camera is, and how far the panel moves the middle.
-LEAST_RADIUS, DEFAULT_RADIUS, ARROW, HANDLE = 0.002, 0.004, 0.2, 0.1
+LEAST_RADIUS, DEFAULT_RADIUS, ARROW, HANDLE = 0.002, 0.004, 0.15, 0.1
 CAMERA, PANEL = 0.95, 0.18
 # Below these parts of EI/L^2 and EI/L forces and moments are rounding.
 LEAST_LOAD = 1e-6

@@ -254,6 +254,54 @@ def test_an_obstacle_pushes_the_rod_and_lets_it_go():
     assert np.all(session.reading.obstacle_forces == 0)
 
 
+KINDS = {
+    "a pin, a swivel and a clip that holds a direction": lambda: rj.Scene(
+        rj.problems.cable(),
+        rj.Pin((0, 0, 0)),
+        rj.Swivel((0.8, 0, 0), (1, 0, 0)),
+        (0, 0, -9.81),
+        clips=[rj.Clip(0.5, (0.4, 0, -0.1), tangent=(1, 0, 0))],
+    ),
+    "a strip": lambda: rj.Scene(
+        rj.Rod(1.0, (5e-3, 2e-2), 5e-3, 800.0, mass_per_length=0.1),
+        rj.Clamp((0, 0, 0), LEVEL),
+        rj.Clamp((0.8, 0, 0), LEVEL),
+        (0, 0, -9.81),
+    ),
+    "a stiffness that jumps": lambda: rj.Scene(
+        rj.Rod(
+            1.0, rj.Steps([0.5], [5e-3, 2e-2]), 5e-3, 800.0, mass_per_length=0.1, radius=rj.Smooth([0, 1], [5e-3, 8e-3])
+        ),
+        rj.Clamp((0, 0, 0), LEVEL),
+        rj.Clamp((0.8, 0, 0), LEVEL),
+        (0, 0, -9.81),
+    ),
+    "a moment on a free end, which has no potential": lambda: rj.Scene(
+        rj.problems.cable(), rj.Clamp((0, 0, 0), LEVEL), rj.Free(moment=(0, 5e-3, 2e-3)), (0, 0, -9.81)
+    ),
+    "a clip through which the rod slides": lambda: hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1), sliding=True)]),
+}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] if "slides" in kind else []) for kind in KINDS]
+)
+def test_every_kind_of_scene_can_be_taken_in_the_hand(kind):
+    """Its first handle moves all of it, to where a solve of the scene there finds it."""
+    session = Session(KINDS[kind](), segments=SEGMENTS)
+    place = session.now.controls.poses["start"].position + np.array([0.01, 0.02, 0.0])
+    report = session.move({"start": (place, None), "rod.EI": 1.1})
+    assert report.moved, report.message
+    again = rj.solve(session.result.scene, segments=SEGMENTS, guess=session.result)
+    np.testing.assert_allclose(session.result.nodes, again.nodes, atol=1e-7)  # residuals below 1e-8 EI/L^2
+    np.testing.assert_allclose(session.result.nodes[0], place, atol=1e-15)
+    assert all(np.all(np.isfinite(values)) for values in report.reading.values.values())
+    assert np.isfinite(report.reading.bend_radius)
+    assert (session.settle() is None) == ("potential" in kind or "slides" in kind)
+    labels = [row.label for row in rows(session, report)]
+    assert len(set(labels)) == len(labels)
+
+
 # --- undo, record, save ----------------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ import pytest
 from matplotlib.image import imread
 
 import rodjax as rj
+from rodjax.window.controls import Pose
 from rodjax.window.session import Session
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
@@ -158,7 +159,7 @@ def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
     )
     assert process.stdout is not None
     line = process.stdout.readline()
-    assert line.startswith("rodjax: the window is at http://localhost:")
+    assert line.startswith("rodjax: the window is at http://127.0.0.1:")
     port = int(line.split(";")[0].rsplit(":", 1)[1])
     assert listening(port, "127.0.0.1")
     process.send_signal(signal.SIGINT)
@@ -166,3 +167,48 @@ def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
     assert (process.returncode, out, errors) == (0, "", "")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
     assert not listening(port, "127.0.0.1")
+
+
+def test_what_is_recorded_is_played_and_undone_without_a_browser():
+    """By the commands that the buttons give."""
+    window = rj.view(scene(), 0, open_browser=False, block=False, segments=10)
+    session, panel = window.session, window.panel
+    done, sent = threading.Event(), []
+
+    def finished(*commands) -> None:
+        done.clear()
+        for command in commands:
+            window.command(command)
+        window.command(done.set)
+        assert done.wait(SECONDS)
+
+    try:
+        until(lambda: window.is_ready, "the window to be ready")
+        window.on_drawn = lambda report: sent.append(report)
+        finished(lambda: window.record(True))
+        place = session.now.controls.poses["end"]
+        for k, phase in enumerate(["start", "update", "end"]):
+            window.drag("end", Pose(place.position - [0.02 * k, 0, 0], place.frame), phase)
+            finished()
+        finished(lambda: window.record(False))
+        assert [report.moved for report in sent] == [True, True, True]
+        assert len(session.recorded) == 4
+        assert (panel.frame.min, panel.frame.max, panel.frame.value, panel.frame.disabled) == (0, 3, 3, False)
+        finished(lambda: window.show_recorded(0))
+        assert session.result.nodes[-1, 0] == pytest.approx(0.8)
+        assert window.stage.handles["end"].position[0] == pytest.approx(0.8)
+        window.command(window.play)  # which stops as soon as something else is asked for
+        until(lambda: abs(session.result.nodes[-1, 0] - 0.76) < 1e-9, "the last moment")
+        window.drag("end", Pose(np.array([9.0, 0, 0]), place.frame), "start")
+        finished()
+        assert "the ends are 9 m apart" in panel.message.content
+        finished(window.undo)
+        assert session.result.nodes[-1, 0] == pytest.approx(0.76)
+        finished(window.start_over)
+        assert session.result.nodes[-1, 0] == pytest.approx(0.8)
+        finished(lambda: window.color_by("tension"), window.fit_colors, lambda: 1 / 0)
+        assert "ZeroDivisionError" in panel.message.content  # and it lives on
+        finished(lambda: window.show_loads(False))
+        assert not window.stage.arrows["forces"].visible
+    finally:
+        window.close()

@@ -26,8 +26,8 @@ from rodjax.window.stage import Stage
 from rodjax.window.tube import Scale, covers, scale_over
 
 # Seconds: without a move after which a rod is at rest, between numbers and between looks at stability while it moves,
-# and between frames of a recording.
-REST, NUMBERS, STABILITY, FRAME = 0.05, 0.1, 0.25, 1 / 30
+# between frames of a recording, and without a number after which a slider is taken anew.
+REST, NUMBERS, STABILITY, FRAME, STRETCH = 0.05, 0.1, 0.25, 1 / 30, 0.5
 MARGIN = "share of the bend limit"
 _log = logging.getLogger("rodjax")
 
@@ -53,15 +53,18 @@ class Window:
         self.report = Report(session.reading, "", True, False, int(session.result.iterations), 0.0)
         self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
         self.on_drawn: Callable[[Report], None] = lambda report: None
-        self._numbers_at = self._stability_at = 0.0
+        self._numbers_at = self._stability_at = self._slid_at = 0.0
+        self._slid = ""
         self.server = started(port, host)
-        self.url = f"http://{'localhost' if host == '127.0.0.1' else host}:{self.server.get_port()}"
+        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.server.get_port()}"
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         # A tunnel through a server of viser's would let anybody in.
         self.server.request_share_url = _no_tunnel
         self.stage = Stage(self.server, session, self.drag)
         self.panel = self._panel()
+        self.panel.show_frames(len(session.recorded), len(session.recorded) - 1)
         self._draw()
         self._thread = threading.Thread(target=self._run, name="rodjax window", daemon=True)
         self._thread.start()
@@ -102,16 +105,16 @@ class Window:
             colors[MARGIN] = MARGIN
         later = self._mailbox.command
         buttons = Buttons(
-            undo=lambda: later(self._undo),
-            start_over=lambda: later(self._start_over),
+            undo=lambda: later(self.undo),
+            start_over=lambda: later(self.start_over),
             save_scene=lambda client: later(lambda: self._download(client, "scene.toml", scene_file)),
-            color_by=lambda name: later(lambda: self._color_by(name)),
-            fit_colors=lambda: later(self._fit_colors),
-            show_loads=lambda on: later(lambda: self._show_loads(on)),
+            color_by=lambda name: later(lambda: self.color_by(name)),
+            fit_colors=lambda: later(self.fit_colors),
+            show_loads=lambda on: later(lambda: self.show_loads(on)),
             show_handles=self.stage.show_handles,
             number=self._number,
-            record=lambda on: later(lambda: self._record(on)),
-            play=lambda: later(self._play),
+            record=lambda on: later(lambda: self.record(on)),
+            play=lambda: later(self.play),
             show_recorded=lambda k: self._mailbox.move("recorded", k),
             save_recording=lambda client: later(lambda: self._download(client, "path.vtkhdf", path_file)),
         )
@@ -127,7 +130,11 @@ class Window:
             self._mailbox.command(lambda: self.stage.place(handles=True))
 
     def _number(self, name: str, value: float) -> None:
-        self._mailbox.command(self.session.mark)
+        # One stretch of a slider is undone at once, and its numbers are coalesced.
+        now = time.monotonic()
+        if name != self._slid or now - self._slid_at > STRETCH:
+            self._mailbox.command(self.session.mark)
+        self._slid, self._slid_at = name, now
         self._mailbox.move(name, value)
 
     # --- the thread that does it ---
@@ -179,7 +186,7 @@ class Window:
     def _moved(self, moves: dict[str, Any]) -> None:
         frame = moves.pop("recorded", None)
         if frame is not None:
-            self._show_recorded(int(frame))
+            self.show_recorded(int(frame))
         if not moves:
             return
         self.report = self.session.move(moves)
@@ -189,7 +196,7 @@ class Window:
         now = time.monotonic()
         if self._mailbox.is_empty and now - self._stability_at > STABILITY:
             self._look_at_stability()
-        if now - self._numbers_at > NUMBERS:
+        if self.report.message or now - self._numbers_at > NUMBERS:
             self._show_numbers()
         else:
             self._numbers_at = 0.0  # later, at rest
@@ -232,13 +239,17 @@ class Window:
         self._draw()
         self._settle()
 
-    # --- commands ---
+    # --- commands, for the window's thread ---
 
-    def _undo(self) -> None:
+    def command(self, do: Callable[[], None]) -> None:
+        """Has a command done by the window's thread, after all that was asked for before."""
+        self._mailbox.command(do)
+
+    def undo(self) -> None:
         self.report = self.session.undo()
         self._show_all()
 
-    def _start_over(self) -> None:
+    def start_over(self) -> None:
         self.session.mark()
         self._jump(lambda: self.session.show(self.session.first))
 
@@ -247,35 +258,35 @@ class Window:
         self.report = Report(show(), "", True, False, 0, 1e3 * (time.perf_counter() - begin))
         self._show_all()
 
-    def _color_by(self, name: str) -> None:
+    def color_by(self, name: str) -> None:
         self.quantity = name
         self._draw()
 
-    def _fit_colors(self) -> None:
+    def fit_colors(self) -> None:
         self.scales.pop(self.quantity, None)
         self._draw()
 
-    def _show_loads(self, on: bool) -> None:
+    def show_loads(self, on: bool) -> None:
         self.with_loads = on
         self._draw()
 
-    def _record(self, on: bool) -> None:
+    def record(self, on: bool) -> None:
         self.session.record(on)
         if not on:
             self.panel.show_frames(len(self.session.recorded), len(self.session.recorded) - 1)
         self.panel.say("every move is recorded" if on else f"{len(self.session.recorded)} moments are recorded")
 
-    def _show_recorded(self, k: int) -> None:
+    def show_recorded(self, k: int) -> None:
         if self.session.recorded and not self.session.is_recording:
             moment = self.session.recorded[min(k, len(self.session.recorded) - 1)]
             self._jump(lambda: self.session.show(moment))
 
-    def _play(self) -> None:
+    def play(self) -> None:
         for k in range(len(self.session.recorded)):
             if not self._mailbox.is_empty or self._mailbox.is_closed:
                 return  # something else was asked for
             begin = time.monotonic()
-            self._show_recorded(k)
+            self.show_recorded(k)
             self.panel.frame.value = k
             time.sleep(max(0.0, FRAME - (time.monotonic() - begin)))
 

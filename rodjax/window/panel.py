@@ -119,7 +119,7 @@ class Panel:
         """How many moments are recorded, and which of them is shown."""
         self.frame.disabled = count < 2
         self.frame.max = max(count - 1, 1)
-        self.frame.value = at
+        self.frame.value = max(at, 0)
 
     @staticmethod
     def _set(element: Any, content: str) -> None:

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from rodjax.routing.route import Route, route
     from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
     from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
+    from rodjax.window.opening import view
 
 __all__ = [
     "Between",
@@ -152,6 +153,7 @@ __all__ = [
     "squared_frequencies",
     "switch_branch",
     "tolerances",
+    "view",
     "write_scene",
 ]
 
@@ -189,6 +191,7 @@ _LATER = {
     "Objective": "routing.objective",
     "Route": "routing.route",
     "route": "routing.route",
+    "view": "window.opening",
     **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 

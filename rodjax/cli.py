@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
     solve.set_defaults(run=_solve)
+    _add_view(commands)
     _add_sweep(commands)
     _add_fit(commands)
     _add_report(commands)
@@ -102,6 +103,22 @@ def _parser() -> argparse.ArgumentParser:
     warm.add_argument("data", metavar="DATA.csv", type=Path, nargs="*", help="of a fit: what was measured")
     warm.set_defaults(run=_warm)
     return parser
+
+
+def _add_view(commands: Any) -> None:
+    view = commands.add_parser("view", help="take the rod of a scene in the hand, in a window in the browser")
+    view.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
+    view.add_argument(
+        "--port", metavar="N", type=_port, default=8080, help="of the window; 0 for any that is free; 8080"
+    )
+    view.add_argument(
+        "--host",
+        metavar="ADDRESS",
+        default="127.0.0.1",
+        help="at which it can be reached: by default from this machine only; whoever reaches it can move the rod",
+    )
+    view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
+    view.set_defaults(run=_view)
 
 
 def _add_sweep(commands: Any) -> None:
@@ -161,6 +178,12 @@ def _shard(text: str) -> tuple[int, int]:
 def _chunk(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text) >= 1):
         raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {text!r}")
+    return int(text)
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, got {text!r}")
     return int(text)
 
 
@@ -240,6 +263,26 @@ def _solve(arguments: argparse.Namespace) -> int:
     outcome = rodjax.describe(result).replace("\n", ", ")
     print(f"rodjax: {arguments.scene}: {steps}{outcome}", file=sys.stderr)
     return 3
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    file = read_scene_file(arguments.scene)
+    from rodjax.window.opening import session_of, show  # takes a second, which the other commands need not wait for
+
+    with warnings.catch_warnings():
+        for category in (NotConvergedWarning, OverstretchedWarning, MeshWarning):
+            warnings.simplefilter("ignore", category)  # said by the window
+        try:
+            shown = rodjax.solve_path(file.scenes, **file.settings) if file.is_path else file.scenes[0]
+            session = session_of(shown, file.segments, file.strain_limit)
+        except ValueError as error:
+            print(f"rodjax: {arguments.scene}: {' '.join(str(error).split())}", file=sys.stderr)
+            return 3
+    try:
+        show(session, arguments.port, arguments.host, not arguments.no_browser)
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+    return 0
 
 
 def _sweep(arguments: argparse.Namespace) -> int:

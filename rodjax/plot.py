@@ -169,7 +169,13 @@ def largest_radius(radius: Value) -> float:
 def _framed(
     equilibrium: Equilibrium, s: Float[jax.Array, "k"]
 ) -> tuple[Float[jax.Array, "k 3"], Float[jax.Array, "k 3"], Float[jax.Array, "k 3"]]:
-    """Centerline, tangents and d1 between the nodes."""
+    return framed_at(equilibrium, s)
+
+
+def framed_at(
+    equilibrium: Equilibrium, s: Float[jax.Array, "k"]
+) -> tuple[Float[jax.Array, "k 3"], Float[jax.Array, "k 3"], Float[jax.Array, "k 3"]]:
+    """Centerline, tangents and d1 of one equilibrium between its nodes."""
     centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
     tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
     return centerline, tangents, _directors(equilibrium, s, tangents)
@@ -179,17 +185,17 @@ def _directors(
     equilibrium: Equilibrium, s: Float[jax.Array, "k"], tangents: Float[jax.Array, "k 3"]
 ) -> Float[jax.Array, "k 3"]:
     """d1 between the nodes: carried from both neighbours without twist, the angle between the two shared evenly."""
-    spacing = equilibrium.s[1] - equilibrium.s[0]
-    first = jnp.clip(jnp.floor(s / spacing), 0, len(equilibrium.s) - 2)
-    cell = first.astype(int)
+    nodes = equilibrium.s
+    cell = jnp.clip(jnp.sum(nodes[None] <= s[:, None], axis=1) - 1, 0, len(nodes) - 2)
+    length = nodes[cell + 1] - nodes[cell]
     d1 = equilibrium.frames[:, :, 0]
     from_before = jax.vmap(transport)(d1[cell], equilibrium.tangents[cell], tangents)
     from_after = jax.vmap(transport)(d1[cell + 1], equilibrium.tangents[cell + 1], tangents)
     # Frames give the angle up to turns: take the one nearest to the twist rate.
-    expected = spacing * (equilibrium.twist[cell] + equilibrium.twist[cell + 1]) / 2
+    expected = length * (equilibrium.twist[cell] + equilibrium.twist[cell + 1]) / 2
     angle = jax.vmap(angle_about)(tangents, from_before, from_after)
     angle += 2 * jnp.pi * jnp.round((expected - angle) / (2 * jnp.pi))
-    angle = ((s / spacing - first) * angle)[:, None]
+    angle = ((s - nodes[cell]) / length * angle)[:, None]
     return jnp.cos(angle) * from_before + jnp.sin(angle) * jnp.cross(tangents, from_before)
 
 

@@ -102,7 +102,7 @@ def test_a_solve_that_does_not_converge_exits_with_3_and_still_writes(tmp_path, 
     ("arguments", "said"),
     [
         ([], "COMMAND"),
-        (["bend"], "'solve', 'sweep', 'merge', 'fit', 'report', 'route', 'demo', 'warm'"),
+        (["bend"], "'solve', 'view', 'sweep', 'merge', 'fit', 'report', 'route', 'demo', 'warm'"),
         (["solve"], "SCENE.toml"),
         (["solve", HANGING, "--fast"], "--fast"),
         (["solve", "missing.toml"], "missing.toml: cannot be read"),

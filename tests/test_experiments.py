@@ -169,6 +169,18 @@ def test_scaling(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
+def test_window_latency(tmp_path):
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    rows = script("window_latency").main(["--scene", "two clips", "--moves", "50", "--out", str(tmp_path)])
+    (row,) = rows
+    assert row.moves == 50
+    assert row.not_moved == 0
+    assert 0 < row.solved < row.median < row.percent_99_9 <= row.worst
+    assert row.iterations_median <= 6
+    assert (tmp_path / "window_latency.csv").read_text().count("\n") == 2
+
+
+@pytest.mark.slow
 def test_interactive(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     options = ["--segments", "6", "--scene", "hanging", "--moves", "40", "--out", str(tmp_path)]

@@ -23,6 +23,7 @@ ORDER = (
     ("identification",),
     ("routing",),
     ("sweep",),
+    ("window",),
     ("demo", "warm"),
     ("rodjax",),
     ("cli", "cosseratbench"),

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rodjax import Clamp, Free, PointForce, Rod, Scene, Smooth, Steps, frame, plot, problems, solve
+from rodjax import Clamp, Clip, Free, PointForce, Rod, Scene, Smooth, Steps, frame, plot, problems, solve
 from rodjax.discretization.twist import angle_about, transport_along
 
 SEGMENTS = 10
@@ -81,6 +81,18 @@ def test_the_strip_runs_along_d1_at_the_nodes(twisted):
     at_nodes = [int(np.argmin(np.abs(s - node))) for node in twisted.s]
     np.testing.assert_allclose(s[at_nodes], twisted.s, atol=1e-12)
     np.testing.assert_allclose(strip[at_nodes], twisted.frames[:, :, 0], atol=1e-10)
+
+
+def test_directors_between_nodes_pass_through_those_at_nodes_of_unequal_elements():
+    level = frame((1.0, 0.0, 0.0))
+    turned = frame((1.0, 0.0, 0.0), (0.0, 1.0, 2.0))
+    clip = Clip(0.33, (0.3, 0.0, -0.05))
+    scene = Scene(problems.cable(), Clamp((0, 0, 0), level), Clamp((0.8, 0, 0), turned), clips=[clip])
+    equilibrium = solve(scene, segments=10)
+    assert np.ptp(np.diff(equilibrium.s)) > 0.01
+    _, tangents, d1 = plot.framed_at(equilibrium, equilibrium.s)
+    np.testing.assert_allclose(tangents, equilibrium.tangents, atol=1e-10)
+    np.testing.assert_allclose(d1, equilibrium.frames[:, :, 0], atol=1e-10)
 
 
 def test_the_strip_winds_by_the_total_twist(twisted):

@@ -170,6 +170,12 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     path = file_path(path, "path", SUFFIX)
+    replace_file(path, file_content(equilibrium))
+
+
+def file_content(equilibrium: Equilibrium) -> bytes:
+    """What `save` writes, with the same errors."""
+    instance(equilibrium, "equilibrium", Equilibrium)
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
     if equilibrium.scene.rod.law is not None:
@@ -194,7 +200,7 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
         _write(file.create_group("rodjax"), equilibrium)
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
     seal(image)
-    replace_file(path, image.getvalue())
+    return image.getvalue()
 
 
 def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) -> None:

@@ -27,8 +27,13 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
 
     Of the loads along the rod the file keeps the order among the forces and among the couples.
     """
+    text = scene_text(scene, segments)
+    replace_file(file_path(path, "path"), text.encode())
+
+
+def scene_text(scene: Scene, segments: int | None = None) -> str:
+    """What `write_scene` writes, with the same errors."""
     instance(scene, "scene", Scene)
-    path = file_path(path, "path")
     if not is_known(scene):
         raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
     if scene.rod.length.ndim:
@@ -66,7 +71,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
         lines += ["", "[[obstacles]]", *written_obstacle(one, f"scene.obstacles[{k}]")]
     if segments is not None:
         lines += ["", "[solve]", f"segments = {whole_number(segments, 'segments', 2, MAX_SEGMENTS)}"]
-    replace_file(path, "\n".join([*lines, ""]).encode())
+    return "\n".join([*lines, ""])
 
 
 def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[str]:

@@ -1,0 +1,150 @@
+"""Does the window keep up with a hand?
+
+A hand that moves and turns at random (`interactive.hand`), by 5 mm and 3 degrees a move at most, drags the end of a
+cable of 32 elements, 90 times a second, in a window that nobody looks at: through its mailbox, its thread and all that
+it sends to a browser. What is measured is the time from a move received to its shape sent. It needs viser: pip install
+'rodjax[view]'.
+"""
+
+import argparse
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from interactive import hand
+from measuring import conditions, save_rows, set_up
+
+import rodjax
+from rodjax.window.browser import Window
+from rodjax.window.controls import Pose
+from rodjax.window.session import Report, Session
+
+SEGMENTS = 32
+PERIOD = 1 / 90  # [s]
+WARM_UP = 20  # first moves, which do not count
+# [ms] and the share of moves that shall be sooner.
+TARGETS = {"two clips": (5.0, 99.9), "two obstacles": (15.0, 99.0)}
+
+
+class Row(NamedTuple):
+    """Latencies [ms] of a scene; `solved`: of these the median of the session's own part, without what is sent."""
+
+    scene: str
+    moves: int
+    median: float
+    percent_99: float
+    percent_99_9: float
+    worst: float
+    solved: float
+    target: float
+    target_percent: float
+    within: float  # share of moves within the target
+    not_moved: int  # refused, or not all of the way
+    iterations_median: float
+    iterations_max: int
+
+
+def scenes() -> dict[str, rodjax.Scene]:
+    level = rodjax.frame((1.0, 0.0, 0.0))
+    ends = rodjax.Clamp((0.0, 0.0, 0.0), level), rodjax.Clamp((0.8, 0.0, 0.0), level)
+    cable, gravity = rodjax.problems.cable(), (0.0, 0.0, -9.81)
+    clips = [rodjax.Clip(0.25, (0.22, 0.02, -0.08)), rodjax.Clip(0.5, (0.42, -0.02, -0.14))]
+    pipes = [rodjax.Capsule((x, -0.5, -0.16), (x, 0.5, -0.16), 0.03) for x in (0.25, 0.55)]
+    return {
+        "two clips": rodjax.Scene(cable, *ends, gravity, clips=clips),
+        "two obstacles": rodjax.Scene(cable, *ends, gravity, obstacles=pipes),
+    }
+
+
+def latencies(scene: rodjax.Scene, moves: int, seed: int, period: float = PERIOD) -> tuple[np.ndarray, list[Report]]:
+    """Of each move of a hand [ms], and what it led to."""
+    session = Session(scene, segments=SEGMENTS)
+    window = Window(session, port=0)
+    sent, reports = threading.Event(), []
+
+    def drawn(report: Report) -> None:
+        reports.append(report)
+        sent.set()
+
+    window.on_drawn = drawn
+    try:
+        while not window.is_ready:
+            time.sleep(0.05)
+        assert isinstance(scene.end, rodjax.Clamp)
+        positions, frames = hand(scene.end, np.zeros(3), moves + WARM_UP, seed)
+        times = []
+        due = time.perf_counter()
+        for position, frame in zip(positions, frames, strict=True):
+            due = max(due + period, time.perf_counter())
+            time.sleep(max(0.0, due - time.perf_counter()))
+            sent.clear()
+            begin = time.perf_counter()
+            window.drag("end", Pose(position, frame))
+            sent.wait()
+            times.append(1e3 * (time.perf_counter() - begin))
+    finally:
+        window.close()
+    return np.array(times[WARM_UP:]), reports[WARM_UP:]
+
+
+def row(name: str, times: np.ndarray, reports: Sequence[Report]) -> Row:
+    median, percent_99, percent_99_9 = np.percentile(times, [50, 99, 99.9])
+    target, target_percent = TARGETS[name]
+    iterations = [report.iterations for report in reports]
+    return Row(
+        scene=name,
+        moves=len(times),
+        median=float(median),
+        percent_99=float(percent_99),
+        percent_99_9=float(percent_99_9),
+        worst=float(np.max(times)),
+        solved=float(np.median([report.milliseconds for report in reports])),
+        target=target,
+        target_percent=target_percent,
+        within=float(100 * np.mean(times <= target)),
+        not_moved=sum(not report.moved for report in reports),
+        iterations_median=float(np.median(iterations)),
+        iterations_max=int(np.max(iterations)),
+    )
+
+
+HEADER = (
+    f"{'':14}|{'from a move to its shape sent [ms]':^45}|{'within':^20}|{'not':>6}|{'iterations':^12}\n"
+    f"{'scene':14}|{'median':>9}{'99 %':>9}{'99.9 %':>9}{'worst':>9}{'solved':>9}|{'target':>20}|{'moved':>6}"
+    f"|{'median':>7}{'max':>5}"
+)
+
+
+def line(row: Row) -> str:
+    within = f"{row.within:.2f} % in {row.target:g} ms"
+    return (
+        f"{row.scene:14}|{row.median:9.2f}{row.percent_99:9.2f}{row.percent_99_9:9.2f}{row.worst:9.2f}{row.solved:9.2f}"
+        f"|{within:>20}|{row.not_moved:6}|{row.iterations_median:7.0f}{row.iterations_max:5}"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> list[Row]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", nargs="+", choices=list(TARGETS), default=list(TARGETS))
+    parser.add_argument("--moves", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder for window_latency.csv")
+    arguments = parser.parse_args(argv)
+    set_up()
+    print(f"{arguments.moves} moves, {SEGMENTS} elements, seed {arguments.seed}; {conditions()}")
+    print(HEADER)
+    rows = []
+    for name in arguments.scene:
+        found = row(name, *latencies(scenes()[name], arguments.moves, arguments.seed))
+        print(line(found), flush=True)
+        rows.append(found)
+    if arguments.out is not None:
+        save_rows(rows, arguments.out / "window_latency.csv")
+    return rows
+
+
+if __name__ == "__main__":
+    main()

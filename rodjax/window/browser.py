@@ -1,0 +1,323 @@
+"""The window in the browser: a session, a viser server that shows it, and one thread between the two."""
+
+import contextlib
+import gc
+import io
+import logging
+import socket
+import threading
+import time
+import webbrowser
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rodjax.checks import whole_number
+from rodjax.routing.limits import Limits
+from rodjax.window.controls import Pose
+from rodjax.window.files import path_file, scene_file
+from rodjax.window.mailbox import Mailbox
+from rodjax.window.numbers import least_bend_radius, rows
+from rodjax.window.panel import Buttons, Panel
+from rodjax.window.reading import QUANTITIES
+from rodjax.window.session import Report, Session
+from rodjax.window.stage import Stage
+from rodjax.window.tube import Scale, covers, scale_over
+
+# Seconds: without a move after which a rod is at rest, between numbers and between looks at stability while it moves,
+# between frames of a recording, and without a number after which a slider is taken anew.
+REST, NUMBERS, STABILITY, FRAME, STRETCH = 0.05, 0.1, 0.25, 1 / 30, 0.5
+MARGIN = "share of the bend limit"
+_log = logging.getLogger("rodjax")
+
+
+class Window:
+    """A session that a browser shows; it lives until `close`.
+
+    **Arguments:**
+
+    - `session`: `Session`.
+    - `port`: 0 for any that is free. `host`: who may connect; the default only programs of this machine.
+    - `limits`: of `rodjax.Limits`, against which numbers are shown; `None` for none.
+
+    `on_drawn` is called with the report of each move whose shape has been sent, in the window's own thread.
+
+    Raises `ImportError` without viser, `OSError` where nothing can be opened at host and port.
+    """
+
+    def __init__(self, session: Session, port: int = 8080, host: str = "127.0.0.1", limits: Limits | None = None):
+        self.session, self.limits = session, limits
+        self.quantity, self.with_loads = "curvature", True
+        self.scales: dict[str, Scale] = {}
+        self.report = Report(session.reading, "", True, False, int(session.result.iterations), 0.0)
+        self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
+        self.on_drawn: Callable[[Report], None] = lambda report: None
+        self._numbers_at = self._stability_at = self._slid_at = 0.0
+        self._slid = ""
+        self.server = started(port, host)
+        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.server.get_port()}"
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        # A tunnel through a server of viser's would let anybody in.
+        self.server.request_share_url = _no_tunnel
+        self.stage = Stage(self.server, session, self.drag)
+        self.panel = self._panel()
+        self.panel.show_frames(len(session.recorded), len(session.recorded) - 1)
+        self._draw()
+        self._thread = threading.Thread(target=self._run, name="rodjax window", daemon=True)
+        self._thread.start()
+
+    def open(self) -> None:
+        """Shows the window in the user's browser."""
+        webbrowser.open(self.url)
+
+    def close(self) -> None:
+        """Ends the server and its threads. A second call does nothing."""
+        if self._mailbox.is_closed:
+            return
+        self._mailbox.close()
+        self._closed.set()
+        self._thread.join()
+        gc.unfreeze()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def wait(self) -> None:
+        """Until Ctrl-C, then closes."""
+        try:
+            # Not the thread itself: a join that is interrupted takes it for ended (Python 3.11).
+            while not self._closed.wait(0.5):
+                pass
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.close()
+
+    # --- what the browser asks for ---
+
+    def _panel(self) -> Panel:
+        colors = dict(QUANTITIES)
+        if not self.session.scene.obstacles:
+            colors.pop("pressure")
+        if least_bend_radius(self.session, self.limits) is not None:
+            colors[MARGIN] = MARGIN
+        later = self._mailbox.command
+        buttons = Buttons(
+            undo=lambda: later(self.undo),
+            start_over=lambda: later(self.start_over),
+            save_scene=lambda client: later(lambda: self._download(client, "scene.toml", scene_file)),
+            color_by=lambda name: later(lambda: self.color_by(name)),
+            fit_colors=lambda: later(self.fit_colors),
+            show_loads=lambda on: later(lambda: self.show_loads(on)),
+            show_handles=self.stage.show_handles,
+            number=self._number,
+            record=lambda on: later(lambda: self.record(on)),
+            play=lambda: later(self.play),
+            show_recorded=lambda k: self._mailbox.move("recorded", k),
+            save_recording=lambda client: later(lambda: self._download(client, "path.vtkhdf", path_file)),
+        )
+        numbers = dict(self.session.now.controls.numbers)
+        return Panel(self.server.gui, list(self.session.sliders.values()), numbers, colors, buttons)
+
+    def drag(self, name: str, pose: Pose, phase: str = "update") -> None:
+        """A handle has been dragged to a pose, as the browser tells it: at the "start", an "update" or the "end"."""
+        if phase == "start":
+            self._mailbox.command(self.session.mark)
+        self._mailbox.move(name, pose)
+        if phase == "end":
+            self._mailbox.command(lambda: self.stage.place(handles=True))
+
+    def _number(self, name: str, value: float) -> None:
+        # One stretch of a slider is undone at once, and its numbers are coalesced.
+        now = time.monotonic()
+        if name != self._slid or now - self._slid_at > STRETCH:
+            self._mailbox.command(self.session.mark)
+        self._slid, self._slid_at = name, now
+        self._mailbox.move(name, value)
+
+    # --- the thread that does it ---
+
+    def _run(self) -> None:
+        self._do(self._warm_up)
+        while not self._mailbox.is_closed:
+            item = self._mailbox.take(REST if self._is_unsettled else None)
+            if self._mailbox.is_closed:
+                return
+            if item is None:
+                self._do(self._settle)
+            elif callable(item):
+                self._do(item)
+            else:
+                moves = item
+                self._do(lambda moves=moves: self._moved(moves))
+
+    def _do(self, command: Callable[[], None]) -> None:
+        """Whatever goes wrong is said, and the window lives on."""
+        try:
+            command()
+        except Exception as error:
+            _log.exception("the window could not do what it was asked")
+            self.panel.say(f"{type(error).__name__}: {' '.join(str(error).split())}", is_bad=True)
+
+    def _warm_up(self) -> None:
+        self.panel.say("compiling: a few seconds, once for this kind of scene")
+        self.session.warm_up(lambda: not self._mailbox.is_closed)
+        self._settle()
+        # A full collection would look at millions of objects of JAX, for a tenth of a second in the middle of a move.
+        gc.collect()
+        gc.freeze()
+        self._ready.set()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether all that moves need is compiled."""
+        return self._ready.is_set()
+
+    @property
+    def _hint(self) -> str:
+        return f"Drag an arrow or a ring of a handle. {self.stage.note}"
+
+    @property
+    def _is_unsettled(self) -> bool:
+        return self._numbers_at == 0.0 or (self.session.softest is None and self.session.can_settle)
+
+    def _moved(self, moves: dict[str, Any]) -> None:
+        frame = moves.pop("recorded", None)
+        if frame is not None:
+            self.show_recorded(int(frame))
+        if not moves:
+            return
+        self.report = self.session.move(moves)
+        self.stage.place(handles=False)
+        self._draw()
+        self.on_drawn(self.report)
+        now = time.monotonic()
+        if self._mailbox.is_empty and now - self._stability_at > STABILITY:
+            self._look_at_stability()
+        if self.report.message or now - self._numbers_at > NUMBERS:
+            self._show_numbers()
+        else:
+            self._numbers_at = 0.0  # later, at rest
+
+    def _settle(self) -> None:
+        self._look_at_stability()
+        self._show_numbers()
+
+    def _look_at_stability(self) -> None:
+        self.session.settle()
+        self._stability_at = time.monotonic()
+
+    def _show_numbers(self) -> None:
+        self._numbers_at = time.monotonic()
+        self.panel.show_rows(rows(self.session, self.report, self.limits))
+        text = self.report.message or ("the rod is about to snap" if self.session.is_soft else "")
+        self.panel.say(text or self._hint, is_bad=bool(text))
+
+    def _draw(self) -> None:
+        reading = self.report.reading
+        least = least_bend_radius(self.session, self.limits)
+        if least is not None:
+            reading.values[MARGIN] = least * reading.values["curvature"]
+        values = reading.values[self.quantity]
+        scale = self.scales.get(self.quantity)
+        if scale is None or not covers(scale, values):
+            low, high = float(np.min(values)), float(np.max(values))
+            if scale is not None:  # it only grows, so that a colour keeps its meaning
+                low, high = min(low, float(scale.edges[0])), max(high, float(scale.edges[-1]))
+            scale = self.scales[self.quantity] = scale_over(low, high)
+        with self.server.atomic():
+            self.stage.draw(reading, self.quantity, scale)
+            self.stage.draw_loads(reading, self.with_loads)
+        self.panel.show_legend(scale)
+
+    def _show_all(self) -> None:
+        """After a jump to another moment: handles and sliders go along."""
+        self.stage.place(handles=True)
+        self.panel.show_numbers(dict(self.session.now.controls.numbers))
+        self._draw()
+        self._settle()
+
+    # --- commands, for the window's thread ---
+
+    def command(self, do: Callable[[], None]) -> None:
+        """Has a command done by the window's thread, after all that was asked for before."""
+        self._mailbox.command(do)
+
+    def undo(self) -> None:
+        self.report = self.session.undo()
+        self._show_all()
+
+    def start_over(self) -> None:
+        self.session.mark()
+        self._jump(lambda: self.session.show(self.session.first))
+
+    def _jump(self, show: Callable[[], Any]) -> None:
+        begin = time.perf_counter()
+        self.report = Report(show(), "", True, False, 0, 1e3 * (time.perf_counter() - begin))
+        self._show_all()
+
+    def color_by(self, name: str) -> None:
+        self.quantity = name
+        self._draw()
+
+    def fit_colors(self) -> None:
+        self.scales.pop(self.quantity, None)
+        self._draw()
+
+    def show_loads(self, on: bool) -> None:
+        self.with_loads = on
+        self._draw()
+
+    def record(self, on: bool) -> None:
+        self.session.record(on)
+        if not on:
+            self.panel.show_frames(len(self.session.recorded), len(self.session.recorded) - 1)
+        self.panel.say("every move is recorded" if on else f"{len(self.session.recorded)} moments are recorded")
+
+    def show_recorded(self, k: int) -> None:
+        if self.session.recorded and not self.session.is_recording:
+            moment = self.session.recorded[min(k, len(self.session.recorded) - 1)]
+            self._jump(lambda: self.session.show(moment))
+
+    def play(self) -> None:
+        for k in range(len(self.session.recorded)):
+            if not self._mailbox.is_empty or self._mailbox.is_closed:
+                return  # something else was asked for
+            begin = time.monotonic()
+            self.show_recorded(k)
+            self.panel.frame.value = k
+            time.sleep(max(0.0, FRAME - (time.monotonic() - begin)))
+
+    def _download(self, client: Any, name: str, make: Callable[[Session], tuple[bytes, str]]) -> None:
+        """To the browser that asked for it: this process writes no file."""
+        try:
+            content, note = make(self.session)
+        except (ImportError, ValueError) as error:
+            self.panel.say(f"not saved: {error}", is_bad=True)
+            return
+        client.send_file_download(name, content)
+        self.panel.say(f"{name}: {note}" if note else f"{name} is ready to be downloaded")
+
+
+def started(port: int, host: str) -> Any:
+    """A viser server at exactly this address."""
+    try:
+        import viser
+    except ImportError:
+        raise ImportError("view needs viser, got none: pip install 'rodjax[view]'") from None
+    port = whole_number(port, "port", 0, 65535)
+    # viser would take the next port, or wait forever.
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise OSError(f"port {port} of {host} cannot be opened: {error.strerror}") from None
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=host, port=port, label="rodjax", verbose=False)
+
+
+def _no_tunnel(verbose: bool = True) -> None:
+    _log.warning("a browser asked to share the window beyond this machine, which rodjax does not do")

@@ -1,0 +1,503 @@
+"""The window's session, without a browser."""
+
+import math
+import socket
+import sys
+import threading
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rodjax as rj
+from rodjax.cli import main
+from rodjax.io.scene_file import read_scene
+from rodjax.window import tube
+from rodjax.window.bounds import out_of_reach, reaches
+from rodjax.window.controls import Pose, SceneMaker, controls_of, handles_of, moved, sliders_of
+from rodjax.window.files import path_file, scene_file
+from rodjax.window.mailbox import Mailbox
+from rodjax.window.numbers import rows
+from rodjax.window.opening import session_of, view
+from rodjax.window.session import SNAP_WAY, Session
+
+SEGMENTS = 10
+LEVEL = rj.frame((1.0, 0.0, 0.0))
+
+
+def hanging(**more) -> rj.Scene:
+    return rj.Scene(
+        rj.problems.cable(),
+        rj.Clamp((0.0, 0.0, 0.0), LEVEL),
+        rj.Clamp((0.8, 0.0, 0.0), LEVEL),
+        gravity=(0.0, 0.0, -9.81),
+        **more,
+    )
+
+
+def turned(frame, angle: float) -> np.ndarray:
+    """About its own tangent."""
+    frame = np.asarray(frame)
+    return Rotation.from_rotvec(angle * frame[:, 2]).as_matrix() @ frame
+
+
+@pytest.fixture(scope="module")
+def begun() -> Session:
+    return Session(hanging(), segments=SEGMENTS)
+
+
+@pytest.fixture
+def session(begun: Session) -> Session:
+    begun.show(begun.first)
+    begun.recorded, begun.is_recording, begun._undone = [], False, []
+    return begun
+
+
+def end(session: Session) -> Pose:
+    return session.now.controls.poses["end"]
+
+
+# --- controls --------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_of_its_own_controls_is_the_same():
+    box = rj.Box((0.4, 0.0, -0.5), (0.1, 0.1, 0.1), np.eye(3))
+    scene = hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1), tangent=(1, 0, 0))], obstacles=[box])
+    same = SceneMaker(scene)(controls_of(scene))
+    assert jax_leaves(same) == pytest.approx(jax_leaves(scene), abs=1e-15)  # the tangent of a clip by way of a frame
+
+
+def jax_leaves(scene: rj.Scene) -> np.ndarray:
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
+
+
+def test_handles_and_sliders_are_those_of_what_the_scene_has():
+    scene = hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1))], obstacles=[rj.Distance(lambda point: point[2] + 1.0)])
+    assert list(handles_of(scene)) == ["start", "end", "clips[0]"]  # what has only a distance cannot be moved
+    assert not handles_of(scene)["clips[0]"].turns
+    assert list(sliders_of(scene)) == ["rod.length", "rod.EI", "rod.GJ", "gravity", "clips[0].at"]
+    cantilever = rj.problems.cantilever()
+    assert list(handles_of(cantilever)) == ["start"]
+    assert list(sliders_of(cantilever)) == ["rod.length", "rod.EI", "rod.GJ"]
+
+
+def test_numbers_of_sliders_are_those_of_the_scene():
+    scene = hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1))])
+    made = SceneMaker(scene)
+    numbers = {"rod.length": 1.2, "rod.EI": 2.0, "rod.GJ": 0.5, "gravity": 0.25, "clips[0].at": 0.45}
+    changed = made(controls_of(scene).changed(numbers))
+    assert float(changed.rod.length) == 1.2
+    assert float(changed.rod.EI) == 2.0 * float(scene.rod.EI)
+    assert float(changed.rod.GJ) == 0.5 * float(scene.rod.GJ)
+    assert changed.gravity is not None
+    np.testing.assert_allclose(changed.gravity, (0, 0, -9.81 / 4))
+    assert float(changed.clips[0].at) == 0.45
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        rj.Plane((0.1, 0.2, 0.3), (0.0, 1.0, 1.0)),
+        rj.Sphere((0.1, 0.2, 0.3), 0.1),
+        rj.Capsule((0.1, 0.2, 0.3), (0.4, 0.2, 0.1), 0.1),
+        rj.Cylinder((0.1, 0.2, 0.3), (0.4, 0.2, 0.1), 0.1),
+        rj.Box((0.1, 0.2, 0.3), (0.1, 0.2, 0.3), np.eye(3)),
+        rj.Pipe([(0.1, 0.2, 0.3), (0.4, 0.2, 0.1), (0.5, 0.5, 0.1)], 0.05),
+        rj.Union(rj.Sphere((0.1, 0.2, 0.3), 0.1), rj.Sphere((0.3, 0.2, 0.3), 0.1)),
+    ],
+    ids=lambda obstacle: type(obstacle).__name__,
+)
+def test_an_obstacle_moves_as_a_rigid_body(obstacle):
+    """The distance of a point is that of the point moved back."""
+    pivot, pose = (
+        np.array([0.2, 0.1, 0.0]),
+        Pose(np.array([-0.1, 0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()),
+    )
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    back = pivot + (points - pose.position) @ pose.frame
+    np.testing.assert_allclose(moved(obstacle, pivot, pose).distance(points), obstacle.distance(back), atol=1e-12)
+
+
+def test_half_of_a_move_is_half_of_its_turn():
+    scene = hanging()
+    controls = controls_of(scene)
+    frame = turned(LEVEL, 1.0)
+    half = controls.between(controls.changed({"end": ((0.6, 0.0, 0.0), frame), "gravity": 0.5}), 0.5)
+    np.testing.assert_allclose(half.poses["end"].position, (0.7, 0, 0), atol=1e-15)
+    np.testing.assert_allclose(half.poses["end"].frame, turned(LEVEL, 0.5), atol=1e-12)
+    assert half.numbers["gravity"] == 0.75
+    assert half.poses["start"] is controls.poses["start"]
+
+
+# --- moves -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_rod_follows_a_move(session):
+    report = session.move({"end": ((0.75, 0.05, 0.02), None)})
+    cold = rj.solve(session.result.scene, segments=SEGMENTS)
+    assert report.moved
+    assert report.message == ""
+    np.testing.assert_allclose(session.result.nodes[-1], (0.75, 0.05, 0.02), atol=1e-12)
+    # Both solves end at residuals below 1e-8 EI/L^2.
+    np.testing.assert_allclose(session.result.nodes, cold.nodes, atol=1e-7)
+    np.testing.assert_allclose(report.reading.forces[1], session.result.end_force)
+    np.testing.assert_allclose(report.reading.forces[0], -np.asarray(session.result.start_force))
+
+
+def test_a_connector_is_wound_up_and_unwound(session):
+    """Two turns in one move are made in pieces, so that none is lost; the twist in the rod is that of its ends."""
+    before = np.asarray(session.result.nodes)
+    for k in range(1, 9):
+        report = session.move({"end": ((0.8, 0.0, 0.0), turned(LEVEL, k * math.pi / 2))})
+        assert report.moved
+    scene = session.result.scene
+    shape = rj.solve(scene, segments=SEGMENTS, guess=session.result)
+    assert float(session.result.total_twist) == pytest.approx(float(shape.total_twist), abs=1e-8)
+    # The ends turned by two turns against one another; what the curve writhes is not twist.
+    assert float(session.result.total_twist) > 2 * math.pi
+    for k in range(7, -1, -1):
+        assert session.move({"end": ((0.8, 0.0, 0.0), turned(LEVEL, k * math.pi / 2))}).moved
+    assert float(session.result.total_twist) == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(np.abs(np.asarray(session.result.nodes)), np.abs(before), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("move", "told"),
+    [
+        ({"end": ((5.0, 0.0, 0.0), None)}, "the ends are 5 m apart"),
+        ({"end": ((1.2, 0.0, 0.0), None)}, "1 m of rod between them reach at most 1.05 m"),
+        ({"end": ((math.nan, 0.0, 0.0), None)}, "end.position must be finite"),
+        ({"end": ((0.8, 0.0, 0.0), np.diag([1.0, 1.0, -1.0]))}, "end.frame must be right-handed"),
+        ({"rod.length": -1.0}, "length"),
+        ({"rod.EI": math.inf}, "rod.EI must be finite"),
+        ({"middle": ((0.0, 0.0, 0.0), None)}, "there is nothing to move named 'middle'"),
+    ],
+)
+def test_a_move_that_makes_no_sense_is_told_and_the_session_lives_on(session, move, told):
+    report = session.move(move)
+    assert not report.moved
+    assert told in report.message
+    assert bool(session.result.converged)
+    assert np.all(np.isfinite(report.reading.centerline))
+    assert session.move({"end": ((0.78, 0.0, 0.0), None)}).moved
+
+
+def test_a_move_beyond_the_reach_is_followed_as_far_as_it_goes(session):
+    report = session.move({"end": ((0.8, 0.0, 0.9), None)})
+    assert not report.moved
+    assert "of the way only" in report.message
+    assert 0.2 < end(session).position[2] < 0.7
+
+
+def test_reach_is_that_of_the_rod_between_two_places():
+    scene = hanging(clips=[rj.Clip(0.3, (0.2, 0.0, 0.0)), rj.Clip(0.6, (0.5, 0.0, 0.0), sliding=True)])
+    np.testing.assert_allclose(reaches(scene), [0.2 / 0.3, 0.3, 0.3])
+    assert out_of_reach(scene, [1.0, 1.0, 1.0]) is None
+    told = out_of_reach(scene, [0.5, 1.0, 1.0])
+    assert told == "clip 0 is 0.2 m from the start, but the 0.3 m of rod between them reach at most 0.15 m"
+
+
+def test_a_sudden_change_of_shape_is_told_as_a_snap():
+    """A strut bowed up by its clamps, which turn down: it jumps where the bow has no equilibrium left."""
+    rod = rj.Rod(1.0, EI=1.0, GJ=1.0, EA=1e4)
+    tilted = rj.frame((math.cos(0.5), 0.0, -math.sin(0.5)), (0, 1, 0))
+    up = rj.frame((math.cos(0.5), 0.0, math.sin(0.5)), (0, 1, 0))
+    begin = rj.Scene(rod, rj.Clamp((0, 0, 0), up), rj.Clamp((0.95, 0, 0), tilted))
+    session = Session(begin, segments=SEGMENTS)
+    assert float(session.result.nodes[SEGMENTS // 2, 2]) > 0.1
+    snaps, softest = [], []
+    for k in range(41):
+        angle = 0.5 - k / 40
+        start = rj.frame((math.cos(angle), 0.0, math.sin(angle)), (0, 1, 0))
+        stop = rj.frame((math.cos(angle), 0.0, -math.sin(angle)), (0, 1, 0))
+        report = session.move({"start": ((0, 0, 0), start), "end": ((0.95, 0, 0), stop)})
+        assert report.moved
+        if report.snapped:
+            assert report.message == "the rod snapped into another shape"
+        snaps.append(report.snapped)
+        softest.append(session.settle())
+    assert sum(snaps) == 1
+    before = snaps.index(True) - 1
+    assert float(session.result.nodes[SEGMENTS // 2, 2]) < -SNAP_WAY
+    # The softest stiffness falls towards the snap.
+    assert softest[before] < 0.2 * softest[0]
+
+
+def test_a_support_may_not_enter_an_obstacle_nor_the_other_way_round():
+    ball = rj.Sphere((0.4, 0.0, 0.5), 0.1)
+    session = Session(hanging(obstacles=[ball]), segments=SEGMENTS)
+    report = session.move({"end": ((0.42, 0.0, 0.5), None)})
+    assert "the end is 0.08 m inside of obstacle 0 (sphere)" in report.message
+    there = session.now.controls.poses["obstacles[0]"].position
+    report = session.move({"obstacles[0]": ((0.0, 0.0, 0.05), None)})
+    assert "the start is 0.05 m inside of obstacle 0 (sphere)" in report.message
+    assert not report.moved
+    assert session.move({"obstacles[0]": (there, None)}).moved
+
+
+def test_an_obstacle_pushes_the_rod_and_lets_it_go():
+    session = Session(hanging(obstacles=[rj.Capsule((0.4, -1.0, -0.5), (0.4, 1.0, -0.5), 0.05)]), segments=SEGMENTS)
+    free = np.asarray(session.result.nodes)
+    assert session.reading.clearances[0] == pytest.approx(-0.055 - (-0.5 - free[:, 2].min()), abs=2e-3)
+    report = session.move({"obstacles[0]": ((0.4, 0.0, -0.3), None)})
+    assert report.moved
+    weight = float(session.scene.rod.mass_per_length) * 9.81
+    assert 0.1 * weight < report.reading.obstacle_forces[0][2] < 2 * weight
+    # All forces on the rod are in balance with its weight.
+    total = report.reading.forces.sum(0) + report.reading.obstacle_forces.sum(0)
+    np.testing.assert_allclose(total, (0, 0, weight), atol=1e-6)
+    assert np.max(report.reading.values["pressure"]) > 0
+    session.move({"obstacles[0]": ((0.4, 0.0, -0.5), None)})
+    np.testing.assert_allclose(session.result.nodes, free, atol=1e-7)
+    assert np.all(session.reading.obstacle_forces == 0)
+
+
+KINDS = {
+    "a pin, a swivel and a clip that holds a direction": lambda: rj.Scene(
+        rj.problems.cable(),
+        rj.Pin((0, 0, 0)),
+        rj.Swivel((0.8, 0, 0), (1, 0, 0)),
+        (0, 0, -9.81),
+        clips=[rj.Clip(0.5, (0.4, 0, -0.1), tangent=(1, 0, 0))],
+    ),
+    "a strip": lambda: rj.Scene(
+        rj.Rod(1.0, (5e-3, 2e-2), 5e-3, 800.0, mass_per_length=0.1),
+        rj.Clamp((0, 0, 0), LEVEL),
+        rj.Clamp((0.8, 0, 0), LEVEL),
+        (0, 0, -9.81),
+    ),
+    "a stiffness that jumps": lambda: rj.Scene(
+        rj.Rod(
+            1.0, rj.Steps([0.5], [5e-3, 2e-2]), 5e-3, 800.0, mass_per_length=0.1, radius=rj.Smooth([0, 1], [5e-3, 8e-3])
+        ),
+        rj.Clamp((0, 0, 0), LEVEL),
+        rj.Clamp((0.8, 0, 0), LEVEL),
+        (0, 0, -9.81),
+    ),
+    "a moment on a free end, which has no potential": lambda: rj.Scene(
+        rj.problems.cable(), rj.Clamp((0, 0, 0), LEVEL), rj.Free(moment=(0, 5e-3, 2e-3)), (0, 0, -9.81)
+    ),
+    "a clip through which the rod slides": lambda: hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1), sliding=True)]),
+}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] if "slides" in kind else []) for kind in KINDS]
+)
+def test_every_kind_of_scene_can_be_taken_in_the_hand(kind):
+    """Its first handle moves all of it, to where a solve of the scene there finds it."""
+    session = Session(KINDS[kind](), segments=SEGMENTS)
+    place = session.now.controls.poses["start"].position + np.array([0.01, 0.02, 0.0])
+    report = session.move({"start": (place, None), "rod.EI": 1.1})
+    assert report.moved, report.message
+    again = rj.solve(session.result.scene, segments=SEGMENTS, guess=session.result)
+    np.testing.assert_allclose(session.result.nodes, again.nodes, atol=1e-7)  # residuals below 1e-8 EI/L^2
+    np.testing.assert_allclose(session.result.nodes[0], place, atol=1e-15)
+    assert all(np.all(np.isfinite(values)) for values in report.reading.values.values())
+    assert np.isfinite(report.reading.bend_radius)
+    assert (session.settle() is None) == ("potential" in kind or "slides" in kind)
+    labels = [row.label for row in rows(session, report)]
+    assert len(set(labels)) == len(labels)
+
+
+# --- undo, record, save ----------------------------------------------------------------------------------------------
+
+
+def test_undo_goes_back_to_where_the_hand_took_hold(session):
+    session.mark()
+    session.move({"end": ((0.75, 0.0, 0.0), None)})
+    session.move({"end": ((0.7, 0.0, 0.0), None)})
+    session.mark()
+    session.move({"gravity": 0.5})
+    session.undo()
+    assert session.now.controls.numbers["gravity"] == 1.0
+    np.testing.assert_allclose(session.result.nodes[-1], (0.7, 0, 0), atol=1e-12)
+    session.undo()
+    assert session.now is session.first
+    assert session.undo().message == "there is nothing to undo"
+
+
+def test_a_recording_is_a_path(session, tmp_path):
+    with pytest.raises(ValueError, match="nothing is recorded yet"):
+        session.recording()
+    session.record(True)
+    for x in (0.78, 0.76, 0.74):
+        session.move({"end": ((x, 0.0, 0.0), None)})
+    session.record(False)
+    session.move({"end": ((0.72, 0.0, 0.0), None)})
+    content, _ = path_file(session)
+    (tmp_path / "path.vtkhdf").write_bytes(content)
+    path = rj.load(tmp_path / "path.vtkhdf")
+    np.testing.assert_allclose(path.nodes[:, -1, 0], (0.8, 0.78, 0.76, 0.74), atol=1e-12)
+    again = session_of(path, None)
+    assert again.segments == SEGMENTS
+    np.testing.assert_allclose(again.result.nodes[-1], (0.74, 0, 0), atol=1e-12)
+    again.show(again.recorded[1])
+    report = again.move({"end": ((0.77, 0.0, 0.0), None)})
+    assert report.moved
+    np.testing.assert_allclose(again.result.nodes[-1], (0.77, 0, 0), atol=1e-12)
+
+
+def test_a_saved_scene_has_the_turns_of_the_rod(session, tmp_path):
+    for k in range(1, 7):
+        session.move({"end": ((0.8, 0.0, 0.1), turned(LEVEL, k * math.pi / 2))})
+    content, remark = scene_file(session)
+    assert remark == ""
+    (tmp_path / "scene.toml").write_bytes(content)
+    assert tomllib.loads(content.decode())["end"]["turns"] != 0
+    scene = read_scene(tmp_path / "scene.toml")
+    assert isinstance(scene, rj.Scene)
+    again = rj.solve(scene, segments=SEGMENTS)
+    assert float(again.total_twist) == pytest.approx(float(session.result.total_twist), abs=1e-6)
+
+
+def test_the_file_of_a_shape_that_no_cold_solve_finds_says_so():
+    """A strut bowed down by where it came from: from its supports alone a solve bows it up."""
+    rod = rj.Rod(1.0, EI=1.0, GJ=1.0, EA=1e4)
+    scene = rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((0.8, 0, 0), LEVEL))
+    nodes = np.asarray(rj.solve(scene, segments=SEGMENTS).nodes)
+    other = rj.solve(scene, segments=SEGMENTS, guess=rj.Guess(nodes * [1, -1, -1]))
+    _, remark = scene_file(session_of(other, None))
+    assert remark == "solved by itself this scene ends in another shape than here"
+    _, remark = scene_file(Session(scene, segments=SEGMENTS))
+    assert remark == ""
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def test_the_tube_is_closed_and_has_the_volume_of_the_rod(session):
+    """Strips, bands and caps together: by Gauss' theorem, and from its outside."""
+    reading = session.reading
+    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
+    scale = tube.scale_over(0.0, float(np.max(reading.values["curvature"])))
+    parts = [*surface.strips, *surface.bands(reading.values["curvature"], scale), surface.caps]
+    corners = np.concatenate([part.vertices.astype(float)[part.faces] for part in parts])
+    volume = np.sum(np.linalg.det(corners)) / 6
+    length = np.sum(np.linalg.norm(np.diff(reading.centerline, axis=0), axis=1))
+    around = tube.AROUND
+    area = around / 2 * math.sin(2 * math.pi / around) * 5e-3**2
+    # Pappus, but that each piece between two rings is bent by up to 0.12 rad from its middle: 1 - cos(0.12) = 7e-3 at
+    # the most, a fifth of that on average.
+    assert volume == pytest.approx(area * length, rel=3e-3)
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
+    np.testing.assert_allclose(facing, 0, atol=1e-8)
+
+
+def test_bands_show_the_values_between_their_edges(session):
+    reading = session.reading
+    values = reading.values["curvature"]
+    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
+    scale = tube.scale_over(float(values.min()), float(values.max()))
+    assert tube.covers(scale, values)
+    assert 4 <= len(scale.colors) <= tube.MOST_BANDS
+    middles = (values[1:] + values[:-1]) / 2
+    for k, part in enumerate(surface.bands(values, scale)):
+        inside = np.sum((scale.edges[k] <= middles) & (middles < scale.edges[k + 1]))
+        assert len(part.faces) == max(1, 2 * inside * (tube.AROUND - 2 * tube.STRIP))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 0.0), (3.0, 3.0), (-1e-12, 1e-12), (-5.0, 2e6)])
+def test_a_scale_covers_its_range(low, high):
+    scale = tube.scale_over(low, high)
+    assert tube.covers(scale, np.array([low, high]))
+    assert np.all(np.diff(scale.edges) > 0)
+
+
+def test_numbers_stand_against_their_limits(session):
+    limits = rj.Limits(bend_radius=20, end_force=0.1, twist=100)
+    report = session.move({"end": ((0.6, 0.0, 0.0), None)})
+    session.settle()
+    found = {row.label: row for row in rows(session, report, limits)}
+    radius = report.reading.bend_radius
+    assert radius == pytest.approx(1 / np.max(report.reading.values["curvature"]), rel=1e-2)  # at clamps, on one side
+    assert found["smallest bend radius"].text == f"{1e3 * radius:.4g} mm of at least 205 mm"
+    assert found["smallest bend radius"].is_bad  # less than 20 diameters inside: 41 radii of 5 mm
+    assert found["force, end"].is_bad
+    assert not found["twist rate"].is_bad
+    assert found["state"].text == "at rest"
+    stiffness = float(rj.lowest_mode(session.result).stiffness)
+    assert found["softest motion"].text == f"{stiffness:.3g} N"
+
+
+# --- the browser's side ----------------------------------------------------------------------------------------------
+
+
+def test_of_moves_that_nobody_took_the_newest_counts():
+    box, done = Mailbox(), []
+    box.move("end", 1)
+    box.move("start", 2)
+    box.move("end", 3)
+    box.command(lambda: done.append("undo"))
+    box.move("end", 4)
+    assert box.take(0.0) == {"end": 3, "start": 2}
+    command = box.take(0.0)
+    assert callable(command)
+    command()
+    assert done == ["undo"]
+    assert box.take(0.0) == {"end": 4}
+    assert box.is_empty
+    assert box.take(0.0) is None
+    taken = []
+    waiting = threading.Thread(target=lambda: taken.append(box.take(None)))
+    waiting.start()
+    box.close()
+    waiting.join(5.0)
+    assert taken == [None]
+
+
+def test_arguments_that_make_no_sense_are_refused():
+    with pytest.raises(TypeError, match="shown must be a Scene or Equilibrium, got 3"):
+        view(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="segments must be a whole number from 2"):
+        Session(hanging(), segments=1)
+    with pytest.raises(ValueError, match="scene must have an equilibrium to begin with, got none: not converged"):
+        Session(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), segments=SEGMENTS)  # too large to go around
+
+
+@pytest.fixture
+def scene_toml(tmp_path):
+    rj.write_scene(hanging(), tmp_path / "scene.toml", segments=SEGMENTS)
+    return str(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--port", "70000"], "argument --port: must be a whole number from 0 to 65535, got '70000'"),
+        (["--port", "x"], "argument --port: must be a whole number from 0 to 65535, got 'x'"),
+        (["--host", "no.such.host.invalid"], "port 8080 of no.such.host.invalid cannot be opened: "),
+    ],
+)
+def test_the_command_says_what_is_wrong_in_one_line(options, said, scene_toml, capsys):
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    assert main(["view", scene_toml, "--no-browser", *options]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"rodjax: {said}")
+    assert err.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert main(["view", scene_toml, "--no-browser", "--port", str(port)]) == 2
+    said = capsys.readouterr().err
+    assert said == f"rodjax: port {port} of 127.0.0.1 cannot be opened: Address already in use\n"
+
+
+def test_without_viser_the_command_says_what_to_install(scene_toml, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", scene_toml]) == 2
+    assert capsys.readouterr().err == "rodjax: view needs viser, got none: pip install 'rodjax[view]'\n"
+
+
+def test_a_scene_without_an_equilibrium_exits_with_3(tmp_path, capsys):
+    rj.write_scene(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), tmp_path / "scene.toml", segments=SEGMENTS)
+    assert main(["view", str(tmp_path / "scene.toml")]) == 3
+    assert "scene must have an equilibrium to begin with, got none: not converged" in capsys.readouterr().err

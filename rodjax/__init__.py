@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from rodjax.routing.route import Route, route
     from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
     from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
+    from rodjax.sweeps.sweep import sweep
 
 __all__ = [
     "Between",
@@ -149,6 +150,7 @@ __all__ = [
     "solve_continuum",
     "solve_path",
     "squared_frequencies",
+    "sweep",
     "switch_branch",
     "tolerances",
     "write_scene",
@@ -188,6 +190,7 @@ _LATER = {
     "Objective": "routing.objective",
     "Route": "routing.route",
     "route": "routing.route",
+    "sweep": "sweeps.sweep",
     **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
 

@@ -20,8 +20,9 @@ import rodjax
 from rodjax.cli import main
 from rodjax.io.scene_file import read_scene
 from rodjax.solving.refinement import SIZES
-from rodjax.sweep.cases import CaseReader, SweepError, read_cases
-from rodjax.sweep.sweep import merge, summary, sweep
+from rodjax.sweeps.cases import CaseReader, SweepError, read_cases
+from rodjax.sweeps.result import merge, summary
+from rodjax.sweeps.sweep import sweep
 
 SCENE = """
 [rod]
@@ -215,7 +216,7 @@ IN_A_TABLE = [
     + [("cases.csv", *mistake) for mistake in IN_A_TABLE],
 )
 def test_a_mistake_is_named_in_one_line_and_nothing_is_solved(name, text, said, allowed, files, capsys, monkeypatch):
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", lambda *args, **options: pytest.fail("solved"))
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", lambda *args, **options: pytest.fail("solved"))
     over = "cases.csv" if name.endswith("csv") else "cases.toml"
     Path(over).write_text(text)
     assert main(["sweep", "scene.toml", "--over", over, "-o", "out.h5"]) == 2
@@ -299,7 +300,7 @@ def test_the_command_says_what_it_did_and_resumes_a_complete_sweep(files, whole,
 
 def stopped_after(count, monkeypatch):
     """Makes a sweep stop, as by Ctrl-C, when it has solved so many chunks; returns the numbers of cases it solves."""
-    solved, solve = [], rodjax.sweep.sweep.solve_batch
+    solved, solve = [], rodjax.sweeps.chunk.solve_batch
 
     def counted(scenes, **options):
         if len(solved) == count:
@@ -307,7 +308,7 @@ def stopped_after(count, monkeypatch):
         solved.append(scenes.rod.length.shape[0])
         return solve(scenes, **options)
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", counted)
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", counted)
     return solved
 
 
@@ -376,13 +377,13 @@ def test_merged_shards_are_the_whole(files, whole, capsys):
 
 
 def test_cases_that_do_not_converge_are_counted(files, capsys, monkeypatch):
-    solve = rodjax.sweep.sweep.solve_batch
+    solve = rodjax.sweeps.chunk.solve_batch
 
     def seldom(scenes, **options):
         result = solve(scenes, **options)
         return eqx.tree_at(lambda result: result.converged, result, scenes.rod.EI > 4.5e-3)
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", seldom)
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", seldom)
     assert main(["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", "4"]) == 3
     out, err = capsys.readouterr()
     assert "5 of 10 cases converged" in out
@@ -410,7 +411,7 @@ def test_without_segments_the_first_case_decides_on_the_mesh(files, whole, capsy
         asked.append((float(scene.rod.EI), float(scene.end.position[0]), options))
         return types.SimpleNamespace(s=np.zeros(5), discretization="finite_difference")
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve", solve)
+    monkeypatch.setattr("rodjax.sweeps.sweep.solve", solve)
     sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, say=print)
     assert asked == [(0.004, pytest.approx(0.7), {"rtol": 0.1, "discretization": "finite_difference"})]
     assert "4 segments (finite_difference), as case 0 needs for rtol = 0.1" in capsys.readouterr().out

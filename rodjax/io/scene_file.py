@@ -256,11 +256,18 @@ class SceneReader:
     def part(self, make: Callable[..., Part], *arguments: Any) -> Part:
         """`make(self, *arguments)`, of this or an earlier call with the same arguments. Nobody may change it."""
         key = make, pickle.dumps(arguments)
-        if key not in self._parts:
-            if len(self._parts) >= MAX_KEPT:
-                self._parts.clear()
-            self._parts[key] = make(self, *arguments)
-        return self._parts[key]
+        known = self._parts
+        if key in known:
+            return known[key]
+        made = make(self, *arguments)
+        if len(known) >= MAX_KEPT:  # not cleared: another thread may be about to take a part out
+            known = self._parts = {}
+        known[key] = made
+        return made
+
+    def __reduce__(self):
+        """Other processes read anew."""
+        return SceneReader, ()
 
     def si_values(
         self, table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()

@@ -85,7 +85,11 @@ def checked_executor(executor: Any) -> Executor | None:
 
 
 def in_order(
-    function: Callable[..., Any], parts: Iterable[tuple], *, executor: Executor | None = None, threads: int | None = None
+    function: Callable[..., Any],
+    parts: Iterable[tuple],
+    *,
+    executor: Executor | None = None,
+    threads: int | None = None,
 ) -> list[Any]:
     """What `function` gives for each of the parts, in their order: see `as_completed`."""
     found = dict(as_completed(function, parts, executor=executor, threads=threads))
@@ -93,7 +97,11 @@ def in_order(
 
 
 def as_completed(
-    function: Callable[..., Any], parts: Iterable[tuple], *, executor: Executor | None = None, threads: int | None = None
+    function: Callable[..., Any],
+    parts: Iterable[tuple],
+    *,
+    executor: Executor | None = None,
+    threads: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """The number of each part and `function(*part)`, as they are done.
 

@@ -168,12 +168,116 @@ def test_a_case_is_the_scene_of_a_file_with_its_values(files):
     assert float(scenes[1].gravity[2]) == -2
 
 
+BY_COLUMNS = {
+    "plain": (
+        SCENE,
+        {
+            "rod.EI": ("0.004", "0.005"),
+            "end.position.2": ("1 cm", "0.02"),
+            "loads.gravity": ('"[0, 0, -9] m/s^2"', '"[0, 1, -8]"'),
+        },
+    ),
+    "clamps that turn": (
+        SCENE,
+        {
+            "end.tangent": ('"[1, 0, 0.3]"', '"[1, 0, 0]"'),
+            "start.d2": ('"[0, 2, 0.1]"', '"[0, 1, 0]"'),
+            "end.spin": ("100 deg", "0"),
+        },
+    ),
+    "a section": (
+        SCENE.replace(
+            'EI = "4.9e-3 N m^2"\nGJ = "3.3e-3 N m^2"\nEA = "785 N"\nmass_per_length = "0.1 kg/m"',
+            'section = "tube"\nouter_radius = "5 mm"\ninner_radius = "4 mm"\nyoungs_modulus = "10 MPa"\n'
+            'poisson_ratio = 0.5\ndensity = "1200 kg/m^3"',
+        ),
+        {
+            "rod.length": ("1.1", "1.2"),
+            "rod.outer_radius": ("6 mm", "7e-3"),
+            "rod.poisson_ratio": ("0.4", "0.3"),
+            "loads.point_force.0.at": ("0.3", "50 cm"),
+        },
+    ),
+    "clips and obstacles": (
+        SCENE.replace('"finite_difference"', '"hermite"').replace('EA = "785 N"', 'EA = "785 N"\nradius = "5 mm"')
+        + '[[clips]]\nat = "0.4 m"\nposition = "[0.3, 0, 0.05] m"\ntangent = [1, 0, 0]\nd2 = [0, 1, 0]\n'
+        + 'spin = "0 deg"\n'
+        + '[[obstacles]]\nkind = "box"\ncenter = "[0, 0, -1] m"\nsize = "[10, 10, 10] cm"\n'
+        + "frame = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        + '[[obstacles]]\nkind = "union"\n[[obstacles.parts]]\nkind = "capsule"\nstart = "[0, 0, -1] m"\n'
+        + 'end = "[1, 0, -1] m"\nradius = "5 cm"\n',
+        {
+            "clips.0.at": ("45 cm", "0.42"),
+            "clips.0.spin": ("10 deg", "0"),
+            "obstacles.0.center.2": ("-1.1", "-120 cm"),
+            "obstacles.0.size": ('"[20, 10, 10] cm"', '"[0.1, 0.1, 0.1]"'),
+            "obstacles.1.parts.0.end.1": ("2 cm", "0.1"),
+            "obstacles.1.parts.0.radius": ("6 cm", "0.07"),
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BY_COLUMNS)
+def test_scenes_made_by_columns_are_those_read_one_by_one(name, files, monkeypatch):
+    scene, cells = BY_COLUMNS[name]
+    Path("scene.toml").write_text(scene)
+    first, second = (",".join(row) for row in zip(*cells.values(), strict=True))
+    Path("table.csv").write_text("\n".join([",".join(cells), first, second, first]) + "\n")
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    given = np.arange(3), reader.cases.of(np.arange(3)), 4
+    one_by_one = reader.of_cases.stacked(*given)
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    monkeypatch.setattr("rodjax.sweeps.cases._stacked", lambda scenes: pytest.fail("read one by one"))
+    at_once = reader.of_cases.stacked(*given)
+    assert jax.tree.structure(at_once) == jax.tree.structure(one_by_one)
+    for leaf, expected in zip(jax.tree.leaves(at_once), jax.tree.leaves(one_by_one), strict=True):
+        assert leaf.dtype == expected.dtype
+        # A program may round a sum of products once where NumPy does so twice.
+        np.testing.assert_allclose(leaf, expected, rtol=4e-16, atol=4e-16)
+        assert leaf.shape[0] == 4
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        ('end.d2\n"[0, 1, 0]"\n"[1, 0, 0]"\n"[0, 0, 1]"\n', "d2 must not be parallel to the tangent"),
+        ("end.tangent.0\n1\n0\n2\n", "tangent must be a direction"),
+        ("rod.length,end.position.0\n1.0,0.8\n0.9,1.75\n1.0,0.8\n", "the ends are 1.75 m apart"),
+        ("rod.length,loads.point_force.0.at\n2.0,0.5\n1.0,1.5\n2.0,1.9\n", "at"),
+    ],
+)
+def test_what_makes_no_sense_is_named_also_by_columns(cells, said, files, monkeypatch):
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    Path("table.csv").write_text(cells)
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    with pytest.raises(SweepError, match=r"^table\.csv: case 1: .*" + said):
+        reader.of_cases.stacked(np.arange(3), reader.cases.of(np.arange(3)), 3)
+
+
+def test_scenes_that_differ_in_more_than_numbers_are_read_one_by_one(files, monkeypatch):
+    """How many wires a bundle has decides what is summed."""
+    wires = 'section = "bundle"\nwires = 7\nwire_radius = "1 mm"\nyoungs_modulus = "1 GPa"\nstick = 0.2\n'
+    wires += "poisson_ratio = 0.3"
+    plain = 'EI = "4.9e-3 N m^2"\nGJ = "3.3e-3 N m^2"\nEA = "785 N"\nmass_per_length = "0.1 kg/m"'
+    scene = SCENE.replace(plain, wires).split("[loads]")[0]
+    Path("scene.toml").write_text(scene)
+    Path("table.csv").write_text("rod.wires,rod.length\n7,1\n19,1.1\n")
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    given = np.arange(2), reader.cases.of(np.arange(2)), 2
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    stacked = reader.of_cases.stacked(*given)
+    expected = [scene.rod.EA for scene in reader.scenes(np.arange(2))]
+    np.testing.assert_array_equal(stacked.rod.EA, expected)
+    assert expected[1] == pytest.approx(19 / 7 * expected[0])
+
+
 MISTAKES = [
     ("[]", "is not valid TOML", ""),
     ("", "holds no keys", "rod.EI"),
     ("rod.EI = 5", "rod.EI must be a list of values", "from = 1"),
     ("rod.EI = []", "rod.EI must be a list of values", "from = 1"),
-    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end, loads and clips"),
+    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end, loads, clips and obstacles"),
     ('"end.support" = ["pin", "clamp"]', "end.support cannot vary", "that hold numbers"),
     ('"rod.color" = [1]', "rod.color cannot vary", "that hold numbers"),
     ('"1" = [1]', "1 cannot vary", "that hold numbers"),

@@ -26,6 +26,8 @@ from rodjax.model.scene import Scene
 MAX_CORNERS = 1024
 # More cases than this are taken for a mistake: their results would fill 100 GB.
 MAX_CASES = 100_000_000
+# Of as many cases in a chunk the scenes are made at once: 2 ms for 1024, and 0.2 s to compile; one by one 2 ms each.
+LEAST_ROWS = 128
 
 
 class SweepError(ValueError):
@@ -193,7 +195,18 @@ class CaseScenes:
         return [self.read(int(case), values, row).scenes[0] for row, case in enumerate(cases)]
 
     def stacked(self, cases: Int[np.ndarray, "k"], values: Mapping[str, np.ndarray], size: int) -> Scene:
-        """Of all cases, along a leading axis; so many, of which those that lack are the last case."""
+        """Of all cases, along a leading axis; so many, of which those that lack are the last case.
+
+        Of many they are made column by column, and read one by one only where they may make no sense.
+        """
+        if size >= LEAST_ROWS:
+            filled = {key: numbers[np.minimum(np.arange(size), len(cases) - 1)] for key, numbers in values.items()}
+            found = self._variations.stacked(filled)
+            if found is not None:
+                stack, is_suspect = found
+                for row in np.flatnonzero(is_suspect[: len(cases)]):
+                    self.read(int(cases[row]), values, row)
+                return stack
         scenes = self.scenes(cases, values)
         return _stacked(scenes + scenes[-1:] * (size - len(cases)))
 

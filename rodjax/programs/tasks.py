@@ -11,13 +11,14 @@ import pickle
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
 import jax
 import jaxlib
 import numpy as np
+from jaxtyping import Int
 
 from rodjax.checks import line, shown, whole_number
 from rodjax.programs import kept
@@ -74,6 +75,11 @@ def _cores() -> int:
         return os.cpu_count() or 1
 
 
+def rows_of(first: int, size: int, count: int) -> Int[np.ndarray, "size"]:
+    """The rows of a part of so many in all; the last again where it has less than `size`."""
+    return np.minimum(np.arange(first, first + size), count - 1)
+
+
 def checked_executor(executor: Any) -> Executor | None:
     """`None`, or what has the method `submit` of `concurrent.futures.Executor`."""
     if executor is not None and not callable(getattr(executor, "submit", None)):
@@ -86,12 +92,16 @@ def checked_executor(executor: Any) -> Executor | None:
 
 def in_order(
     function: Callable[..., Any],
-    parts: Iterable[tuple],
+    parts: Sequence[tuple],
     *,
     executor: Executor | None = None,
     threads: int | None = None,
 ) -> list[Any]:
-    """What `function` gives for each of the parts, in their order: see `as_completed`."""
+    """What `function` gives for each of the parts, in their order: see `as_completed`. A single part is done here as if
+    it were no part, by NumPy code too, unless there is an executor.
+    """
+    if executor is None and len(parts) == 1:
+        return [function(*parts[0])]
     found = dict(as_completed(function, parts, executor=executor, threads=threads))
     return [found[number] for number in range(len(found))]
 

@@ -21,6 +21,7 @@ from rodjax.io.quantities import SceneFileError
 from rodjax.io.scene_file import SceneFile, read_text, toml_tables
 from rodjax.io.scene_keys import SceneVariations, cell, check_keys, si_number
 from rodjax.model.scene import Scene
+from rodjax.programs.tasks import rows_of
 
 # More than a grid of ten keys has; to read them takes a second.
 MAX_CORNERS = 1024
@@ -200,7 +201,7 @@ class CaseScenes:
         Of many they are made column by column, and read one by one only where they may make no sense.
         """
         if size >= LEAST_ROWS:
-            filled = {key: numbers[np.minimum(np.arange(size), len(cases) - 1)] for key, numbers in values.items()}
+            filled = {key: numbers[rows_of(0, size, len(cases))] for key, numbers in values.items()}
             found = self._variations.stacked(filled)
             if found is not None:
                 stack, is_suspect = found

@@ -187,11 +187,10 @@ def _in_parts(
     count = len(is_free)
     size = min(LANES, count)
     each = jax.tree.map(np.asarray, (problem.groups[0], starts, is_free, shapes))
-    common = eqx.tree_at(lambda problem: (problem.groups, problem.is_free), problem, ((), None))
 
     def part(first: int) -> tuple[Any, ...]:
         group, *others = jax.tree.map(lambda leaf: leaf[rows_of(first, size, count)], each)
-        here = eqx.tree_at(lambda problem: problem.groups, common, (group,), is_leaf=lambda x: x == ())
+        here = eqx.tree_at(lambda problem: (problem.groups, problem.is_free), problem, ((group,), None))
         return structure, here, *others
 
     parts = [part(first) for first in range(0, count, size)]

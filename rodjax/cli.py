@@ -29,6 +29,7 @@ from rodjax.cluster import ClusterError, connected
 from rodjax.io.files import SUFFIX, load, save
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.programs import answers, kept
+from rodjax.programs.tasks import TaskError
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
@@ -401,18 +402,22 @@ def _route(arguments: argparse.Namespace) -> int:
         warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
         warnings.simplefilter("ignore", OverstretchedWarning)
         try:
-            route = rodjax.route(
-                scene.scenes[0],
-                file.variables,
-                limits=file.limits,
-                objective=file.objective,
-                obstacles=file.obstacles,
-                names=file.names,
-                segments=scene.segments,
-                progress=sys.stderr.isatty(),
-                **options,
-            )
-        except ValueError as error:
+            with _connected(arguments.scheduler) as executor:
+                route = rodjax.route(
+                    scene.scenes[0],
+                    file.variables,
+                    limits=file.limits,
+                    objective=file.objective,
+                    obstacles=file.obstacles,
+                    names=file.names,
+                    segments=scene.segments,
+                    executor=executor,
+                    progress=sys.stderr.isatty(),
+                    **options,
+                )
+        except ClusterError:
+            raise
+        except (ValueError, TaskError) as error:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(

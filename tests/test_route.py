@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax.programs.tasks import Workers
+from rodjax.routing.group import Group, Targets
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.route import _Fleet, _problem
 from rodjax.routing.search import Asked, Numbers, Search, Settings
@@ -20,6 +22,7 @@ VARIABLES = [
     rj.Between("end.position.2", 0.05, 0.25),
     rj.Between("rod.length", 0.1, 0.45),
 ]
+HERE = Workers(None, 1)
 
 
 def corner() -> rj.Scene:
@@ -71,10 +74,11 @@ def test_the_shortest_turn_is_an_arc(shortest):
 def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
+    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0), False)
 
     def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        numbers = fleet.evaluate({1: Asked(design, False)})[1]
+        numbers = group.evaluate({1: Asked(design, False)})[1]
         assert numbers.is_valid
         return np.append(numbers.objective, numbers.slacks), numbers.rates
 
@@ -98,7 +102,7 @@ def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):
 
     monkeypatch.setattr(_Fleet, "_solved_cold", missing_one)
     problem, _ = _problem(corner(), VARIABLES, rj.Limits(bend_radius=9.0), None, (), None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
     assert fleet.redrawn == 2
     np.testing.assert_array_equal(fleet.solves, [1, 1, 3, 1])
     others = [0, 1, 3]

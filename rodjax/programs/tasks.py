@@ -6,6 +6,7 @@ of one type.
 """
 
 import contextlib
+import importlib.metadata
 import os
 import pickle
 import socket
@@ -16,7 +17,6 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from typing import Any, NamedTuple
 
 import jax
-import jaxlib
 import numpy as np
 from jaxtyping import Int
 
@@ -40,6 +40,13 @@ FINAL = (ValueError, TypeError, AttributeError, ImportError, pickle.PicklingErro
 
 class TaskError(RuntimeError):
     """An engine could not do its part; the message is one line."""
+
+
+class Workers(NamedTuple):
+    """What does the parts of some work: an executor, or so many threads."""
+
+    executor: Executor | None
+    threads: int
 
 
 class _Here(threading.local):
@@ -135,13 +142,35 @@ def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple]) -> Iterato
         yield number, _part_done(function, part)
 
 
-def _part_done(function: Callable[..., Any], part: tuple) -> Any:
+def inherited() -> Callable[[], contextlib.AbstractContextManager]:
+    """What holds in this thread, for threads that it starts to enter: that it is at a part, and the precision."""
+    is_at_part, is_double = _here.is_at_part, jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+    @contextlib.contextmanager
+    def entered() -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            if is_at_part:
+                stack.enter_context(_at_part())
+            if is_double != jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+                stack.enter_context(jax.enable_x64(is_double))
+            yield
+
+    return entered
+
+
+@contextlib.contextmanager
+def _at_part() -> Iterator[None]:
     before, _here.is_at_part = _here.is_at_part, True
     try:
         with compiled_only():
-            return function(*part)
+            yield
     finally:
         _here.is_at_part = before
+
+
+def _part_done(function: Callable[..., Any], part: tuple) -> Any:
+    with _at_part():
+        return function(*part)
 
 
 def _by_threads(function: Callable[..., Any], parts: Iterable[tuple], count: int) -> Iterator[tuple[int, Any]]:
@@ -241,15 +270,12 @@ class _Surroundings(NamedTuple):
     @classmethod
     def here(cls) -> "_Surroundings":
         platform, is_double = jax.default_backend(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-        return cls(__version__, kept.source(), jaxlib.__version__, platform, bool(is_double))
+        return cls(__version__, kept.source(), importlib.metadata.version("jaxlib"), platform, bool(is_double))
 
     def check(self) -> None:
         here = _Surroundings.here()
-        differing = [
-            f"{name} ({ours[:12]}, not {wanted[:12]})"
-            for name, ours, wanted in zip(self._fields[:4], here, self, strict=False)
-            if ours != wanted
-        ]
+        pairs = [(name, str(getattr(here, name)), str(getattr(self, name))) for name in self._fields[:4]]
+        differing = [f"{name} ({ours[:12]}, not {asked[:12]})" for name, ours, asked in pairs if ours != asked]
         if differing:
             raise TaskError(
                 f"the worker on {socket.gethostname()} is not like the process that asks, different in "

@@ -3,7 +3,6 @@
 import functools
 import math
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +19,7 @@ from rodjax.model.supports import Free
 from rodjax.paths.batch import LANES, chunk_size, solve_stack
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
-from rodjax.programs.tasks import as_completed, rows_of
+from rodjax.programs.tasks import Workers, as_completed, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
 from rodjax.solving.implicit import differentiable
@@ -65,13 +64,6 @@ class Slopes(NamedTuple):
     by: Quantities
     stiffness: Float[Numbers, ""]
     stiffness_by: Float[Numbers, "p"]
-
-
-class Workers(NamedTuple):
-    """What solves many rods: an executor, or so many threads."""
-
-    executor: Executor | None
-    threads: int
 
 
 class Scattering(eqx.Module):
@@ -119,7 +111,7 @@ class Scattering(eqx.Module):
         if workers.executor is None and total <= size:  # no parts, and so by NumPy code at first
             results: Iterable[tuple[int, Any]] = enumerate(_solved_part(*part) for part in parts)
         else:
-            results = as_completed(_solved_part, parts, executor=workers.executor, threads=workers.threads)
+            results = as_completed(_solved_part, parts, **workers._asdict())
         for number, part in results:
             yield number, *jax.tree.map(lambda x, k=number: x[: total - k * size], part)
 

@@ -21,10 +21,10 @@ from rodjax.checks import Numbers, instance, is_known, leaf, number_array, posit
 from rodjax.identification.unknowns import Unknown, known_names, target
 from rodjax.model.scene import Scene
 from rodjax.programs.answers import one_answer
-from rodjax.programs.tasks import checked_executor, checked_threads
+from rodjax.programs.tasks import Workers, checked_executor, checked_threads
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
-from rodjax.routing.scatter import Moments, Quantities, Scattering, Workers, by_derivatives, by_few, by_samples
+from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 

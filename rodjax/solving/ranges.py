@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
 from rodjax.discretization.cells import segments_for_jumps
 from rodjax.model.along import Along, Smooth, Steps
-from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
+from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
 from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene
 from rodjax.model.supports import Clamp, Free
@@ -53,10 +53,10 @@ def suspects(scenes: Scene) -> Bool[np.ndarray, "..."]:
     and of what varies along a rod, are not looked at.
     """
     with np.errstate(all="ignore"):
-        found = _is_wrong(scenes) | _is_misplaced(scenes)
+        found: np.ndarray = np.asarray(_is_wrong(scenes) | _is_misplaced(scenes))
         for obstacle in scenes.obstacles:
             found |= _is_wrong_obstacle(obstacle, scenes)
-    return np.asarray(found)
+    return found
 
 
 def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
@@ -142,7 +142,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     return ~functools.reduce(operator.and_, good)
 
 
-def _is_wrong_obstacle(obstacle: Obstacle, scenes: Scene) -> Bool[np.ndarray, "..."]:
+def _is_wrong_obstacle(obstacle: Any, scenes: Scene) -> Bool[np.ndarray, "..."]:
     wrong = np.zeros(scenes.rod.length.shape, bool)
     if isinstance(obstacle, Union):
         return functools.reduce(operator.or_, (_is_wrong_obstacle(part, scenes) for part in obstacle.obstacles), wrong)
@@ -152,7 +152,8 @@ def _is_wrong_obstacle(obstacle: Obstacle, scenes: Scene) -> Bool[np.ndarray, ".
         wrong |= np.all(obstacle.start == obstacle.end, axis=-1)
     if isinstance(obstacle, Box):
         wrong = ~np.all(obstacle.size > 0, axis=-1)
-        wrong |= np.zeros_like(wrong) if obstacle.frame is None else ~_each(_is_rotation(obstacle.frame), scenes)
+        if obstacle.frame is not None:
+            wrong |= ~np.asarray(_each(_is_rotation(obstacle.frame), scenes))
     return wrong
 
 

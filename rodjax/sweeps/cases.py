@@ -206,7 +206,7 @@ class CaseScenes:
             if found is not None:
                 stack, is_suspect = found
                 for row in np.flatnonzero(is_suspect[: len(cases)]):
-                    self.read(int(cases[row]), values, row)
+                    self.read(int(cases[row]), values, int(row))
                 return stack
         scenes = self.scenes(cases, values)
         return _stacked(scenes + scenes[-1:] * (size - len(cases)))

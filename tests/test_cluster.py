@@ -39,11 +39,10 @@ class Cluster:
     def start(self, *arguments: str) -> subprocess.Popen:
         # A program that hears on no other address and has no page of its own.
         command = [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:], "--host", "127.0.0.1"]
-        log = open(self._folder / f"{len(self.processes)}.log", "w")  # noqa: SIM115 - of the process
         environment = {**os.environ, "PYTHONPATH": str(Path(rj.__file__).parents[1])}
-        process = subprocess.Popen(
-            [*command, "--no-dashboard"], stdout=log, stderr=log, env=environment, cwd=self._folder
-        )
+        options: dict[str, Any] = dict(env=environment, cwd=self._folder)
+        with open(self._folder / f"{len(self.processes)}.log", "w") as log:
+            process = subprocess.Popen([*command, "--no-dashboard"], stdout=log, stderr=log, **options)
         self.processes.append(process)
         return process
 
@@ -100,7 +99,10 @@ def command(cluster: Cluster, *more: str) -> list[str]:
 
 def started(cluster: Cluster) -> subprocess.Popen:
     arguments = [sys.executable, "-W", "error", "-m", "rodjax", *command(cluster)]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # How long a scheduler that is lost is looked for.
+    environment = {**os.environ, "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s"}
+    options: dict[str, Any] = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(arguments, **options)
     wait_until(lambda: len(list(Path("out.h5.parts").glob("chunk-*.h5"))) > 5 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
     return process
@@ -127,7 +129,7 @@ def test_the_scheduler_is_killed_and_the_sweep_resumed(cluster, files, capsys):
     process = started(cluster)
     scheduler.send_signal(signal.SIGKILL)
     _, err = process.communicate(timeout=SECONDS)
-    assert process.returncode == 2
+    assert process.returncode == 2, err
     said = err.splitlines()[-1]
     assert len(err.splitlines()) <= 2
     assert said.startswith("rodjax: ")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from test_tasks import Unreliable
 
 import rodjax
 from rodjax.cli import main
@@ -478,6 +480,56 @@ def test_merged_shards_are_the_whole(files, whole, capsys):
         file.attrs["over_sha256"] = "0"
     with pytest.raises(SweepError, match=r"copy\.h5 does not belong to 2\.h5: different in the grid or table"):
         merge(["2.h5", "copy.h5"], "bad.h5")
+
+
+@pytest.mark.parametrize("options", [{"threads": 2}, {"executor": "that fails once"}])
+def test_whoever_solves_the_chunks_the_result_is_the_same(options, files, whole, capsys):
+    if "executor" in options:
+        options = {"executor": Unreliable(lambda number: number == 1)}
+    sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, progress=True, **options)
+    assert_same("out.h5", whole)
+    assert "10/10" in capsys.readouterr().err
+    assert sorted(os.listdir()) == ["grid.toml", "out.h5", "scene.toml"]
+
+
+def test_an_executor_that_fails_leaves_finished_chunks(files, whole):
+    with Unreliable(lambda number: number > 0) as engine, pytest.raises(SweepError) as caught:
+        sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, executor=engine)
+    said = (
+        r"task \d failed 4 times: ConnectionError: the worker is lost; the finished chunks are in out\.h5\.parts: go on"
+    )
+    assert re.match(said, str(caught.value))
+    left = set(os.listdir("out.h5.parts"))
+    assert left <= {"chunk-000000.h5", "manifest.json"}
+    sweep("scene.toml", "grid.toml", "out.h5", resume=True)
+    assert_same("out.h5", whole)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from rodjax.file_lock import locked
+with locked(Path("out.h5")):
+    print("locked", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_two_processes_at_one_sweep_are_told_so(files, whole, capsys):
+    process = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process, process.stdout:
+        assert process.stdout.readline() == "locked\n"
+        command = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", "4", "--resume"]
+        assert main(command) == 2
+        err = capsys.readouterr().err
+        assert re.fullmatch(rf"rodjax: out\.h5 is being written by process {process.pid} on \S+; wait .*\n", err)
+        # The lock ends with its process, however that ends.
+        process.kill()
+        process.wait()
+        assert main(command) == 0
+    assert_same("out.h5", whole)
+    assert not Path("out.h5.lock").exists()
 
 
 def test_cases_that_do_not_converge_are_counted(files, capsys, monkeypatch):

@@ -204,7 +204,7 @@ class _Given(NamedTuple):
 def _collected(
     submit: Callable[[tuple], Future], parts: Iterable[tuple], most: int, retries: int
 ) -> Iterator[tuple[int, Any]]:
-    """Results as they come; where this ends early, nothing stays under way."""
+    """Results as they come; where this ends early, what waits for its turn is cancelled."""
     following = (_Given(number, part, 0) for number, part in enumerate(parts))
     again: deque[_Given] = deque()
     under_way: dict[Future, _Given] = {}
@@ -216,7 +216,10 @@ def _collected(
                     break
                 try:
                     under_way[submit(given.part)] = given
-                except RuntimeError as error:  # as of a pool whose process has died, or a closed client
+                except FINAL:
+                    raise
+                except Exception as error:  # as of a pool whose process has died, or a client without its scheduler
+                    under_way.clear()  # nothing is left that could be cancelled
                     raise TaskError(f"the executor takes no more tasks: {_told(error)}") from error
             if not under_way:
                 return

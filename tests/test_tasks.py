@@ -119,18 +119,20 @@ def test_what_ends_early_cancels_what_waits():
     assert len(begun) <= 2
 
 
-def doubled(x):
-    assert isinstance(x, np.ndarray)
-    return 2 * jnp.asarray(x)
+def doubled(x, y):
+    """Of arrays that are what they are here."""
+    assert isinstance(x, jax.Array)
+    assert isinstance(y, np.ndarray)
+    return x + jnp.asarray(y)
 
 
 def test_an_executor_works_in_the_precision_of_who_asks():
     x = jnp.full(3, 0.1)
     assert x.dtype == np.float64
     with ThreadPoolExecutor(1) as engine:
-        (wide,) = in_order(doubled, [(x,)], executor=engine)
+        (wide,) = in_order(doubled, [(x, np.asarray(x))], executor=engine)
         with jax.enable_x64(False):
-            (narrow,) = in_order(doubled, [(x,)], executor=engine)
+            (narrow,) = in_order(doubled, [(x, np.asarray(x))], executor=engine)
             # A block of the user's holds for threads of our own too.
             assert {leaf.dtype for leaf in in_order(lambda k: jnp.zeros(()), PARTS, threads=2)} == {np.dtype("float32")}
     assert (wide.dtype, narrow.dtype) == (np.float64, np.float32)
@@ -140,10 +142,8 @@ def test_an_executor_works_in_the_precision_of_who_asks():
 
 def test_a_worker_with_other_code_is_told():
     other = tasks._Surroundings.here()._replace(source="f" * 64)
-    with pytest.raises(
-        TaskError, match=r"^the worker on \S+ is not like the process that asks, different in source \("
-    ):
-        tasks._done_elsewhere(other, squared, (1,), "")
+    with pytest.raises(TaskError, match=r"^the worker on \S+ is not like the process that asks, different in source "):
+        tasks._done_elsewhere(other, squared, (1,), (False,), "")
 
 
 def test_how_many_threads(monkeypatch):

@@ -190,7 +190,8 @@ def _by_engine(function: Callable[..., Any], parts: Iterable[tuple], executor: E
     def submit(part: tuple) -> Future:
         # A number of its own: an engine may take equal calls for one, whose failure would be that of all.
         own = os.urandom(8).hex()
-        return executor.submit(_done_elsewhere, surroundings, function, _as_numpy(part), own)
+        are_jax = tuple(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(part))
+        return executor.submit(_done_elsewhere, surroundings, function, _as_numpy(part), are_jax, own)
 
     return _collected(submit, parts, UNDER_WAY, RETRIES)
 
@@ -286,13 +287,17 @@ class _Surroundings(NamedTuple):
             )
 
 
-def _done_elsewhere(surroundings: _Surroundings, function: Callable[..., Any], part: tuple, own: str) -> Any:
-    """What an engine runs, in any thread of any process."""
+def _done_elsewhere(
+    surroundings: _Surroundings, function: Callable[..., Any], part: tuple, are_jax: tuple[bool, ...], own: str
+) -> Any:
+    """What an engine runs, in any thread of any process. `are_jax`: which leaves of the part are arrays of JAX's."""
     surroundings.check()
     with contextlib.ExitStack() as stack:
         if surroundings.is_double != jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             stack.enter_context(jax.enable_x64(surroundings.is_double))
-        return _as_numpy(_part_done(function, part))
+        leaves, tree = jax.tree.flatten(part)
+        leaves = [jax.device_put(leaf) if is_jax else leaf for leaf, is_jax in zip(leaves, are_jax, strict=True)]
+        return _as_numpy(_part_done(function, jax.tree.unflatten(tree, leaves)))
 
 
 def _as_numpy(values: Any) -> Any:

@@ -23,7 +23,8 @@ need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the 
 `scene` and `over`, and what is in `rodjax.sweeps.manifest.Manifest`, with its `fingerprint`.
 
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
-solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
-the shard and wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and
-the same bits in the end.
+solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result; and a file with `.lock`, by
+which a second process is told that one is at work. Chunks are the same whatever the shard, whoever solves them and
+wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and the same bits in
+the end.
 """

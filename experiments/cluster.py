@@ -1,9 +1,9 @@
 """What does an engine cost a sweep, and what do more workers and threads bring?
 
 A cable of 50 elements between two clamps, as in `sweep_stress.py`, in chunks of 1024 cases: cases a second of one
-process with one thread and with two, of one Dask worker and of two on this machine, each after a sweep that compiles. The
-kinds take turns, and the median of the rounds counts, as other programs may use the machine. All results must be the same
-to the last bit.
+process with one thread and with two, of one Dask worker and of two on this machine, each after a sweep that compiles.
+The kinds take turns, and the median of the rounds counts, as other programs may use the machine. All results must be
+the same to the last bit.
 
     python experiments/cluster.py [--chunks 8] [--rounds 5]
 """

@@ -53,10 +53,9 @@ def suspects(scenes: Scene) -> Bool[np.ndarray, "..."]:
     and of what varies along a rod, are not looked at.
     """
     with np.errstate(all="ignore"):
-        found: np.ndarray = np.asarray(_is_wrong(scenes) | _is_misplaced(scenes))
-        for obstacle in scenes.obstacles:
-            found |= _is_wrong_obstacle(obstacle, scenes)
-    return found
+        wrong = [_is_wrong_obstacle(obstacle, scenes) for obstacle in scenes.obstacles]
+        wrong = [np.asarray(_is_wrong(scenes)), _is_misplaced(scenes), *wrong]
+    return np.any(np.stack(wrong), axis=0)
 
 
 def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
@@ -143,7 +142,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
 
 
 def _is_wrong_obstacle(obstacle: Any, scenes: Scene) -> Bool[np.ndarray, "..."]:
-    wrong = np.zeros(scenes.rod.length.shape, bool)
+    wrong: Any = np.zeros(scenes.rod.length.shape, bool)
     if isinstance(obstacle, Union):
         return functools.reduce(operator.or_, (_is_wrong_obstacle(part, scenes) for part in obstacle.obstacles), wrong)
     if isinstance(obstacle, Sphere | Capsule | Cylinder | Pipe):

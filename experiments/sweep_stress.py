@@ -50,13 +50,13 @@ def main(argv: Sequence[str] | None = None) -> list[Run]:
     with tempfile.TemporaryDirectory(dir=options.out) as name:
         folder = Path(name)
         write_scene(rodjax.problems.hanging_cable(), folder / "scene.toml", options.segments)
-        _write_table(folder / "table.csv", options.chunk, options.seed)
+        write_table(folder / "table.csv", options.chunk, options.seed)
         _run(folder, "compiled.h5", options.chunk)  # the cache has the programs after this
-        _write_table(folder / "table.csv", options.cases, options.seed)
+        write_table(folder / "table.csv", options.cases, options.seed)
         whole = _run(folder, "whole.h5", options.chunk)
         _print("without a stop", whole, options.cases)
         runs = [whole, *_killed_runs(folder, options, whole.seconds)]
-        _check_same(folder / "whole.h5", folder / "killed.h5")
+        check_same(folder / "whole.h5", folder / "killed.h5")
     print(f"the same to the last bit; largest memory {max(run.peak_mib for run in runs):.0f} MiB")
     return runs
 
@@ -72,7 +72,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _write_table(path: Path, cases: int, seed: int) -> None:
+def write_table(path: Path, cases: int, seed: int) -> None:
     draw = np.random.default_rng(seed).uniform
     length, span = draw(0.9, 1.2, cases), draw(0.5, 0.85, cases)
     columns = [length, draw(3e-3, 8e-3, cases), span, draw(-1.5, 1.5, cases), draw(-2.0, 2.0, cases)]
@@ -137,7 +137,7 @@ def _print(name: str, run: Run, cases: int) -> None:
     )
 
 
-def _check_same(one: Path, other: Path) -> None:
+def check_same(one: Path, other: Path) -> None:
     with h5py.File(one) as first, h5py.File(other) as second:
         names = _datasets(first)
         differing = [name for name in names if not np.array_equal(_bits(first, name), _bits(second, name))]

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from rodjax.routing.route import Route, route
     from rodjax.routing.tolerances import Envelope, Tolerance, tolerances
     from rodjax.routing.variables import Between, OnLine, OnPatch, OnSurface, Turned
+    from rodjax.sweeps.sweep import sweep
     from rodjax.window.opening import view
 
 __all__ = [
@@ -151,6 +152,7 @@ __all__ = [
     "solve_continuum",
     "solve_path",
     "squared_frequencies",
+    "sweep",
     "switch_branch",
     "tolerances",
     "view",
@@ -191,6 +193,7 @@ _LATER = {
     "Objective": "routing.objective",
     "Route": "routing.route",
     "route": "routing.route",
+    "sweep": "sweeps.sweep",
     "view": "window.opening",
     **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }

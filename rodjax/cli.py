@@ -25,17 +25,22 @@ import numpy as np
 import rodjax
 from rodjax.analysis.curvature import curvature_along
 from rodjax.atomic_write import replace_file
+from rodjax.cluster import ClusterError, connected
 from rodjax.io.files import SUFFIX, load, save
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.programs import answers, kept
+from rodjax.programs.tasks import TaskError
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
-from rodjax.sweep.cases import SweepError
-from rodjax.sweep.sweep import SUFFIX as SWEEP_SUFFIX
-from rodjax.sweep.sweep import Summary, merge, sweep
+from rodjax.sweeps.cases import SweepError
+from rodjax.sweeps.result import Summary, merge
+from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX
+from rodjax.sweeps.sweep import sweep
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from matplotlib.figure import Figure
 
     from rodjax.identification.refits import Profile
@@ -57,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = arguments.run(arguments)
         sys.stdout.flush()
         return code
-    except (CommandError, SceneFileError, SweepError) as error:
+    except (CommandError, ClusterError, SceneFileError, SweepError) as error:
         message = str(error)
     except OSError as error:
         message = f"{error.strerror or error}: {error.filename}" if error.filename else str(error)
@@ -123,15 +128,18 @@ def _add_view(commands: Any) -> None:
 
 def _add_sweep(commands: Any) -> None:
     output = dict(
-        metavar=f"SWEEP{SWEEP_SUFFIX}", type=Path, required=True, help="the file to write: pydoc rodjax.sweep"
+        metavar=f"SWEEP{SWEEP_SUFFIX}", type=Path, required=True, help="the file to write: pydoc rodjax.sweeps"
     )
     run = commands.add_parser("sweep", help="solve a scene for all cases of a grid or table, many or few")
     run.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
-    run.add_argument("--over", metavar="GRID.toml|TABLE.csv", type=Path, required=True, help="pydoc rodjax.sweep")
+    run.add_argument("--over", metavar="GRID.toml|TABLE.csv", type=Path, required=True, help="pydoc rodjax.sweeps")
     run.add_argument("-o", "--output", **output)
-    run.add_argument("--shard", metavar="i/n", type=_shard, default=(1, 1), help="only part i of n, to be merged")
+    run.add_argument(
+        "--shard", metavar="i/n", type=_shard, default=(1, 1), help="only part i of n, to be merged: for array jobs"
+    )
     run.add_argument("--resume", action="store_true", help="go on where an earlier run was stopped")
     run.add_argument("--chunk", metavar="N", type=_chunk, help="cases solved, and written, at a time; 1024")
+    _add_scheduler(run)
     run.set_defaults(run=_sweep)
     join = commands.add_parser("merge", help="put the shards of a sweep together")
     join.add_argument("shards", metavar=f"SHARD{SWEEP_SUFFIX}", type=Path, nargs="+")
@@ -165,7 +173,14 @@ def _add_report(commands: Any) -> None:
     route.add_argument("file", metavar="ROUTE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
     route.add_argument("--starts", metavar="N", type=_chunk, help="designs from which the search begins; 16")
+    _add_scheduler(route)
     route.set_defaults(run=_route)
+
+
+def _add_scheduler(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--scheduler", metavar="tcp://HOST:8786", help="have the workers of a Dask scheduler compute: docs/cluster.md"
+    )
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -287,17 +302,23 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
-    summary = sweep(
-        arguments.scene,
-        arguments.over,
-        arguments.output,
-        shard=arguments.shard,
-        chunk=arguments.chunk,
-        resume=arguments.resume,
-        progress=sys.stderr.isatty(),
-        say=lambda line: print(line, flush=True),
-    )
+    with _connected(arguments.scheduler) as executor:
+        summary = sweep(
+            arguments.scene,
+            arguments.over,
+            arguments.output,
+            shard=arguments.shard,
+            chunk=arguments.chunk,
+            resume=arguments.resume,
+            executor=executor,
+            progress=sys.stderr.isatty(),
+            say=lambda line: print(line, flush=True),
+        )
     return _swept(arguments.output, summary)
+
+
+def _connected(scheduler: str | None) -> "contextlib.AbstractContextManager[Executor | None]":
+    return connected(scheduler, lambda line: print(f"rodjax: {line}", file=sys.stderr, flush=True))
 
 
 def _merge(arguments: argparse.Namespace) -> int:
@@ -424,18 +445,22 @@ def _route(arguments: argparse.Namespace) -> int:
         warnings.simplefilter("ignore", NotConvergedWarning)  # said by the report
         warnings.simplefilter("ignore", OverstretchedWarning)
         try:
-            route = rodjax.route(
-                scene.scenes[0],
-                file.variables,
-                limits=file.limits,
-                objective=file.objective,
-                obstacles=file.obstacles,
-                names=file.names,
-                segments=scene.segments,
-                progress=sys.stderr.isatty(),
-                **options,
-            )
-        except ValueError as error:
+            with _connected(arguments.scheduler) as executor:
+                route = rodjax.route(
+                    scene.scenes[0],
+                    file.variables,
+                    limits=file.limits,
+                    objective=file.objective,
+                    obstacles=file.obstacles,
+                    names=file.names,
+                    segments=scene.segments,
+                    executor=executor,
+                    progress=sys.stderr.isatty(),
+                    **options,
+                )
+        except ClusterError:
+            raise
+        except (ValueError, TaskError) as error:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(

@@ -41,6 +41,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 rodjax.enable_compilation_cache()
 # Tests replace functions of the library, of which programs kept on disk would know nothing.
 os.environ["RODJAX_CACHE"] = "off"
+# Each worker has one core; tests of threads ask for them.
+os.environ["RODJAX_THREADS"] = "1"
 rodjax.keep_programs(False)
 # Few programs are called so often here that compiling them would pay. What is compared bit by bit is compiled.
 ANSWERS.is_patient = True

@@ -36,7 +36,8 @@ from rodjax.io.files import load, save
 from rodjax.io.quantities import QUANTITIES
 from rodjax.io.scene_file import read_scene_file
 from rodjax.io.scene_writing import write_scene
-from rodjax.sweep.sweep import ERRORS, sweep
+from rodjax.sweeps.chunk import ERRORS
+from rodjax.sweeps.sweep import sweep
 
 # What hypothesis keeps for itself goes beside other temporary files, not into the tree.
 set_hypothesis_home_dir(os.path.join(tempfile.gettempdir(), "rodjax-hypothesis"))
@@ -111,11 +112,11 @@ def samples(tmp_path_factory) -> Samples:
     scene_file.write_text(document(DOCUMENTS[1]))
     grid.write_text(GRID)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rodjax.sweep.sweep.solve_batch", made_up_batch)
-        patch.setattr("rodjax.sweep.sweep._errors", made_up_errors)
+        patch.setattr("rodjax.sweeps.chunk.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweeps.chunk._errors", made_up_errors)
         for name, shard in (("whole", (1, 1)), ("1", (1, 2)), ("2", (2, 2))):
             sweep(scene_file, grid, folder / f"{name}.h5", shard=shard, chunk=2)
-        patch.setattr("rodjax.sweep.sweep._assemble", lambda *_: sys.exit())
+        patch.setattr("rodjax.sweeps.sweep.assemble", lambda *_: sys.exit())
         with pytest.raises(SystemExit):
             sweep(scene_file, grid, folder / "out.h5", chunk=2)
     return Samples(jax.tree.map(numbers, single), jax.tree.map(numbers, path), folder)
@@ -154,7 +155,7 @@ def world(tmp_path, samples, capsys, monkeypatch) -> World:
     for module, names in modules.items():
         for name in names:
             monkeypatch.setattr(f"rodjax.{module}.{name}", solved)
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", solved)
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", solved)
     monkeypatch.setattr(rj, "fit", solved)
     monkeypatch.setattr("rodjax.cli._set_up_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
@@ -1111,8 +1112,8 @@ def damaged_parts(example, world):
     copied(world, *SWEEP)
     damage_to(f"out.h5.parts/{name}", damaged)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rodjax.sweep.sweep.solve_batch", made_up_batch)
-        patch.setattr("rodjax.sweep.sweep._errors", made_up_errors)
+        patch.setattr("rodjax.sweeps.chunk.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweeps.chunk._errors", made_up_errors)
         code, err = world.run(*RESUME)
     if code == 0:
         assert contents("out.h5") == contents(world.samples.sweeps / "whole.h5")
@@ -1196,8 +1197,8 @@ def full_disks_of_a_sweep(part, world):
     copied(world, "scene.toml", "grid.toml")
     whole = world.samples.sweeps / "whole.h5"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rodjax.sweep.sweep.solve_batch", made_up_batch)
-        patch.setattr("rodjax.sweep.sweep._errors", made_up_errors)
+        patch.setattr("rodjax.sweeps.chunk.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweeps.chunk._errors", made_up_errors)
         with full_disk(int(part * whole.stat().st_size)):
             line = world.refused(*RESUME[:-1], "--chunk", 2)
         assert "File too large" in line
@@ -1240,8 +1241,8 @@ def unwritable_places(example, world):
         patch.setattr(rj, "describe", lambda equilibrium: "described")
         patch.setattr(rj, "solve", lambda scene, **options: world.samples.single)
         patch.setattr("rodjax.plot.plot_rod", lambda equilibrium: Picture())
-        patch.setattr("rodjax.sweep.sweep.solve_batch", made_up_batch)
-        patch.setattr("rodjax.sweep.sweep._errors", made_up_errors)
+        patch.setattr("rodjax.sweeps.chunk.solve_batch", made_up_batch)
+        patch.setattr("rodjax.sweeps.chunk._errors", made_up_errors)
         line = world.refused(*arguments)
     assert name.strip() in line
     assert Path("note").read_text() == "old"

@@ -1,8 +1,11 @@
 """Batches: as each scene by itself, whatever the others do, on one device or several."""
 
+import math
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -84,9 +87,29 @@ def test_guesses():
 def test_chunks_do_not_show(monkeypatch):
     scenes = random_scenes()
     whole = solve_batch(scenes, **OPTIONS)
-    monkeypatch.setattr(batch, "CHUNKS", (16,))
-    parts = solve_batch(scenes, progress=True, **OPTIONS)
+    monkeypatch.setattr(batch, "CHUNKS", ((16, math.inf),))
+    parts = solve_batch(scenes, progress=True, threads=1, **OPTIONS)
     assert_same(parts, whole)  # other programs, and so other roundings
+    names = set()
+    solve_many = batch._solve_many
+
+    def watched(*arguments):
+        names.add(threading.current_thread().name)
+        time.sleep(0.05)  # so that no thread does all
+        return solve_many(*arguments)
+
+    monkeypatch.setattr(batch, "_solve_many", watched)
+    for count in (2, 4):
+        names.clear()
+        shared = solve_batch(scenes, threads=count, **OPTIONS)
+        assert 1 < len(names) <= count
+        for ours, theirs in zip(jax.tree.leaves(shared), jax.tree.leaves(parts), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, 16), (17, 128), (129, 256), (1024, 256), (4097, 1024)])
+def test_how_many_scenes_go_in_one_call(count, size):
+    assert batch.chunk_size(count) == size
 
 
 @pytest.mark.slow
@@ -215,6 +238,8 @@ def test_arguments():
     scenes = random_scenes(2)
     with pytest.raises(TypeError, match="mesh must be a Mesh"):
         solve_batch(scenes, mesh="all", **OPTIONS)
+    with pytest.raises(ValueError, match="threads must be a whole number from 1 to 4096, got 0"):
+        solve_batch(scenes, threads=0, **OPTIONS)
     with pytest.raises(ValueError, match="at least one scene"):
         solve_batch([], **OPTIONS)
     with pytest.raises(ValueError, match="single scene"):

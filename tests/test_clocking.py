@@ -17,7 +17,7 @@ from rodjax.io.scene_file import SceneFileError, SceneReader, read_scene_file
 from rodjax.io.scene_keys import SceneVariations
 from rodjax.io.scene_writing import write_scene
 from rodjax.routing.files import read_route_file
-from rodjax.sweep.cases import CaseReader, SweepError
+from rodjax.sweeps.cases import CaseReader, SweepError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 

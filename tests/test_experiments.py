@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -297,6 +298,21 @@ def test_sweep_stress(tmp_path, capsys):
     )
     assert not runs[-1].was_killed
     assert "the same to the last bit" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_cluster(capsys):
+    """With threads in the place of an engine's workers."""
+
+    def executor(stack, workers):
+        return stack.enter_context(ThreadPoolExecutor(workers))
+
+    options = ["--chunks", "3", "--chunk", "4", "--segments", "4", "--rounds", "1"]
+    rows = script("cluster").main(options, executor=executor)
+    assert len(rows) == 4
+    assert rows[0].ratio == 1.0
+    assert all(row.rate > 0 for row in rows)
+    assert "2 of Dask's workers" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -2,8 +2,10 @@
 
 import functools
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -242,7 +244,7 @@ def test_pictures_of_unknown_arclength_and_critical_values():
 
 
 @pytest.mark.slow
-def test_many_fits_by_themselves_are_the_single_ones():
+def test_many_fits_by_themselves_are_the_single_ones(monkeypatch):
     unknowns = ["rod.EI", rj.Unknown("rod.mass_per_length"), "measured.0.shift"]
     noisy = experiments(1.0)
     free = np.array([[True] * 3] * 6 + [[True, False, False]] * 6)
@@ -260,6 +262,15 @@ def test_many_fits_by_themselves_are_the_single_ones():
     np.testing.assert_array_equal(fits.degrees_of_freedom, [27] * 6 + [29] * 6)
     low, high = fits.intervals()
     assert np.all((low[:6, 0] < EI) & (high[:6, 0] > EI))
+    # In parts of five, whoever computes them, the same to the last bit; as in one to the tolerance of the search.
+    monkeypatch.setattr("rodjax.identification.each.LANES", 5)
+    with ThreadPoolExecutor(2) as engine:
+        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
+        first, *others = (rj.fit_each([*noisy, *noisy], unknowns, free=free, **kind, **SETTINGS) for kind in kinds)
+    np.testing.assert_allclose(first.estimates, fits.estimates, rtol=1e-5)
+    for other in others:
+        for ours, theirs in zip(jax.tree.leaves(vars(other)), jax.tree.leaves(vars(first)), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
 
 
 # --- without a fit ----------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1] / "rodjax"
 # Folders, and modules beside them, each of which may import from those in the lines above it.
 ORDER = (
-    ("atomic_write", "checks", "units", "version", "warn"),
+    ("atomic_write", "checks", "file_lock", "units", "version", "warn"),
     ("programs",),
     ("linalg",),
     ("geometry",),
@@ -22,9 +22,9 @@ ORDER = (
     ("plot", "problems"),
     ("identification",),
     ("routing",),
-    ("sweep",),
+    ("sweeps",),
     ("window",),
-    ("demo", "warm"),
+    ("cluster", "demo", "warm"),
     ("rodjax",),
     ("cli", "cosseratbench"),
     ("__main__",),

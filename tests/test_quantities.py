@@ -16,7 +16,7 @@ from rodjax.io.quantities import LISTS, OF_TABLES, QUANTITIES, SceneFileError, i
 from rodjax.io.scene_file import read_scene_file
 from rodjax.routing.files import read_route_file
 from rodjax.routing.variables import Between
-from rodjax.sweep.cases import SweepError, read_cases
+from rodjax.sweeps.cases import SweepError, read_cases
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 # By table, key, SI unit, shape and example, of all that files have.

@@ -1,5 +1,7 @@
 """route(): an optimum in closed form, rates beside differences, obstacles, bits, and words for what cannot be kept."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,8 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax.programs.tasks import Workers
+from rodjax.routing.group import Group, Targets
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.route import _Fleet, _problem
 from rodjax.routing.search import Asked, Numbers, Search, Settings
@@ -20,6 +24,7 @@ VARIABLES = [
     rj.Between("end.position.2", 0.05, 0.25),
     rj.Between("rod.length", 0.1, 0.45),
 ]
+HERE = Workers(None, 1)
 
 
 def corner() -> rj.Scene:
@@ -28,10 +33,10 @@ def corner() -> rj.Scene:
     return rj.Scene(rod, rj.Clamp((0, 0, 0), rj.frame((1, 0, 0))), rj.Clamp((0.2, 0, 0.2), rj.frame((0, 0, 1))))
 
 
-def routed(bend_radius=9.0, obstacle=AWAY, seed=0) -> rj.Route:
+def routed(bend_radius=9.0, obstacle=AWAY, seed=0, **workers) -> rj.Route:
     limits = rj.Limits(bend_radius=bend_radius, clearance=0.01)
     options = dict(limits=limits, obstacles=[obstacle], names=["the ball"], starts=4, segments=16, solver=TIGHT)
-    return rj.route(corner(), VARIABLES, seed=seed, **options)
+    return rj.route(corner(), VARIABLES, seed=seed, **options, **workers)
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +76,11 @@ def test_the_shortest_turn_is_an_arc(shortest):
 def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
+    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0), False)
 
     def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        numbers = fleet.evaluate({1: Asked(design, False)})[1]
+        numbers = group.evaluate({1: Asked(design, False)})[1]
         assert numbers.is_valid
         return np.append(numbers.objective, numbers.slacks), numbers.rates
 
@@ -98,7 +104,7 @@ def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):
 
     monkeypatch.setattr(_Fleet, "_solved_cold", missing_one)
     problem, _ = _problem(corner(), VARIABLES, rj.Limits(bend_radius=9.0), None, (), None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
     assert fleet.redrawn == 2
     np.testing.assert_array_equal(fleet.solves, [1, 1, 3, 1])
     others = [0, 1, 3]
@@ -121,6 +127,23 @@ def test_a_softest_motion_may_be_limited(shortest):
     route = rj.route(corner(), VARIABLES, limits=stiffer, starts=2, segments=16, solver=TIGHT)
     assert route.feasible
     assert float(rj.lowest_mode(route.verified).stiffness) >= 4 * stiffness
+
+
+@pytest.mark.slow
+def test_groups_of_starts_are_searched_by_anybody(shortest, monkeypatch):
+    """In groups of two, whoever searches from them, the same to the last bit; the arc as in one group."""
+    monkeypatch.setattr("rodjax.routing.route.GROUP", 2)
+    with ThreadPoolExecutor(2) as engine:
+        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
+        with rj.numpy_first(False):  # cold solves of all starts, too
+            first, *others = (routed(**kind) for kind in kinds)
+    assert first.feasible
+    assert first.objective == pytest.approx(shortest.objective, rel=1e-5)
+    np.testing.assert_array_equal(first.starts.feasible, True)
+    for other in others:
+        assert jax.tree.structure(other) == jax.tree.structure(first)
+        for ours, theirs in zip(jax.tree.leaves(other), jax.tree.leaves(first), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.slow

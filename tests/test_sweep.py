@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,13 +16,15 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from test_tasks import Unreliable
 
 import rodjax
 from rodjax.cli import main
 from rodjax.io.scene_file import read_scene
 from rodjax.solving.refinement import SIZES
-from rodjax.sweep.cases import CaseReader, SweepError, read_cases
-from rodjax.sweep.sweep import merge, summary, sweep
+from rodjax.sweeps.cases import CaseReader, SweepError, read_cases
+from rodjax.sweeps.result import merge, summary
+from rodjax.sweeps.sweep import sweep
 
 SCENE = """
 [rod]
@@ -167,12 +170,116 @@ def test_a_case_is_the_scene_of_a_file_with_its_values(files):
     assert float(scenes[1].gravity[2]) == -2
 
 
+BY_COLUMNS = {
+    "plain": (
+        SCENE,
+        {
+            "rod.EI": ("0.004", "0.005"),
+            "end.position.2": ("1 cm", "0.02"),
+            "loads.gravity": ('"[0, 0, -9] m/s^2"', '"[0, 1, -8]"'),
+        },
+    ),
+    "clamps that turn": (
+        SCENE,
+        {
+            "end.tangent": ('"[1, 0, 0.3]"', '"[1, 0, 0]"'),
+            "start.d2": ('"[0, 2, 0.1]"', '"[0, 1, 0]"'),
+            "end.spin": ("100 deg", "0"),
+        },
+    ),
+    "a section": (
+        SCENE.replace(
+            'EI = "4.9e-3 N m^2"\nGJ = "3.3e-3 N m^2"\nEA = "785 N"\nmass_per_length = "0.1 kg/m"',
+            'section = "tube"\nouter_radius = "5 mm"\ninner_radius = "4 mm"\nyoungs_modulus = "10 MPa"\n'
+            'poisson_ratio = 0.5\ndensity = "1200 kg/m^3"',
+        ),
+        {
+            "rod.length": ("1.1", "1.2"),
+            "rod.outer_radius": ("6 mm", "7e-3"),
+            "rod.poisson_ratio": ("0.4", "0.3"),
+            "loads.point_force.0.at": ("0.3", "50 cm"),
+        },
+    ),
+    "clips and obstacles": (
+        SCENE.replace('"finite_difference"', '"hermite"').replace('EA = "785 N"', 'EA = "785 N"\nradius = "5 mm"')
+        + '[[clips]]\nat = "0.4 m"\nposition = "[0.3, 0, 0.05] m"\ntangent = [1, 0, 0]\nd2 = [0, 1, 0]\n'
+        + 'spin = "0 deg"\n'
+        + '[[obstacles]]\nkind = "box"\ncenter = "[0, 0, -1] m"\nsize = "[10, 10, 10] cm"\n'
+        + "frame = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        + '[[obstacles]]\nkind = "union"\n[[obstacles.parts]]\nkind = "capsule"\nstart = "[0, 0, -1] m"\n'
+        + 'end = "[1, 0, -1] m"\nradius = "5 cm"\n',
+        {
+            "clips.0.at": ("45 cm", "0.42"),
+            "clips.0.spin": ("10 deg", "0"),
+            "obstacles.0.center.2": ("-1.1", "-120 cm"),
+            "obstacles.0.size": ('"[20, 10, 10] cm"', '"[0.1, 0.1, 0.1]"'),
+            "obstacles.1.parts.0.end.1": ("2 cm", "0.1"),
+            "obstacles.1.parts.0.radius": ("6 cm", "0.07"),
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BY_COLUMNS)
+def test_scenes_made_by_columns_are_those_read_one_by_one(name, files, monkeypatch):
+    scene, cells = BY_COLUMNS[name]
+    Path("scene.toml").write_text(scene)
+    first, second = (",".join(row) for row in zip(*cells.values(), strict=True))
+    Path("table.csv").write_text("\n".join([",".join(cells), first, second, first]) + "\n")
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    given = np.arange(3), reader.cases.of(np.arange(3)), 4
+    one_by_one = reader.of_cases.stacked(*given)
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    monkeypatch.setattr("rodjax.sweeps.cases._stacked", lambda scenes: pytest.fail("read one by one"))
+    at_once = reader.of_cases.stacked(*given)
+    assert jax.tree.structure(at_once) == jax.tree.structure(one_by_one)
+    for leaf, expected in zip(jax.tree.leaves(at_once), jax.tree.leaves(one_by_one), strict=True):
+        assert leaf.dtype == expected.dtype
+        # A program may round a sum of products once where NumPy does so twice.
+        np.testing.assert_allclose(leaf, expected, rtol=4e-16, atol=4e-16)
+        assert leaf.shape[0] == 4
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        ('end.d2\n"[0, 1, 0]"\n"[1, 0, 0]"\n"[0, 0, 1]"\n', "d2 must not be parallel to the tangent"),
+        ("end.tangent.0\n1\n0\n2\n", "tangent must be a direction"),
+        ("rod.length,end.position.0\n1.0,0.8\n0.9,1.75\n1.0,0.8\n", "the ends are 1.75 m apart"),
+        ("rod.length,loads.point_force.0.at\n2.0,0.5\n1.0,1.5\n2.0,1.9\n", "at"),
+    ],
+)
+def test_what_makes_no_sense_is_named_also_by_columns(cells, said, files, monkeypatch):
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    Path("table.csv").write_text(cells)
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    with pytest.raises(SweepError, match=r"^table\.csv: case 1: .*" + said):
+        reader.of_cases.stacked(np.arange(3), reader.cases.of(np.arange(3)), 3)
+
+
+def test_scenes_that_differ_in_more_than_numbers_are_read_one_by_one(files, monkeypatch):
+    """How many wires a bundle has decides what is summed."""
+    wires = 'section = "bundle"\nwires = 7\nwire_radius = "1 mm"\nyoungs_modulus = "1 GPa"\nstick = 0.2\n'
+    wires += "poisson_ratio = 0.3"
+    plain = 'EI = "4.9e-3 N m^2"\nGJ = "3.3e-3 N m^2"\nEA = "785 N"\nmass_per_length = "0.1 kg/m"'
+    scene = SCENE.replace(plain, wires).split("[loads]")[0]
+    Path("scene.toml").write_text(scene)
+    Path("table.csv").write_text("rod.wires,rod.length\n7,1\n19,1.1\n")
+    reader = CaseReader(Path("scene.toml"), Path("table.csv"))
+    given = np.arange(2), reader.cases.of(np.arange(2)), 2
+    monkeypatch.setattr("rodjax.sweeps.cases.LEAST_ROWS", 1)
+    stacked = reader.of_cases.stacked(*given)
+    expected = [scene.rod.EA for scene in reader.scenes(np.arange(2))]
+    np.testing.assert_array_equal(stacked.rod.EA, expected)
+    assert expected[1] == pytest.approx(19 / 7 * expected[0])
+
+
 MISTAKES = [
     ("[]", "is not valid TOML", ""),
     ("", "holds no keys", "rod.EI"),
     ("rod.EI = 5", "rod.EI must be a list of values", "from = 1"),
     ("rod.EI = []", "rod.EI must be a list of values", "from = 1"),
-    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end, loads and clips"),
+    ('"solve.segments" = [4, 5]', "solve.segments cannot vary", "rod, start, end, loads, clips and obstacles"),
     ('"end.support" = ["pin", "clamp"]', "end.support cannot vary", "that hold numbers"),
     ('"rod.color" = [1]', "rod.color cannot vary", "that hold numbers"),
     ('"1" = [1]', "1 cannot vary", "that hold numbers"),
@@ -215,7 +322,7 @@ IN_A_TABLE = [
     + [("cases.csv", *mistake) for mistake in IN_A_TABLE],
 )
 def test_a_mistake_is_named_in_one_line_and_nothing_is_solved(name, text, said, allowed, files, capsys, monkeypatch):
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", lambda *args, **options: pytest.fail("solved"))
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", lambda *args, **options: pytest.fail("solved"))
     over = "cases.csv" if name.endswith("csv") else "cases.toml"
     Path(over).write_text(text)
     assert main(["sweep", "scene.toml", "--over", over, "-o", "out.h5"]) == 2
@@ -299,7 +406,7 @@ def test_the_command_says_what_it_did_and_resumes_a_complete_sweep(files, whole,
 
 def stopped_after(count, monkeypatch):
     """Makes a sweep stop, as by Ctrl-C, when it has solved so many chunks; returns the numbers of cases it solves."""
-    solved, solve = [], rodjax.sweep.sweep.solve_batch
+    solved, solve = [], rodjax.sweeps.chunk.solve_batch
 
     def counted(scenes, **options):
         if len(solved) == count:
@@ -307,7 +414,7 @@ def stopped_after(count, monkeypatch):
         solved.append(scenes.rod.length.shape[0])
         return solve(scenes, **options)
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", counted)
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", counted)
     return solved
 
 
@@ -375,14 +482,64 @@ def test_merged_shards_are_the_whole(files, whole, capsys):
         merge(["2.h5", "copy.h5"], "bad.h5")
 
 
+@pytest.mark.parametrize("options", [{"threads": 2}, {"executor": "that fails once"}])
+def test_whoever_solves_the_chunks_the_result_is_the_same(options, files, whole, capsys):
+    if "executor" in options:
+        options = {"executor": Unreliable(lambda number: number == 1)}
+    sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, progress=True, **options)
+    assert_same("out.h5", whole)
+    assert "10/10" in capsys.readouterr().err
+    assert sorted(os.listdir()) == ["grid.toml", "out.h5", "scene.toml"]
+
+
+def test_an_executor_that_fails_leaves_finished_chunks(files, whole):
+    with Unreliable(lambda number: number > 0) as engine, pytest.raises(SweepError) as caught:
+        sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, executor=engine)
+    said = (
+        r"task \d failed 4 times: ConnectionError: the worker is lost; the finished chunks are in out\.h5\.parts: go on"
+    )
+    assert re.match(said, str(caught.value))
+    left = set(os.listdir("out.h5.parts"))
+    assert left <= {"chunk-000000.h5", "manifest.json"}
+    sweep("scene.toml", "grid.toml", "out.h5", resume=True)
+    assert_same("out.h5", whole)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from rodjax.file_lock import locked
+with locked(Path("out.h5")):
+    print("locked", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_two_processes_at_one_sweep_are_told_so(files, whole, capsys):
+    process = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process, process.stdout:
+        assert process.stdout.readline() == "locked\n"
+        command = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", "4", "--resume"]
+        assert main(command) == 2
+        err = capsys.readouterr().err
+        assert re.fullmatch(rf"rodjax: out\.h5 is being written by process {process.pid} on \S+; wait .*\n", err)
+        # The lock ends with its process, however that ends.
+        process.kill()
+        process.wait()
+        assert main(command) == 0
+    assert_same("out.h5", whole)
+    assert not Path("out.h5.lock").exists()
+
+
 def test_cases_that_do_not_converge_are_counted(files, capsys, monkeypatch):
-    solve = rodjax.sweep.sweep.solve_batch
+    solve = rodjax.sweeps.chunk.solve_batch
 
     def seldom(scenes, **options):
         result = solve(scenes, **options)
         return eqx.tree_at(lambda result: result.converged, result, scenes.rod.EI > 4.5e-3)
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve_batch", seldom)
+    monkeypatch.setattr("rodjax.sweeps.chunk.solve_batch", seldom)
     assert main(["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", "4"]) == 3
     out, err = capsys.readouterr()
     assert "5 of 10 cases converged" in out
@@ -410,7 +567,7 @@ def test_without_segments_the_first_case_decides_on_the_mesh(files, whole, capsy
         asked.append((float(scene.rod.EI), float(scene.end.position[0]), options))
         return types.SimpleNamespace(s=np.zeros(5), discretization="finite_difference")
 
-    monkeypatch.setattr("rodjax.sweep.sweep.solve", solve)
+    monkeypatch.setattr("rodjax.sweeps.sweep.solve", solve)
     sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK, say=print)
     assert asked == [(0.004, pytest.approx(0.7), {"rtol": 0.1, "discretization": "finite_difference"})]
     assert "4 segments (finite_difference), as case 0 needs for rtol = 0.1" in capsys.readouterr().out

@@ -1,5 +1,8 @@
 """Tolerances: a taut wire in closed form, a cable in two clips beside a Monte Carlo, and a column that is flagged."""
 
+import math
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -242,3 +245,16 @@ def test_bad_arguments():
     stack = jax.tree.map(lambda leaf: leaf[None], result)
     with pytest.raises(ValueError, match="equilibrium must be a single one"):
         rj.tolerances(stack, good)
+
+
+def test_samples_by_threads_and_an_executor_are_the_same(monkeypatch):
+    monkeypatch.setattr("rodjax.paths.batch.CHUNKS", ((16, math.inf),))
+    tolerance = [Tolerance("rod.length", 1e-3)]
+    equilibrium = rj.solve(rj.problems.hanging_cable(), segments=4)
+    with ThreadPoolExecutor(2) as engine:
+        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
+        first, *others = (rj.tolerances(equilibrium, tolerance, samples=40, **kind) for kind in kinds)
+    assert first.samples == 40
+    for other in others:
+        for ours, theirs in zip(vars(other.sampled).values(), vars(first.sampled).values(), strict=True):
+            np.testing.assert_array_equal(ours, theirs)

@@ -1,8 +1,9 @@
-"""fit_each(): many experiments, each fitted by itself, in one program."""
+"""fit_each(): many experiments, each fitted by itself, a few of them at a time in one program."""
 
 import dataclasses
 import functools
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
 from rodjax.checks import leaf
-from rodjax.identification.lanes import in_lanes
+from rodjax.identification.lanes import LANES
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import Loss
 from rodjax.identification.measurements import Experiment
@@ -34,6 +35,7 @@ from rodjax.identification.statistics import LARGEST_DEVIATION, inverse, rates
 from rodjax.identification.unknowns import Unknown
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
+from rodjax.programs.tasks import checked_executor, checked_threads, in_order, rows_of
 from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.result import Equilibrium
 
@@ -88,8 +90,10 @@ def fit_each(
     discretization: Discretization | None = None,
     planar: bool = False,
     max_steps: int = MAX_STEPS,
+    executor: Executor | None = None,
+    threads: int | None = None,
 ) -> Fits:
-    """The unknowns of each experiment from its own measurements alone, all in one compiled program.
+    """The unknowns of each experiment from its own measurements alone, sixteen at a time in one compiled program.
 
     **Arguments:** as for `rodjax.fit`, save that
 
@@ -98,10 +102,15 @@ def fit_each(
     - `free`: (e, p) of bool, which unknowns are free in which experiment; the others stay as they are at the start.
         `None`: all. The same experiment with several choices compares models.
     - a `loss` other than `"linear"`, and priors, need standard deviations.
+    - `executor`: what computes the fits, anything with the interface of `concurrent.futures.Executor`, such as
+        `client.get_executor()` of Dask; `None`: threads of this process.
+    - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
+        result.
 
     Returns `Fits`; an experiment that does not converge is marked and does not affect others. Raises `ValueError` or
     `TypeError` for arguments that make no sense.
     """
+    executor, threads = checked_executor(executor), checked_threads(threads)
     threshold = checked_threshold(loss, threshold)
     setup = prepared(experiments, unknowns)
     labels = [one if isinstance(one, str) else one.label for one in unknowns]
@@ -128,7 +137,7 @@ def fit_each(
     at_start = eqx.tree_at(lambda p: (p.shared, p.own), problem, (problem.own, problem.shared))
     shapes = beginnings(as_own, at_start, first, guesses)[0]
     while True:
-        found = _each(structure, problem, starts, leaf(is_free), shapes)
+        found = _in_parts(structure, problem, starts, is_free, shapes, executor, threads)
         error = largest_error((found.equilibria,), tolerance)
         better = finer(structure, error, tolerance)
         if better is None:
@@ -165,6 +174,34 @@ class _Found(eqx.Module):
     equilibria: Equilibrium
 
 
+def _in_parts(
+    structure: Structure,
+    problem: Problem,
+    starts: Float[Array, "e p"],
+    is_free: Bool[np.ndarray, "e p"],
+    shapes: Equilibrium,
+    executor: Executor | None,
+    threads: int,
+) -> _Found:
+    """All fits, a part of the experiments at a time."""
+    count = len(is_free)
+    size = min(LANES, count)
+    each = jax.tree.map(np.asarray, (problem.groups[0], starts, is_free, shapes))
+
+    def part(first: int) -> tuple[Any, ...]:
+        group, *others = jax.tree.map(lambda leaf: leaf[rows_of(first, size, count)], each)
+        here = eqx.tree_at(lambda problem: (problem.groups, problem.is_free), problem, ((group,), None))
+        return structure, here, *others
+
+    parts = [part(first) for first in range(0, count, size)]
+    found = in_order(_part_fitted, parts, executor=executor, threads=threads)
+    return jax.tree.map(lambda *leaves: leaf(np.concatenate(leaves)[:count]), *found)
+
+
+def _part_fitted(*part: Any) -> _Found:
+    return jax.tree.map(np.asarray, _each(*part))
+
+
 @functools.partial(compiled, static_argnames=("structure",))
 def _each(
     structure: Structure,
@@ -179,6 +216,7 @@ def _each(
             lambda problem: (problem.groups, problem.is_free),
             problem,
             ((alone,), Coordinates(is_free, jnp.zeros((1, 0), bool))),
+            is_leaf=lambda x: x is None,
         )
         at = Coordinates(start, jnp.zeros((1, 0), starts.dtype))
         found = search(structure, here, at, (jax.tree.map(lambda x: x[None], shape),))
@@ -199,8 +237,7 @@ def _each(
             equilibria=jax.tree.map(lambda x: x[0], found.evaluation.results[0]),
         )
 
-    each = (problem.groups[0].experiments, starts, is_free, shapes)
-    return in_lanes(one, each)
+    return jax.vmap(one)(problem.groups[0].experiments, starts, is_free, shapes)
 
 
 def _by_weight(rows: Float[Array, "k d"], weights: Float[Array, "k"]) -> Float[Array, "k d"]:

@@ -45,7 +45,7 @@ The table has a header and one row for each measured point. Columns are, with a 
 - `end_force_x [N]`, `end_moment_z [N m]`, `start_force_y [N]`, ...: what the support applies to the rod, one component
   or more.
 - keys of the scene file, `end.position.0 [mm]`, `rod.length`, or their names in `[experiments]`: replace what the scene
-  has, in that experiment. Cells as in the tables of `rodjax.sweep`; where they are empty the scene's value stays.
+  has, in that experiment. Cells as in the tables of `rodjax.sweeps`; where they are empty the scene's value stays.
 
 All but points and arclengths have one value in an experiment: in one of its rows, or the same in several. Rows without
 a point have empty cells there. Beside the example above:

@@ -10,13 +10,13 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from rodjax.checks import line, shown
+from rodjax.checks import line, namespace, shown
 
 # SI unit (none: a plain number), shape and an example of every key that holds numbers, as many as its shape says.
 QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
@@ -136,7 +136,7 @@ def named(where: str) -> Iterator[None]:
     except SceneFileError:
         raise
     except (TypeError, ValueError) as error:
-        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*QUANTITIES, *LISTS, *_of_table(where), "values")
+        is_key = re.split(r"\W", str(error), maxsplit=1)[0] in (*QUANTITIES, *LISTS, *of_table(where), "values")
         raise SceneFileError(f"{where}{'.' if is_key else ': '}{error}") from None
 
 
@@ -161,7 +161,7 @@ def check_keys(table: Any, where: str, required: Sequence[str], optional: Sequen
             )
     for key in required:
         if key not in table:
-            is_table = not any(key in keys for keys in (_of_table(where), QUANTITIES, LISTS))
+            is_table = not any(key in keys for keys in (of_table(where), QUANTITIES, LISTS))
             example = f"a table [{key}]" if is_table else f"{key} = {quantity(key, where)[2]}"
             raise SceneFileError(f"{prefix}{key} is missing, for example {example}")
     return table
@@ -183,10 +183,11 @@ def choice(table: Any, where: str, key: str, allowed: list[str]) -> str | None:
 
 def quantity(key: str, where: str = "") -> tuple[str, tuple[int | None, ...], str]:
     """SI unit, shape and an example of a key in the table at that place."""
-    return _of_table(where).get(key) or QUANTITIES.get(key) or LISTS[key]
+    return of_table(where).get(key) or QUANTITIES.get(key) or LISTS[key]
 
 
-def _of_table(where: str) -> dict[str, tuple[str, tuple[int, ...], str]]:
+def of_table(where: str) -> dict[str, tuple[str, tuple[int, ...], str]]:
+    """The keys that mean something of their own in the table at that place."""
     return next((keys for table, keys in OF_TABLES.items() if table in where), {})
 
 
@@ -218,8 +219,16 @@ def _check_table(table: Any, where: str) -> None:
         raise SceneFileError(f"{where} must be a table, [{where}], got {shown(table)}")
 
 
+class InSI(NamedTuple):
+    """In the place of what a file has: numbers in SI units of the right shape, which may be traced."""
+
+    numbers: Any
+
+
 def si_value(value: Any, key: str, si: str, shape: tuple[int | None, ...], example: str) -> Float[np.ndarray, "..."]:
     """A quantity or plain numbers of that shape, in units `si`; of a direction, the unit vector."""
+    if isinstance(value, InSI):
+        return _unit_vector(value.numbers) if key in DIRECTIONS else value.numbers
 
     def mistake(allowed: str, got: str = shown(value)) -> ValueError:
         return ValueError(f"{key} must {allowed}, for example {key} = {example}, got {got}")
@@ -291,12 +300,13 @@ def _described(shape: tuple[int | None, ...]) -> str:
     return f"{' x '.join(map(str, shape))} numbers"
 
 
-def _unit_vector(vector: np.ndarray) -> Float[np.ndarray, "3"]:
+def _unit_vector(vector: Any) -> Float[np.ndarray, "3"]:
     """The direction of a nonzero vector; itself to the last bit where it has the length 1."""
-    unit = vector / np.max(np.abs(vector))
-    unit = unit / np.linalg.norm(unit)
+    xp = namespace(vector)
+    unit = vector / xp.max(xp.abs(vector))
+    unit = unit / xp.linalg.norm(unit)
     rounding = 4 * float(jnp.finfo(jnp.zeros(()).dtype).eps)
-    return vector if np.allclose(vector, unit, rtol=0, atol=rounding) else unit
+    return xp.where(xp.all(xp.abs(vector - unit) <= rounding), vector, unit)
 
 
 @functools.lru_cache(maxsize=1024)

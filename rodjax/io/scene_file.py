@@ -101,10 +101,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast, get_args
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import file_path, leaf, shown, whole_number
+from rodjax.checks import Numbers, file_path, is_known, leaf, namespace, shown, whole_number
 from rodjax.io.clocking import Clocking, Values, is_unclocked
 from rodjax.io.obstacle_tables import obstacle, with_direction
 from rodjax.io.quantities import (
@@ -125,7 +126,7 @@ from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Clip, Free, Pin, Support, Swivel, frame
+from rodjax.model.supports import LEAST_ACROSS, Clamp, Clip, Free, Pin, Support, Swivel, frame
 from rodjax.solving.equilibrium import (
     MAX_SEGMENTS,
     Discretization,
@@ -256,11 +257,18 @@ class SceneReader:
     def part(self, make: Callable[..., Part], *arguments: Any) -> Part:
         """`make(self, *arguments)`, of this or an earlier call with the same arguments. Nobody may change it."""
         key = make, pickle.dumps(arguments)
-        if key not in self._parts:
-            if len(self._parts) >= MAX_KEPT:
-                self._parts.clear()
-            self._parts[key] = make(self, *arguments)
-        return self._parts[key]
+        known = self._parts
+        if key in known:
+            return known[key]
+        made = make(self, *arguments)
+        if len(known) >= MAX_KEPT:  # not cleared: another thread may be about to take a part out
+            known = self._parts = {}
+        known[key] = made
+        return made
+
+    def __reduce__(self):
+        """Other processes read anew."""
+        return SceneReader, ()
 
     def si_values(
         self, table: Any, where: str, required: Sequence[str], optional: Sequence[str], other: Sequence[str] = ()
@@ -268,6 +276,16 @@ class SceneReader:
         """As `quantities.si_values`."""
         check_keys(table, where, required, (*optional, *other))
         return {key: self.part(_si_value, where, key, value) for key, value in table.items() if key not in other}
+
+
+class TracedReader(SceneReader):
+    """The same of tables with traced numbers (`quantities.InSI`), of which nothing is kept.
+
+    What can be checked of known numbers alone is not: `rodjax.solving.ranges` tells which scenes are to be read anew.
+    """
+
+    def part(self, make: Callable[..., Part], *arguments: Any) -> Part:
+        return make(self, *arguments)
 
 
 def _si_value(reader: SceneReader, where: str, key: str, value: Any) -> Float[np.ndarray, "..."]:
@@ -424,7 +442,7 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
                 )
             return values
         values = _frame_values(values, where)
-        if abs(values["spin"]) > math.pi:
+        if is_known(values["spin"]) and abs(values["spin"]) > math.pi:
             raise SceneFileError(
                 f"{where}.spin must lie in -180 deg to 180 deg in the first scene, got {table['spin']!r}; "
                 "turn further along a [[path]], or by whole turns with end.turns"
@@ -490,12 +508,12 @@ def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: s
     if is_unclocked(values):
         raise SceneFileError(_SPIN_NEEDS_D2.format(where))
     values = _frame_values(values, where)
-    if abs(values["spin"]) > math.pi:
+    if is_known(values["spin"]) and abs(values["spin"]) > math.pi:
         raise SceneFileError(
             f"{where}.spin must lie in -180 deg to 180 deg, got {math.degrees(float(values['spin'])):g} deg"
         )
     placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-    return {"frame": _spun(placed, float(values["spin"]))}
+    return {"frame": _spun(placed, values["spin"])}
 
 
 def _changes(
@@ -540,23 +558,29 @@ def _support(
             return with_direction(Swivel(values["position"], values["tangent"]), "tangent", values)
         if kind == "clamp":
             placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-            return Clamp(values["position"], _spun(placed, float(values["spin"])))
+            return Clamp(values["position"], _spun(placed, values["spin"]))
         if kind == "swivel":
             return with_direction(Swivel(**values), "tangent", values)
         return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
 
 
-def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    return np.asarray(frame(tangent, d2))
+def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[Numbers, "3 3"]:
+    placed = frame(tangent, d2)
+    if is_known(tangent, d2):
+        return np.asarray(placed) if is_known(placed) else placed
+    # Of two that are parallel, which are refused where they are known, no frame.
+    across = jnp.linalg.norm(jnp.cross(tangent, d2))
+    return jnp.where(across > LEAST_ACROSS * jnp.linalg.norm(d2), placed, jnp.nan)
 
 
-def _spun(placed: Any, spin: float) -> Any:
+def _spun(placed: Any, spin: Any) -> Any:
     """A frame turned about its own tangent."""
-    if spin == 0:
+    if is_known(placed, spin) and spin == 0:
         return placed
-    d1, d2, tangent = np.asarray(placed).T
-    turned = math.cos(spin) * d1 + math.sin(spin) * d2, math.cos(spin) * d2 - math.sin(spin) * d1
-    return np.stack([*turned, tangent], axis=-1)
+    xp = namespace(placed, spin)
+    d1, d2, tangent = xp.asarray(placed).T
+    turned = xp.cos(spin) * d1 + xp.sin(spin) * d2, xp.cos(spin) * d2 - xp.sin(spin) * d1
+    return xp.stack([*turned, tangent], axis=-1)
 
 
 def _between(before: Values, after: Values, fraction: float, where: str) -> Values:

@@ -6,20 +6,39 @@ plain numbers in SI units.
 
 import functools
 import json
+import logging
+import pickle
 import re
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from rodjax.checks import line, shown
-from rodjax.io.quantities import NUMBER_AND_UNIT, QUANTITIES, SceneFileError, number_in, quantity, si_values
-from rodjax.io.scene_file import SceneFile, SceneReader
+from rodjax.checks import Numbers, line, shown
+from rodjax.io.quantities import (
+    NUMBER_AND_UNIT,
+    QUANTITIES,
+    InSI,
+    SceneFileError,
+    number_in,
+    of_table,
+    quantity,
+    si_values,
+)
+from rodjax.io.scene_file import SceneFile, SceneReader, TracedReader
+from rodjax.model.scene import Scene
+from rodjax.solving.ranges import suspects
 
 Place = tuple[str | int, ...]
+# The tables whose numbers may vary.
+TABLES = ("rod", "start", "end", "loads", "clips", "obstacles")
+_log = logging.getLogger("rodjax")
 
 
 class SceneVariations:
@@ -36,7 +55,7 @@ class SceneVariations:
 
     def in_si(self) -> None:
         """Puts the tables into SI units, in which numbers are read much faster; where there are many scenes."""
-        self._content = {name: _in_si(table) for name, table in self._content.items()}
+        self._content = {name: _in_si(table, name) for name, table in self._content.items()}
 
     def read(self, values: Mapping[str, Float[np.ndarray, "..."]]) -> SceneFile:
         """With these values in SI units; keys without one keep what the file has."""
@@ -48,6 +67,48 @@ class SceneVariations:
         for place, number in numbers.items():
             _put(content, place, _as_text(number, str(place[-1]), _dotted(place[:-1])))
         return self._reader.read(content)
+
+    def stacked(self, values: Mapping[str, Float[np.ndarray, "k ..."]]) -> tuple[Scene, Bool[np.ndarray, "k"]] | None:
+        """The scenes with these values, along a leading axis, all made at once by a compiled program; and which of them
+        are to be read by themselves, as they may make no sense. `None` where the scenes differ in more than numbers.
+        """
+        scenes = _program(pickle.dumps((self._content, self._places, self._templates)))
+        try:
+            stack = jax.tree.map(np.asarray, scenes(dict(values)))
+        except (TypeError, ValueError) as error:  # of traced numbers that decide what there is
+            _log.info("scenes are read one by one: %s", line(str(error)))
+            return None
+        return stack, suspects(stack)
+
+
+_lock = threading.Lock()
+
+
+def _program(packed: bytes) -> Callable[[dict[str, np.ndarray]], Scene]:
+    """What makes stacked scenes of the values by key; one for all chunks that a process reads."""
+    with _lock:
+        return _made_program(packed)
+
+
+@functools.lru_cache(maxsize=4)
+def _made_program(packed: bytes) -> Callable[[dict[str, np.ndarray]], Scene]:
+    content, places, templates = pickle.loads(packed)
+    # On any mesh: none is chosen here.
+    solve = {key: value for key, value in content.get("solve", {}).items() if key not in ("rtol", "segments")}
+    content = content | {"solve": solve | {"segments": 1000}}
+
+    def scene(values: dict[str, Float[Numbers, "..."]]) -> Scene:
+        numbers: dict[Place, Numbers] = {}
+        for key, value in values.items():
+            place, component = places[key]
+            number = jnp.asarray(numbers.get(place, templates[place]))
+            numbers[place] = number.at[component].set(value) if component else value
+        tables = dict(content)
+        for place, number in numbers.items():
+            _put(tables, place, InSI(number))
+        return TracedReader().read(tables).scenes[0]
+
+    return jax.jit(jax.vmap(scene))
 
 
 # --- keys and values -------------------------------------------------------------------------------------------------
@@ -73,14 +134,15 @@ def _target(key: str) -> tuple[Place, tuple[int, ...]]:
     names = key.split(".")
     numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
     end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
-    if names[0] not in ("rod", "start", "end", "loads", "clips") or names[end - 1] not in QUANTITIES:
+    known = QUANTITIES | of_table(".".join(names[: max(end - 1, 0)]))
+    if names[0] not in TABLES or names[end - 1] not in known:
         raise SceneFileError(
-            f"{line(key)} cannot vary; allowed are the keys of rod, start, end, loads and clips that hold "
-            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position"
+            f"{line(key)} cannot vary; allowed are the keys of {', '.join(TABLES[:-1])} and {TABLES[-1]} that hold "
+            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position, obstacles.0.radius"
         )
     place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
     component = tuple(number for number in numbers[end:] if number is not None)
-    shape = QUANTITIES[names[end - 1]][1]
+    shape = known[names[end - 1]][1]
     is_within = len(component) == len(shape) and all(k < size for k, size in zip(component, shape, strict=True))
     if component and not is_within:
         kind = f"{' x '.join(map(str, shape))} numbers, which count from 0" if shape else "a single number"
@@ -98,7 +160,7 @@ def si_number(value: Any, key: str) -> Float[np.ndarray, "..."]:
     """In SI units, of a value as the scene file has it, or plain numbers in SI units."""
     place, component = _target(key)
     where, name = _dotted(place[:-1]), str(place[-1])
-    unit, shape = quantity(name, where)[0], QUANTITIES[name][1]
+    unit, shape, _ = _quantity(name, where)
     is_scalar = not shape or bool(component)
     # The bulk of a large table, which must not wait for the parsing of text.
     if is_scalar and type(value) in (int, float) and abs(value) <= sys.float_info.max:
@@ -143,11 +205,16 @@ def _template(content: dict[str, Any], key: str, place: Place, component: tuple[
         raise SceneFileError(f"{_dotted(place[:-1])} must be a table, got {shown(table)}")
     name = str(place[-1])
     if not component:
-        return np.zeros(QUANTITIES[name][1])
+        return np.zeros(_quantity(name, _dotted(place[:-1]))[1])
     value = _entry(table, place, key)
     numbers = si_values({name: value}, _dotted(place[:-1]), (), (name,))[name]
     # A direction is kept as it was given; scenes make its length 1.
-    return numbers if QUANTITIES[name][0] else np.asarray(value, float)
+    return numbers if _quantity(name, _dotted(place[:-1]))[0] else np.asarray(value, float)
+
+
+def _quantity(name: str, where: str) -> tuple[str, tuple[int, ...], str]:
+    """As `quantity`, of a key that may vary."""
+    return of_table(where).get(name) or QUANTITIES[name]
 
 
 def _entry(table: Any, place: Place, key: str) -> Any:
@@ -177,7 +244,7 @@ def _as_text(number: Float[np.ndarray, "..."], name: str, where: str) -> Any:
     return f"{number.tolist()} {unit}" if unit else number.tolist()
 
 
-def _in_si(table: Any, where: str = "") -> Any:
+def _in_si(table: Any, where: str) -> Any:
     """A table with all quantities in SI units."""
     if isinstance(table, list):
         return [_in_si(entry, where) for entry in table]
@@ -185,7 +252,7 @@ def _in_si(table: Any, where: str = "") -> Any:
         return table
 
     def value(key: str, value: Any) -> Any:
-        if isinstance(value, str) and key in QUANTITIES:
+        if isinstance(value, str) and key in QUANTITIES | of_table(where):
             with suppress(SceneFileError):  # each scene may have another value in its place
                 return _as_text(si_values({key: value}, where, (), (key,))[key], key, where)
         return _in_si(value, f"{where}.{key}")

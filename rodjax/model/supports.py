@@ -173,6 +173,10 @@ def rotate(frame: Any, rotation_vector: Any) -> Float[Array, "3 3"]:
     return leaf(turned + a * (cross @ turned) + b * (cross @ (cross @ turned)))
 
 
+# Of a d2 of which a smaller part is at right angles to the tangent the direction is mostly rounding of the input.
+LEAST_ACROSS = 1e-6
+
+
 def frame(tangent: Any, d2: Any = DEFAULT_D2) -> Float[Array, "3 3"]:
     """The frame with columns (d1, d2, t): t along `tangent`, d2 the part of `d2` at right angles to it.
 
@@ -185,8 +189,7 @@ def frame(tangent: Any, d2: Any = DEFAULT_D2) -> Float[Array, "3 3"]:
     xp = namespace(t, d2)
     across = d2 - xp.dot(d2, t) * t
     length = xp.linalg.norm(across)
-    # Below this the direction of d2 is mostly rounding of the input.
-    if is_known(length) and not length > 1e-6:
+    if is_known(length) and not length > LEAST_ACROSS:
         if is_default:
             raise ValueError(
                 f"d2 must not be parallel to the tangent, as its default (0, 1, 0) is: give d2, got tangent = {t}"

@@ -2,10 +2,11 @@
 
 `jax.vmap` of a solve runs every rod until the slowest has converged. Here so many rods as are quick to compute side by
 side, the lanes, make their turns of Newton's method together, and a lane whose rod is done takes the next scene: one
-compiled loop without idle work, until there are no more scenes.
+compiled loop without idle work, until there are no more scenes. Many scenes go in chunks, which threads share.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,6 +25,7 @@ from rodjax.model.scene import Scene, has_node_places, slides
 from rodjax.paths.path import path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
+from rodjax.programs.tasks import as_completed, checked_threads
 from rodjax.solving.equilibrium import (
     Discretization,
     Options,
@@ -52,9 +54,10 @@ from rodjax.solving.result import (
 
 # Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
 LANES = 8
-# Scenes in one call of a compiled program: the least of these that holds all, or as many calls of the last as it takes.
-# What is prepared for a scene takes some 20 kB at 50 segments.
-CHUNKS = (16, 128, 1024)
+# Scenes in one call of a compiled program, and up to how many scenes in all: of the first that allows so many; more go
+# by the last. The fewer in a call, the more threads share them, and the longer lanes idle at its end: 128 take 11 %
+# more time a scene than 1024, 256 take 6 %. What is prepared for a scene takes some 20 kB at 50 segments.
+CHUNKS = ((16, 16), (128, 128), (256, 4096), (1024, math.inf))
 
 
 @one_answer
@@ -70,6 +73,7 @@ def solve_batch(
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
+    threads: int | None = None,
     progress: bool = False,
 ) -> Equilibrium:
     """The equilibria of independent scenes of one structure, or of independent paths.
@@ -81,6 +85,8 @@ def solve_batch(
     - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
+    - `threads`: the most that share more than 256 scenes, without `mesh`; `None`: the environment variable
+        `RODJAX_THREADS`, or one for each core. The result is the same to the last bit whatever their number.
     - `progress`: show a progress bar.
     - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
         scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
@@ -101,6 +107,7 @@ def solve_batch(
         find=find,
         strain_limit=strain_limit,
         mesh=mesh,
+        threads=threads,
         progress=progress,
     )
 
@@ -111,6 +118,7 @@ def solve_stack(
     *,
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
+    threads: int | None = None,
     progress: bool = False,
     **settings: Any,
 ) -> Equilibrium:
@@ -119,6 +127,7 @@ def solve_stack(
     `settings`: the other arguments of `solve_batch`.
     """
     instance(progress, "progress", bool)
+    threads = checked_threads(threads)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
         if len(mesh.axis_names) != 1:
@@ -133,7 +142,7 @@ def solve_stack(
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
         # A path has one guess, for its first scene.
         begin = guess if last is None or last.s.ndim > 2 else last
-        return _in_chunks(given, begin, strain_limit, options, mesh, progress)
+        return _in_chunks(given, begin, strain_limit, options, mesh, threads, progress)
 
     result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
@@ -154,19 +163,25 @@ def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Sce
     return stack_scenes(rows)
 
 
+def chunk_size(count: int) -> int:
+    """Scenes in one call, of so many in all; that threads share them changes nothing."""
+    return next(size for size, most in CHUNKS if count <= most)
+
+
 def _in_chunks(
     scenes: Scene,
     guess: Guess | Equilibrium | None,
     strain_limit: Float[Array, ""] | float,
     options: Options,
     mesh: Mesh | None,
+    threads: int,
     progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     each = _is_stack(guess)
     devices = 1 if mesh is None else mesh.size
     share = -(-count // devices)
-    chunk = next((size for size in CHUNKS if share <= size), CHUNKS[-1])
+    chunk = chunk_size(share)
     is_traced = not is_known(scenes, guess)
     if mesh is not None and (is_traced or jax.process_count() > 1):
         if count % devices:
@@ -177,8 +192,8 @@ def _in_chunks(
         chunk = share
     if is_traced:
         return _solve_many(scenes, guess, jnp.full(devices, share), strain_limit, options, mesh)
-    parts = []
-    for first in tqdm(range(0, count, chunk * devices), disable=not progress, unit="chunk"):
+
+    def solved(first: int) -> Equilibrium:
         last = min(first + chunk * devices, count)
         part = functools.partial(_part, first=first, last=last, size=chunk * devices)
         counts = np.clip(last - first - chunk * np.arange(devices), 0, chunk)
@@ -188,10 +203,19 @@ def _in_chunks(
             whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
             places = (sharding, sharding if each else whole, sharding)
             inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, places, strict=True))
-        parts.append(_solve_many(*inputs, strain_limit, options, mesh))
+        return jax.block_until_ready(_solve_many(*inputs, strain_limit, options, mesh))
+
+    firsts = range(0, count, chunk * devices)
+    if len(firsts) == 1:
+        parts = {0: solved(0)}
+    else:
+        # Of several devices each call uses all.
+        results = as_completed(solved, ((first,) for first in firsts), threads=threads if mesh is None else 1)
+        parts = dict(tqdm(results, total=len(firsts), disable=not progress, unit="chunk"))
     if count == chunk * devices:
         return parts[0]
-    return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *parts)
+    found = [parts[k] for k in range(len(parts))]
+    return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *found)
 
 
 def _is_stack(guess: Guess | Equilibrium | None) -> bool:

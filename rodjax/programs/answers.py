@@ -79,7 +79,7 @@ class Program:
         last, count = self.asked
         self.asked = ANSWERS.number, count + (last != ANSWERS.number)
         is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
-        if not ANSWERS.by_numpy or not is_early or self.seconds_left <= 0:
+        if not ANSWERS.by_numpy or _here.is_compiled_only or not is_early or self.seconds_left <= 0:
             return None
         if self.code is None:
             with waiting():
@@ -208,6 +208,25 @@ class numpy_first:  # noqa: N801 - called as a function
 
     def __exit__(self, *_: object) -> None:
         ANSWERS.by_numpy = self._before
+
+
+class _Here(threading.local):
+    """What holds in this thread alone."""
+
+    is_compiled_only = False
+
+
+_here = _Here()
+
+
+@contextlib.contextmanager
+def compiled_only() -> Iterator[None]:
+    """No NumPy code in this thread, as `numpy_first(False)` says for all of them."""
+    before, _here.is_compiled_only = _here.is_compiled_only, True
+    try:
+        yield
+    finally:
+        _here.is_compiled_only = before
 
 
 def one_answer(function: F) -> F:

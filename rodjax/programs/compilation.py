@@ -75,8 +75,8 @@ class _Programs:
             return self._by_jax(args, options)
         if len(self.known) == 1 and not self.static:
             # Mostly it is the same again: the program itself tells that sooner than a key does.
-            (only,) = self.known.values()
             with contextlib.suppress(TypeError, ValueError):
+                (only,) = self.known.values()  # unless another thread has just added one
                 if only.executable is not None:
                     return only.executable(*args, **options)
         statics: tuple = ()
@@ -97,7 +97,8 @@ class _Programs:
             name = None
             if kept.is_keeping():
                 name = kept.name_of(self.name, QUICK, statics, tree, kinds)
-            program = self.known[key] = Program(self.trace, tree, name, self.is_patient)
+            # Of threads that ask at once one makes it.
+            program = self.known.setdefault(key, Program(self.trace, tree, name, self.is_patient))
         known = program.executable
         result = program(args, options, leaves, given, named)
         if known is None and program.executable is not None:

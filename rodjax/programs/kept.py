@@ -259,10 +259,6 @@ def settings() -> str:
 @functools.cache
 def _surroundings() -> str:
     """All that stays the same in a process: source, versions, processor, flags."""
-    source = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        source.update(str(path.relative_to(root)).encode() + path.read_bytes())
     versions = [f"{package} {importlib.metadata.version(package)}" for package in PACKAGES]
     versions += [sys.version, _devices()[0].client.platform_version]
     processor = [platform.machine(), platform.processor()]
@@ -270,7 +266,17 @@ def _surroundings() -> str:
         described = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
         processor += [line for line in described if line.startswith(("model name", "flags", "Features"))]
     flags = [os.environ.get("XLA_FLAGS", "")]
-    return "\n".join([source.hexdigest(), *versions, *processor, *flags])
+    return "\n".join([source(), *versions, *processor, *flags])
+
+
+@functools.cache
+def source() -> str:
+    """A hash of this package's source."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.py")):
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 @functools.cache

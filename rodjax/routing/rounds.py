@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rodjax.programs.tasks import inherited
+
 
 class _StoppedError(Exception):
     """Ends a search whose rounds are over."""
@@ -32,6 +34,7 @@ class Rounds:
 
     def run(self) -> list[Any]:
         """What the searches return. Where one of them, or an evaluation, raises, all end and it is raised here."""
+        self._entered = inherited()
         threads = [
             threading.Thread(target=self._search, args=(k,), name=f"search {k}", daemon=True)
             for k in range(len(self._searches))
@@ -74,7 +77,8 @@ class Rounds:
                 return self._answers.pop(k)
 
         try:
-            found = self._searches[k](ask)
+            with self._entered():
+                found = self._searches[k](ask)
         except _StoppedError:
             return
         except BaseException as error:

@@ -1,21 +1,22 @@
 """route(): the best place of clips, ends and cable within limits, from many starts at once."""
 
 import itertools
-import warnings
-from collections.abc import Callable
-from typing import Any
+import math
+from concurrent.futures import Executor
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from tqdm import tqdm
 
 from rodjax.checks import instance, positive, whole_number
 from rodjax.model.scene import Scene, slides
-from rodjax.paths.batch import solve_first, solve_stack
+from rodjax.paths.batch import solve_stack
 from rodjax.programs.answers import one_answer
+from rodjax.programs.tasks import Workers, checked_executor, checked_threads, in_order, rows_of
+from rodjax.routing.group import GROUP, Found, Targets, searched
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, checked, margins, measured_margins
 from rodjax.routing.objective import Objective
@@ -23,20 +24,18 @@ from rodjax.routing.optimality import Optimality, optimality
 from rodjax.routing.problem import (
     Evaluation,
     Problem,
-    arranged,
     chosen,
-    evaluated,
     group_starts,
     nothing_evaluated,
     scenes_of,
     spare_lengths,
 )
-from rodjax.routing.rounds import Rounds
-from rodjax.routing.search import KEPT, REGION, Asked, Numbers, Outcome, Search, Settings
+from rodjax.routing.search import KEPT, REGION, Outcome
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
-from rodjax.solving.equilibrium import Options, Solver, checked_options, solve
+from rodjax.solving.equilibrium import Solver, checked_options, solve
 from rodjax.solving.newton import Newton
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.warn import silenced
 
 SEGMENTS = 48
 # Of each limit so much is kept in reserve, as a part of it, until the error of the mesh is known.
@@ -59,6 +58,7 @@ FINISHED = 3
 MATTERS = 0.05
 # Multipliers below this part of the objective are none.
 NOTHING = 1e-6
+T = TypeVar("T")
 
 
 class Starts(eqx.Module):
@@ -170,12 +170,14 @@ def route(
     tolerance: Any = TOLERANCE,
     iterations: int = ITERATIONS,
     reserve: Any = None,
+    executor: Executor | None = None,
+    threads: int | None = None,
     progress: bool = False,
 ) -> Route:
     """The design of least cost that keeps to limits: where clips sit, how long the cable is, how its ends point.
 
-    Each start is a search by sequential quadratic programming with exact derivatives; all starts are computed together.
-    The first begins at the nominal scene, the others at random designs.
+    Each start is a search by sequential quadratic programming with exact derivatives; eight starts at a time are
+    computed together. The first begins at the nominal scene, the others at random designs.
 
     **Arguments:**
 
@@ -191,7 +193,11 @@ def route(
         thousandth of the ranges; `iterations`: most of each search.
     - `reserve`: of each limit so much more is asked, as a part of it, for the error of the mesh; `None`: a thousandth,
         and of the best five designs in the end as much as a mesh twice as fine differs.
-    - `progress`: show a progress bar of rounds of solves.
+    - `executor`: what searches from the starts, eight of them a task: anything with the interface of
+        `concurrent.futures.Executor`, such as `client.get_executor()` of Dask; `None`: threads of this process.
+    - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
+        result.
+    - `progress`: show a progress bar of rounds of solves, where up to eight starts are searched here.
 
     Limits all along the rod are kept at every place that `rodjax.margins` looks at, each place a constraint: so all
     constraints are smooth, and no softened maximum is taken. The result is called optimal where the conditions of
@@ -206,6 +212,7 @@ def route(
     the least violation, `feasible` is False, and `str` says what is missing. Raises `ValueError` or `TypeError` for
     arguments that make no sense, and `ValueError` where no start has an equilibrium.
     """
+    workers = Workers(checked_executor(executor), checked_threads(threads))
     problem, names = _problem(scene, variables, limits, objective, obstacles, names, segments, solver)
     count = whole_number(starts, "starts", 1, 100_000)
     rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63 - 1))
@@ -214,7 +221,7 @@ def route(
     iterations = whole_number(iterations, "iterations", 1, 1_000_000)
     instance(progress, "progress", bool)
 
-    fleet = _Fleet(problem, count, rng, progress)
+    fleet = _Fleet(problem, count, rng, workers, progress)
     fleet.search(tolerance, iterations, RESERVE if given is None else given)
     return _best(fleet, names, is_finished=given is None)
 
@@ -241,24 +248,20 @@ def _problem(
 
 
 class _Fleet:
-    """All searches: where they stand, the best of each, and what evaluates them."""
+    """All searches, in groups: where they start, and the best of each."""
 
-    def __init__(self, problem: Problem, count: int, rng: np.random.Generator, progress: bool):
-        self.problem, self._progress = problem, progress
-        self._options: Options = checked_options(
-            problem.scene, problem.segments, None, "hermite", problem.solver, None, False
-        )[0]
+    def __init__(self, problem: Problem, count: int, rng: np.random.Generator, workers: Workers, progress: bool):
+        self.problem, self._workers, self._progress = problem, workers, progress
         self.solves = np.zeros(count, int)
         self.failed = self.redrawn = 0
-        self._starts, self._guesses = self._begin(count, rng)
-        designs = jnp.asarray(self._starts)
-        self.last = nothing_evaluated(problem, designs, self._guesses)
-        self.best = self.last
+        starts, guesses = self._begin(count, rng)
+        self._starts, self._guesses = starts, jax.tree.map(np.asarray, guesses)
+        self.best = jax.tree.map(np.asarray, nothing_evaluated(problem, jnp.asarray(starts), guesses))
         # Of each search, what is asked of the slacks; of its best, by how much they lack that, and its objective.
-        self.reserves = np.zeros(self.last.slacks.shape)
+        self.reserves = np.zeros((count, self.best.slacks.shape[-1]))
         self.lacking, self.objective = np.full(count, np.inf), np.full(count, np.inf)
         self.outcomes = [Outcome(0, "")] * count
-        self.groups = group_starts(problem, self._guesses)
+        self.groups = group_starts(problem, guesses)
         self.scale = self.tolerance = 1.0
         self._iterations = ITERATIONS
 
@@ -297,100 +300,81 @@ class _Fleet:
         first = np.where(np.any(spare > 0, axis=1), np.argmax(spare > 0, axis=1), np.argmax(spare, axis=1))
         return designs[np.arange(count), first]
 
-    def _spare(self, design: Float[np.ndarray, "n"]) -> float:
-        return float(spare_lengths(self.problem, jnp.asarray(design)[None])[0])
-
     def _solved_cold(self, designs: Float[np.ndarray, "k n"]) -> Equilibrium:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotConvergedWarning)
+        with silenced(NotConvergedWarning):
             scenes = scenes_of(self.problem, jnp.asarray(designs))
             options: dict[str, Any] = dict(segments=self.problem.segments, solver=self.problem.solver)
-            return solve_stack(scenes, **options, strain_limit=None)
+            return solve_stack(scenes, **options, strain_limit=None, threads=self._workers.threads)
 
     def search(self, tolerance: float, iterations: int, reserve: float) -> None:
         """All searches from their starts, with this reserve of each limit."""
         self.reserves[:, self.best.spare.shape[-1] :] = reserve
-        first = self.evaluate({k: Asked(start, False) for k, start in enumerate(self._starts)})
-        usable = [abs(numbers.objective) for numbers in first.values() if numbers.is_valid]
-        self.scale = FIRST_CURVATURE * (usable[0] if usable and usable[0] > 0 else 1.0)
+        first = abs(float(self.problem.objective.of(_row(self._guesses, 0))))
+        self.scale = FIRST_CURVATURE * (first if math.isfinite(first) and first > 0 else 1.0)
         self.tolerance, self._iterations = tolerance / FIRST_CURVATURE, iterations
-        self._run(first, 1.0)
+        self._search(np.arange(len(self._starts)), 1.0)
 
     def finish(self, reserves: dict[int, Float[np.ndarray, "m"]]) -> None:
         """These searches again, from the best they found, with another reserve."""
-        which = list(reserves)
+        which = np.array(list(reserves))
         for k in which:
             self.reserves[k] = reserves[k]
         self.lacking[which] = self.objective[which] = np.inf
-        self._starts[which] = np.asarray(self.best.design)[which]
-        near = np.isin(np.arange(len(self._starts)), which)
-        self._guesses = chosen(jnp.asarray(near), self.best.result, self._guesses)
-        self._run(self.evaluate({k: Asked(self._starts[k], False) for k in which}), REGION)
+        self._starts[which] = self.best.design[which]
+        self._guesses = _with_rows(self._guesses, which, _rows(self.best.result, which))
+        self._search(which, REGION)
 
-    def _run(self, first: dict[int, Numbers], region: float) -> None:
-        def search(k: int) -> Callable[[Callable[[Asked], Numbers]], Outcome]:
-            settings = Settings(self.scale, self.reserves[k], self.tolerance, self._iterations, self.groups, region)
-            return lambda ask: Search(self._starts[k], first[k], settings, ask, self._spare).run()
+    def _search(self, which: Int[np.ndarray, "w"], region: float) -> None:
+        size, count = min(GROUP, len(self._starts)), len(which)
+        targets = Targets(self.scale, self.tolerance, self._iterations, region)
+        firsts = range(0, count, size)
+        is_one = len(firsts) == 1 and self._workers.executor is None
 
-        which = list(first)
-        with tqdm(disable=not self._progress, unit="round") as bar:
+        def part(first: int) -> tuple[Any, ...]:
+            rows = which[rows_of(first, size, count)]
+            starts, guesses, reserves = _rows((self._starts, self._guesses, self.reserves), rows)
+            return self.problem, starts, guesses, reserves, min(size, count - first), targets, self._progress and is_one
 
-            def evaluate(asked: dict[int, Asked]) -> dict[int, Numbers]:
-                bar.update()
-                bar.set_postfix(running=len(asked))
-                found = self.evaluate({which[j]: one for j, one in asked.items()})
-                return {j: found[which[j]] for j in asked}
+        parts = [part(first) for first in firsts]
+        for first, found in zip(firsts, in_order(searched, parts, **self._workers._asdict()), strict=True):
+            self._put(which[first : first + size], found)
 
-            found = Rounds([search(k) for k in which], evaluate).run()
-        for k, outcome in zip(which, found, strict=True):
+    def _put(self, which: Int[np.ndarray, "w"], found: Found) -> None:
+        """What these searches have found; one that has found nothing keeps what it had."""
+        number = np.flatnonzero(np.isfinite(found.lacking[: len(which)]))
+        self.best = _with_rows(self.best, which[number], _rows(found.best, number))
+        self.lacking[which], self.objective[which] = found.lacking[: len(which)], found.objective[: len(which)]
+        self.solves[which] += found.solves[: len(which)]
+        self.failed += found.failed
+        for k, outcome in zip(which, found.outcomes, strict=True):
             self.outcomes[k] = Outcome(self.outcomes[k].iterations + outcome.iterations, outcome.message)
 
     def optimality(self, k: int) -> Optimality:
         """Of the best design of a search, in units of the objective."""
-        slacks, rates = np.asarray(self.best.slacks[k]), np.asarray(self.best.rates[k])
+        slacks, rates = self.best.slacks[k], self.best.rates[k]
         m = len(slacks)
-        return optimality(rates[0], slacks - self.reserves[k], rates[1 : m + 1], np.asarray(self.best.design[k]))
+        return optimality(rates[0], slacks - self.reserves[k], rates[1 : m + 1], self.best.design[k])
 
     def is_optimal(self, gain: float) -> bool:
         # As the searches, to rounding.
         return bool(gain <= self.scale * self.tolerance * (1 + 1e-6))
 
-    def evaluate(self, asked: dict[int, Asked]) -> dict[int, Numbers]:
-        """One design of each search that asked."""
-        count, order = len(asked), np.fromiter(asked, int)
-        accepted = np.zeros(len(self._starts), bool)
-        designs = self._starts.copy()
-        for k, (design, is_accepted) in asked.items():
-            accepted[k], designs[k] = is_accepted, design
-        if np.any(accepted):
-            self._guesses = chosen(jnp.asarray(accepted), self.last.result, self._guesses)
-        order = jnp.asarray(np.pad(order, (0, len(designs) - count), mode="edge"))
-        placed, scenes, guesses = arranged(self.problem, jnp.asarray(designs), self._guesses, order)
-        results = solve_first(scenes, guesses, count, self._options)
-        self.last = evaluated(self.problem, placed, results, self.last, order, jnp.asarray(count))
-        objective, slacks, rates, is_valid = (
-            np.asarray(x) for x in (self.last.objective, self.last.slacks, self.last.rates, self.last.is_valid)
-        )
-        self.solves[list(asked)] += 1
-        self.failed += sum(not is_valid[k] for k in asked)
-        self._keep_best(list(asked), objective, slacks, is_valid)
-        m = slacks.shape[1]
-        return {k: Numbers(float(objective[k]), slacks[k], rates[k, : m + 1], bool(is_valid[k])) for k in asked}
 
-    def _keep_best(
-        self,
-        asked: list[int],
-        objective: Float[np.ndarray, "k"],
-        slacks: Float[np.ndarray, "k m"],
-        is_valid: Bool[np.ndarray, "k"],
-    ) -> None:
-        lacking = np.maximum(np.max(self.reserves - slacks, axis=1, initial=0.0) - KEPT, 0.0)
-        is_better = (lacking < self.lacking) | ((lacking == self.lacking) & (objective < self.objective))
-        is_better &= is_valid & np.isin(np.arange(len(is_valid)), asked)
-        self.lacking = np.where(is_better, lacking, self.lacking)
-        self.objective = np.where(is_better, objective, self.objective)
-        if np.any(is_better):
-            self.best = chosen(jnp.asarray(is_better), self.last, self.best)
+def _rows(stack: T, which: Int[np.ndarray, "w"]) -> T:
+    return jax.tree.map(lambda leaf: leaf[which], stack)
+
+
+def _row(stack: T, k: int) -> T:
+    return jax.tree.map(lambda leaf: jax.device_put(leaf[k]), stack)
+
+
+def _with_rows(stack: T, which: Int[np.ndarray, "w"], rows: T) -> T:
+    def put(all: np.ndarray, new: np.ndarray) -> np.ndarray:
+        all = all.copy()
+        all[which] = new
+        return all
+
+    return jax.tree.map(put, stack, rows)
 
 
 def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
@@ -413,7 +397,7 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
     found = _margins(verified, problem, names)
     feasible = fleet.lacking == 0
     feasible[[k for k in candidates if not kept[k]]] = False
-    at = jax.tree.map(lambda leaf: leaf[best], fleet.best)
+    at = _row(fleet.best, best)
     variables = problem.variables
     scales = np.concatenate([variable.scales() for variable in variables])
     rates = np.asarray(at.rates) / scales[None]
@@ -447,10 +431,8 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
 def _finer(fleet: _Fleet, k: int) -> tuple[Equilibrium, Float[np.ndarray, "g"]]:
     """The best design of a search on a mesh twice as fine, and the least slack of each limit there."""
     problem = fleet.problem
-    here = jax.tree.map(lambda leaf: leaf[k], fleet.best.result)
-    with warnings.catch_warnings():
-        # What did not converge is not kept.
-        warnings.simplefilter("ignore", NotConvergedWarning)
+    here = _row(fleet.best.result, k)
+    with silenced(NotConvergedWarning):  # what did not converge is not kept
         finer = solve(here.scene, segments=2 * problem.segments, guess=here, solver=problem.solver)
     if problem.limits is None:
         return finer, np.zeros(0)

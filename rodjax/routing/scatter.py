@@ -2,8 +2,7 @@
 
 import functools
 import math
-import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,13 +16,15 @@ from rodjax.identification.unknowns import nominal, with_values
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, has_potential, slides
 from rodjax.model.supports import Free
-from rodjax.paths.batch import CHUNKS, LANES, solve_stack
+from rodjax.paths.batch import LANES, chunk_size, solve_stack
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
+from rodjax.programs.tasks import Workers, as_completed, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.warn import silenced
 
 # Of the three-point rule of Gauss & Hermite, in standard deviations.
 STEP = math.sqrt(3.0)
@@ -95,22 +96,33 @@ class Scattering(eqx.Module):
     def slopes(self) -> Slopes:
         return jax.tree.map(np.asarray, _slopes(self))
 
-    def solved(self, zs: Float[np.ndarray, "k p"]) -> Iterator[tuple[Quantities, Bool[np.ndarray, "k"]]]:
-        """Of the rods with these numbers, so many at a time; and which of them are at rest."""
-        size = next((size for size in CHUNKS if len(zs) <= size), CHUNKS[-1])
+    def solved(
+        self, zs: Float[np.ndarray, "k p"], workers: Workers
+    ) -> Iterator[tuple[int, Quantities, Bool[np.ndarray, "k"]]]:
+        """Of the rods with these numbers, so many at a time, in any order: the number of the part, the quantities, and
+        which of its rods are at rest.
+        """
+        size, total = chunk_size(len(zs)), len(zs)
         n = self.equilibrium.s.shape[-1] - 1
         options: dict[str, Any] = {"segments": n, "discretization": self.equilibrium.discretization}
         # A saddle that is kept would be left otherwise.
         options["find"] = "minimum" if bool(self.equilibrium.stable) else "equilibrium"
-        for begin in range(0, len(zs), size):
-            count = min(size, len(zs) - begin)
-            which = begin + np.minimum(np.arange(size), count - 1)
-            with warnings.catch_warnings():
-                # How many did not converge is what the caller is told.
-                warnings.simplefilter("ignore", NotConvergedWarning)
-                rods = solve_stack(_scenes(self, zs[which]), guess=self.equilibrium, strain_limit=None, **options)
-            found = Quantities(*(np.asarray(x)[:count] for x in _quantities(self, rods)))
-            yield found, np.asarray(rods.converged)[:count]
+        parts = ((self, zs[rows_of(first, size, total)], options) for first in range(0, total, size))
+        if workers.executor is None and total <= size:  # no parts, and so by NumPy code at first
+            results: Iterable[tuple[int, Any]] = enumerate(_solved_part(*part) for part in parts)
+        else:
+            results = as_completed(_solved_part, parts, **workers._asdict())
+        for number, part in results:
+            yield number, *jax.tree.map(lambda x, k=number: x[: total - k * size], part)
+
+
+def _solved_part(
+    scattering: Scattering, zs: Float[np.ndarray, "k p"], options: dict[str, Any]
+) -> tuple[Quantities, Bool[np.ndarray, "k"]]:
+    # How many did not converge is what the caller is told.
+    with silenced(NotConvergedWarning):
+        rods = solve_stack(_scenes(scattering, zs), guess=scattering.equilibrium, strain_limit=None, **options)
+    return jax.tree.map(np.asarray, (_quantities(scattering, rods), rods.converged))
 
 
 @compiled
@@ -150,16 +162,17 @@ def by_derivatives(slopes: Slopes) -> Moments:
 
 
 def by_samples(
-    scattering: Scattering, here: Quantities, zs: Float[np.ndarray, "k p"]
+    scattering: Scattering, here: Quantities, zs: Float[np.ndarray, "k p"], workers: Workers
 ) -> tuple[Moments, Float[np.ndarray, "c m"]]:
     """Of a Monte Carlo, and the values of its c rods that are at rest."""
-    parts, values = [], []
-    for found, converged in scattering.solved(zs):
+    parts = {}
+    for number, found, converged in scattering.solved(zs, workers):
         changes = Quantities(*(x[converged] - x0[None] for x, x0 in zip(found, here, strict=True)))
-        parts.append(Moments.sums(changes))
-        values.append(found.values[converged])
+        parts[number] = Moments.sums(changes), found.values[converged]
+    # Sums in the order of the parts, so that roundings do not depend on which was done first.
+    sums_of, values = zip(*(parts[number] for number in sorted(parts)), strict=True)
     count = sum(map(len, values))
-    sums = jax.tree.map(lambda *x: functools.reduce(np.add, x), *parts)
+    sums = jax.tree.map(lambda *x: functools.reduce(np.add, x), *sums_of)
     mean = Quantities(*(x / max(count, 1) for x in sums.shift))
     last = max(count - 1, 1)
     squares = [np.einsum("nc,nd->ncd", x, x) for x in (mean.nodes, mean.forces)]
@@ -171,7 +184,7 @@ def by_samples(
     return moments, np.concatenate(values)
 
 
-def by_few(scattering: Scattering, slopes: Slopes) -> tuple[Moments, Moments, int]:
+def by_few(scattering: Scattering, slopes: Slopes, workers: Workers) -> tuple[Moments, Moments, int]:
     """By the three-point rule along each of the p normal numbers, as if each acted alone; of the values also along the
     direction in which each grows most; and how many of the rods are not at rest, in whose stead is the first order.
     """
@@ -180,9 +193,10 @@ def by_few(scattering: Scattering, slopes: Slopes) -> tuple[Moments, Moments, in
     sizes = np.linalg.norm(steepest, axis=1, keepdims=True)
     ways = np.concatenate([np.eye(p), steepest / np.where(sizes > 0, sizes, 1.0)])
     signed = np.concatenate([STEP * ways, -STEP * ways])
-    chunks = list(scattering.solved(signed))
-    converged = np.concatenate([converged for _, converged in chunks])
-    rods = Quantities(*(np.concatenate(x) for x in zip(*(found for found, _ in chunks), strict=True)))
+    chunks = {number: part for number, *part in scattering.solved(signed, workers)}
+    founds, at_rest = zip(*(chunks[number] for number in sorted(chunks)), strict=True)
+    converged = np.concatenate(at_rest)
+    rods = Quantities(*(np.concatenate(x) for x in zip(*founds, strict=True)))
     # Without rods at rest on both sides nothing is known beyond the first order.
     is_known = np.all(converged.reshape(2, -1), axis=0)
     changes = []

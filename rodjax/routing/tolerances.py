@@ -9,6 +9,7 @@ and its numbers come first.
 import dataclasses
 import math
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from rodjax.checks import Numbers, instance, is_known, leaf, number_array, posit
 from rodjax.identification.unknowns import Unknown, known_names, target
 from rodjax.model.scene import Scene
 from rodjax.programs.answers import one_answer
+from rodjax.programs.tasks import Workers, checked_executor, checked_threads
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples
@@ -186,6 +188,8 @@ def tolerances(
     names: Any = None,
     samples: int | None = None,
     seed: int = 0,
+    executor: Executor | None = None,
+    threads: int | None = None,
 ) -> Envelope:
     """How an equilibrium scatters where numbers of its scene do, normally and independently of one another.
 
@@ -198,6 +202,10 @@ def tolerances(
     - `samples`: solves of a Monte Carlo, warm from the equilibrium, besides the first order; `None`: a few solves that
         tell whether the first order is enough, and where it is not, 2000 samples; 0: the few solves alone.
     - `seed`: of the random numbers.
+    - `executor`: what solves the samples, anything with the interface of `concurrent.futures.Executor`, such as
+        `client.get_executor()` of Dask; `None`: threads of this process.
+    - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
+        result.
 
     Flagged are quantities whose standard deviation by the solves differs by more than 5 % from that of the first order,
     or whose mean is off by more than a tenth of it, both beyond what so few samples may be off by (two standard
@@ -206,6 +214,7 @@ def tolerances(
 
     Raises `ValueError` or `TypeError` for names that the scene has not, and for arguments that make no sense.
     """
+    workers = Workers(checked_executor(executor), checked_threads(threads))
     instance(equilibrium, "equilibrium", Equilibrium)
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call tolerances outside jax.jit and vmap")
@@ -226,7 +235,7 @@ def tolerances(
     scattering = Scattering(equilibrium, keys, leaf(root.astype(equilibrium.s.dtype)), limits, obstacles)
     # Of values that are not finite, as the bend radius of a straight rod, nothing is said but that.
     with np.errstate(invalid="ignore"):
-        return _envelope(scattering, tolerances, owners, kept, samples, rng)
+        return _envelope(scattering, tolerances, owners, kept, samples, rng, workers)
 
 
 def _envelope(
@@ -236,6 +245,7 @@ def _envelope(
     kept: Margins | None,
     samples: int | None,
     rng: np.random.Generator,
+    workers: Workers,
 ) -> Envelope:
     slopes = scattering.slopes()
     first = by_derivatives(slopes)
@@ -254,11 +264,11 @@ def _envelope(
                 flags.setdefault(name, told)
 
     if not samples:
-        *few, unsolved = by_few(scattering, slopes)
+        *few, unsolved = by_few(scattering, slopes, workers)
         flag(unsolved, few, 0)
     if samples or (samples is None and _is_in_doubt(flags)):
         samples = samples or SAMPLES
-        second, rods = by_samples(scattering, slopes.here, rng.standard_normal((samples, p)))
+        second, rods = by_samples(scattering, slopes.here, rng.standard_normal((samples, p)), workers)
         count = len(rods)
         flag(samples - count, [second] if count else [], count)
         is_broken = _broken(rods, kept)

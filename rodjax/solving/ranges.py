@@ -16,11 +16,15 @@ from jaxtyping import Bool, Float
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
 from rodjax.discretization.cells import segments_for_jumps
 from rodjax.model.along import Along, Smooth, Steps
+from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
 from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene
 from rodjax.model.supports import Clamp, Free
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
+
+# The obstacles whose numbers are looked at in all scenes at once; others, and unions of them, are made anew.
+CHECKED = (Plane, Sphere, Capsule, Cylinder, Pipe, Box)
 
 
 def check_ranges(scenes: Scene) -> None:
@@ -36,13 +40,22 @@ def check_ranges(scenes: Scene) -> None:
     parts = jax.tree.leaves(_checked_when_made(scenes))
     first = (0,) * len(shape)
     if shape and all(np.all(leaf == leaf[first]) for leaf in parts):
-        with np.errstate(all="ignore"):
-            is_suspect = np.asarray(_is_wrong(scenes) | _is_misplaced(scenes))
+        is_suspect = suspects(scenes)
         # What is the same in all of them is looked at in the first.
         is_suspect[first] |= bool(parts)
     for case in np.argwhere(is_suspect):
         name = f"scenes{''.join(f'[{k}]' for k in case)}" if shape else "scene"
         _made(jax.tree.map(lambda leaf, case=case: leaf[tuple(case)], scenes), name)
+
+
+def suspects(scenes: Scene) -> Bool[np.ndarray, "..."]:
+    """Which of stacked scenes may have numbers that making them would have refused; those of obstacles of one's own,
+    and of what varies along a rod, are not looked at.
+    """
+    with np.errstate(all="ignore"):
+        wrong = [_is_wrong_obstacle(obstacle, scenes) for obstacle in scenes.obstacles]
+        wrong = [np.asarray(_is_wrong(scenes)), _is_misplaced(scenes), *wrong]
+    return np.any(np.stack(wrong), axis=0)
 
 
 def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
@@ -88,7 +101,8 @@ def _parameters(kind: type) -> Mapping[str, inspect.Parameter]:
 
 def _checked_when_made(scenes: Scene) -> Any:
     """The parts of scenes that only their making can check."""
-    return [value for value in _values_of(scenes.rod) if isinstance(value, Along)], scenes.obstacles
+    others = [obstacle for obstacle in scenes.obstacles if not isinstance(obstacle, CHECKED)]
+    return [value for value in _values_of(scenes.rod) if isinstance(value, Along)], others
 
 
 def _values_of(rod: Rod) -> list[Any]:
@@ -125,6 +139,21 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
             good += [_each(xp.diff(value.s) > 0, scenes), xp.abs(value.s[..., 0]) <= ARCLENGTH_TOLERANCE * length]
             good.append(xp.abs(value.s[..., -1] - length) <= ARCLENGTH_TOLERANCE * length)
     return ~functools.reduce(operator.and_, good)
+
+
+def _is_wrong_obstacle(obstacle: Any, scenes: Scene) -> Bool[np.ndarray, "..."]:
+    wrong: Any = np.zeros(scenes.rod.length.shape, bool)
+    if isinstance(obstacle, Union):
+        return functools.reduce(operator.or_, (_is_wrong_obstacle(part, scenes) for part in obstacle.obstacles), wrong)
+    if isinstance(obstacle, Sphere | Capsule | Cylinder | Pipe):
+        wrong = ~(obstacle.radius > 0)
+    if isinstance(obstacle, Capsule | Cylinder):
+        wrong |= np.all(obstacle.start == obstacle.end, axis=-1)
+    if isinstance(obstacle, Box):
+        wrong = ~np.all(obstacle.size > 0, axis=-1)
+        if obstacle.frame is not None:
+            wrong |= ~np.asarray(_each(_is_rotation(obstacle.frame), scenes))
+    return wrong
 
 
 def _each(holds: Bool[Numbers, "..."], scenes: Scene) -> Bool[Numbers, "..."]:

@@ -20,10 +20,11 @@ need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the 
 `total_twist`, `start_force`, `start_moment`, `end_force`, `end_moment`, `nodes` (cases, segments + 1, 3), as in
 `rodjax.Equilibrium`, `segments` of the mesh of each case (its `nodes` are those that the coarsest mesh has), and
 `parameters/<key>` in SI units; each has the attributes `units` and `description`. Attributes of the file: the texts
-`scene` and `over`, and what is in `rodjax.sweep.sweep.Manifest`, with its `fingerprint`.
+`scene` and `over`, and what is in `rodjax.sweeps.manifest.Manifest`, with its `fingerprint`.
 
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
-solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result. Chunks are the same whatever
-the shard and wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and
-the same bits in the end.
+solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result; and a file with `.lock`, by
+which a second process is told that one is at work. Chunks are the same whatever the shard, whoever solves them and
+wherever a run was stopped, and the last one is filled up with its last case: one compiled program, and the same bits in
+the end.
 """

@@ -43,7 +43,7 @@ class Scene(eqx.Module):
         earlier equilibrium as a guess carries the turns of each span.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
-    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
+    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, at
         the nodes of the mesh, where it touches them to rounding. Of a mesh that is chosen for a tolerance elements lie
         no deeper than 1e-4 of the radius between their nodes either, as far as finer ones help. Bent over an edge, or
         on a mesh that is given, the rod may lie deeper there: `rodjax.describe` says so, and `rodjax.clearance` tells
@@ -342,6 +342,18 @@ def has_node_places(scene: Scene) -> bool:
     force in each element, are unknowns: beside obstacles, and of rods by frames under loads without a potential.
     """
     return bool(scene.obstacles) or (needs_frames(scene) and not has_potential(scene))
+
+
+def has_friction(scene: Scene) -> bool:
+    """Whether an obstacle has friction, so that an equilibrium depends on how the rod came there."""
+    return any(obstacle.friction is not None for obstacle in scene.obstacles)
+
+
+def check_without_friction(scene: Scene, name: str) -> None:
+    """Raises `ValueError` where what `name` does has no path along which friction could act."""
+    for k, obstacle in enumerate(scene.obstacles):
+        if obstacle.friction is not None:
+            raise ValueError(f"obstacles[{k}].friction must be 0 in {name}: friction acts along a path only, solve_path")
 
 
 def _follows(end: Support) -> bool:

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
-from rodjax.model.scene import Scene, has_node_places, slides
+from rodjax.model.scene import Scene, has_friction, has_node_places, slides
 from rodjax.paths.path import path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -131,8 +131,8 @@ def solve_stack(
     strain_limit = checked_strain_limit(strain_limit)
 
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
-        # A path has one guess, for its first scene.
-        begin = guess if last is None or last.s.ndim > 2 else last
+        # A path has one guess, for its first scene; a step with friction is one from the guess.
+        begin = guess if last is None or last.s.ndim > 2 or has_friction(given) else last
         return _in_chunks(given, begin, strain_limit, options, mesh, progress)
 
     result = with_ranges(given, refined_together(solve, options, rtol))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
-from rodjax.model.scene import Scene, between, has_node_places, has_potential, nondimensional, slides
+from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional, slides
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -186,7 +186,11 @@ def _solve_path(
         found, substeps = _step(last, before, scene, options, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        return (_Station(scene, found.state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
+        state = found.state
+        if has_friction(scenes):
+            converged = is_converged(found.outcome.status)
+            state = jax.tree.map(lambda new, old: jnp.where(converged, new, old), state.as_memory(), state)
+        return (_Station(scene, state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
     assert first.last is not None
@@ -245,7 +249,9 @@ def _step(
         first = FirstTwist(progress.total_twist, progress.last._replace(shape=progress.reached.shape))
         found = solve_from(here, progress.begin, first, options)
         converged = is_converged(found.outcome.status)
-        reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
+        reached = jax.tree.map(
+            lambda new, old: jnp.where(converged, new, old), found.state.as_memory(), progress.reached
+        )
         is_smallest = progress.share <= 0.5**MAX_SPLITS
         return _Progress(
             reached=reached,

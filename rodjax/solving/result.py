@@ -38,7 +38,7 @@ from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
 from rodjax.discretization.nodal import NodalForm
-from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
@@ -88,7 +88,8 @@ class SolverState(eqx.Module):
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it;
-    `pressures`: of each obstacle on each node.
+    `pressures`: of each obstacle on each node; `friction`: where obstacles have some, with the memory from which this
+    was found: what begins here has that of `as_memory`.
     """
 
     shape: Shape
@@ -98,6 +99,14 @@ class SolverState(eqx.Module):
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
     pressures: Float[Array, "... k n+1"] | None = None
+    friction: Friction | None = None
+
+    def as_memory(self) -> "SolverState":
+        """As what the next step of a path begins from: slips are counted from here."""
+        if self.friction is None:
+            return self
+        nodes = self.units.origin[None] + self.units.length * self.shape.nodes
+        return dataclasses.replace(self, friction=dataclasses.replace(self.friction, reference=nodes))
 
     def point(self, total_twist: Float[Array, ""]) -> Any:
         """The unknowns of the form of one equilibrium."""
@@ -105,7 +114,7 @@ class SolverState(eqx.Module):
         if self.pressures is None:
             return point
         relaxed = jnp.zeros_like(self.pressures[:, 0])
-        return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed))
+        return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed, self.friction))
 
 
 class Equilibrium(eqx.Module):
@@ -512,7 +521,7 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
     form, point = form_of(scaled, state.shape), state.point(equilibrium.total_twist)
-    return form, form.begun(point, state.shape.nodes, state.pressures)
+    return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
 def describe(equilibrium: Equilibrium) -> str:

@@ -1,0 +1,41 @@
+"""Coulomb friction at the nodes: slips s, and the tangential forces q of f obstacles, no longer than mu p.
+
+As of pressures and gaps, either the slip is zero or the force is as long as its bound, and against the slip:
+q = -mu p s/|s|. So q is what q - W s is where that is cut to the bound, whatever the weight W.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rodjax.geometry.vectors import root
+
+# A slip counts as so much of a force in EI/L^2, as gaps do, when it is asked whether a search has ended.
+SLIP_WEIGHT = 1e4
+# A node that went less far than this along an obstacle has not slipped [L].
+LEAST_SLIP = 1e-12
+
+
+def tangential(
+    vectors: Float[Array, "#f n+1 3"], normals: Float[Array, "f n+1 3"]
+) -> Float[Array, "f n+1 3"]:
+    """What of vectors is along the surfaces."""
+    return vectors - normals * jnp.sum(vectors * normals, axis=-1, keepdims=True)
+
+
+def pulled(
+    forces: Float[Array, "f n+1 3"], ways: Float[Array, "n+1 3"], normals: Float[Array, "f n+1 3"]
+) -> tuple[Float[Array, "f n+1 3"], Float[Array, "f n+1 3"]]:
+    """What would hold nodes where they were, q - W s, without bounds; and the slips."""
+    slips = tangential(ways[None], normals)
+    return tangential(forces, normals) - SLIP_WEIGHT * slips, slips
+
+
+def directions(exerted: Float[Array, "f n+1 3"], slips: Float[Array, "f n+1 3"]) -> Float[Array, "f n+1 3"]:
+    """Of friction: that of `exerted`, which is against the slips, with the derivatives of -s/|s|; zero without slip."""
+    has_slipped = jnp.sum(jax.lax.stop_gradient(slips) ** 2, axis=-1, keepdims=True) > LEAST_SLIP**2
+    lengths = [root(jnp.sum(jax.lax.stop_gradient(vectors) ** 2, axis=-1, keepdims=True)) for vectors in (exerted, slips)]
+    ratio = lengths[0] / jnp.where(has_slipped, lengths[1], 1.0)
+    against = exerted - ratio * (slips - jax.lax.stop_gradient(slips))
+    against = jnp.where(has_slipped, against, 1.0)
+    return jnp.where(has_slipped, against / root(jnp.sum(against**2, axis=-1, keepdims=True)), 0.0)

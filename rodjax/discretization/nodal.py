@@ -127,7 +127,20 @@ class NodalForm(Form):
         nodal = point.nodal
         if others is None:
             return nodal
-        return nodal.with_contact_forces(nodal.places + others.displacements, nodal.contact_forces + others.pressures)
+        moved = nodal.with_contact_forces(nodal.places + others.displacements, nodal.contact_forces + others.pressures)
+        return moved if nodal.friction is None else self._on_surfaces(nodal, others, moved)
+
+    def _on_surfaces(self, nodal: Nodal, others: NodalChange, moved: Nodal) -> Nodal:
+        """With nodes that press on obstacles as far from them as their tangent planes have it: these go along them.
+
+        A taut cable slides over a cylinder in whole steps so; along straight lines it would gain length.
+        """
+        gaps, normals = self.gaps_and_normals(nodal.places)
+        beyond, there = self.gaps_and_normals(moved.places)
+        beyond -= gaps + jnp.einsum("knc,nc->kn", normals, others.displacements)
+        pushes = (moved.pressures > 0) & ~self.is_held[None]
+        places = moved.places - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
+        return dataclasses.replace(moved, places=places)
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""

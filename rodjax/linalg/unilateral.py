@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.chain import ChainSystem, factor_chain
+from rodjax.linalg.chain import ChainSystem, ContactRows, factor_chain
 
 # The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at
 # a time; with each softness the first so many are followed by whole steps; steps of each line search.
@@ -84,10 +84,13 @@ class Unilateral(eqx.Module):
         of_friction = parts * (jnp.sum(of_tangential**2, axis=1) - along**2)
         return jnp.sum(jnp.where(normal > 0, of_normal, 0.0) * of_normal) + jnp.sum(of_friction)
 
-    def slipping(self, trial: Float[Array, "r n+1"], softness: Float[Array, ""]) -> tuple[Array, Array] | None:
+    def slipping(
+        self, trial: Float[Array, "r n+1"], contacts: ContactRows, softness: Float[Array, ""]
+    ) -> tuple[Array, Array] | None:
         """The stiffness at the nodes of what slips there, and the forces there that do not depend on the motion."""
         if self.bounds is None:
             return None
+        along = contacts.normals[len(self.gaps) - 3 * len(self.bounds) :].reshape(-1, 3, *contacts.normals.shape[1:])
         _, tangential = self._parted(trial)
         _, begin = self._parted(self.pressures - self.gaps / softness)
         directions, parts = self._slipping(tangential)
@@ -95,7 +98,8 @@ class Unilateral(eqx.Module):
         turning = jnp.where(slips[:, None], _across(directions) * parts[:, None, None], 0.0)
         force = jnp.where(slips, self.bounds[:, None] * directions, 0.0)
         force += jnp.einsum("fcdn,fdn->fcn", turning, begin)
-        return jnp.sum(turning, axis=0).transpose(2, 0, 1) / softness, jnp.sum(force, axis=0).T
+        stiffness = jnp.einsum("fcna,fcdn,fdnb->nab", along, turning / softness, along)
+        return stiffness, jnp.einsum("fcna,fcn->na", along, force)
 
     def turned(self, trial: Float[Array, "r n+1"], other: Float[Array, "r n+1"]) -> Bool[Array, ""]:
         """Whether a slip has another direction in one trial than in another."""
@@ -175,7 +179,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     def solved(is_closed: Bool[Array, "r n+1"], trial: Float[Array, "r n+1"], softness: Float[Array, ""]):
         here = eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
         pushed = here.contacts.pushed(jnp.where(is_closed, contacts.pressures, 0.0))
-        slipping = contacts.slipping(trial, softness)
+        slipping = contacts.slipping(trial, here.contacts, softness)
         if slipping is not None:
             here = eqx.tree_at(lambda system: system.stiffness, here, here.stiffness + slipping[0])
             pushed += slipping[1]

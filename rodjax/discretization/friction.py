@@ -16,9 +16,7 @@ SLIP_WEIGHT = 1e4
 LEAST_SLIP = 1e-12
 
 
-def tangential(
-    vectors: Float[Array, "#f n+1 3"], normals: Float[Array, "f n+1 3"]
-) -> Float[Array, "f n+1 3"]:
+def tangential(vectors: Float[Array, "#f n+1 3"], normals: Float[Array, "f n+1 3"]) -> Float[Array, "f n+1 3"]:
     """What of vectors is along the surfaces."""
     return vectors - normals * jnp.sum(vectors * normals, axis=-1, keepdims=True)
 
@@ -33,9 +31,12 @@ def pulled(
 
 def directions(exerted: Float[Array, "f n+1 3"], slips: Float[Array, "f n+1 3"]) -> Float[Array, "f n+1 3"]:
     """Of friction: that of `exerted`, which is against the slips, with the derivatives of -s/|s|; zero without slip."""
-    has_slipped = jnp.sum(jax.lax.stop_gradient(slips) ** 2, axis=-1, keepdims=True) > LEAST_SLIP**2
-    lengths = [root(jnp.sum(jax.lax.stop_gradient(vectors) ** 2, axis=-1, keepdims=True)) for vectors in (exerted, slips)]
-    ratio = lengths[0] / jnp.where(has_slipped, lengths[1], 1.0)
-    against = exerted - ratio * (slips - jax.lax.stop_gradient(slips))
-    against = jnp.where(has_slipped, against, 1.0)
-    return jnp.where(has_slipped, against / root(jnp.sum(against**2, axis=-1, keepdims=True)), 0.0)
+    fixed = jax.lax.stop_gradient(slips)
+    has_slipped = lengths(fixed) > LEAST_SLIP
+    ratio = jax.lax.stop_gradient(lengths(exerted)) / jnp.where(has_slipped, lengths(fixed), 1.0)
+    against = jnp.where(has_slipped, exerted - ratio * (slips - fixed), 1.0)
+    return jnp.where(has_slipped, against / lengths(against), 0.0)
+
+
+def lengths(vectors: Float[Array, "f n+1 3"]) -> Float[Array, "f n+1 1"]:
+    return root(jnp.sum(vectors**2, axis=-1, keepdims=True))

@@ -29,14 +29,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
-from rodjax.discretization.friction import LEAST_SLIP, directions, pulled, tangential
+from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.vectors import dot, root
+from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, clipped, minimized
@@ -60,6 +60,8 @@ DEEPER = 0.125
 LOOKED_AT = (0.25, 0.5, 0.75)
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
+# What a contact does.
+OPEN, STICKS, SLIPS = 0, 1, 2
 # A node lies on an obstacle where its gap is below this [L].
 LIES_ON = 1e-9
 # A start touches where its gap is below this part of the radius.
@@ -302,8 +304,8 @@ class NodalForm(Form):
         assert nodal.friction is not None
         exerted, slips = pulled(nodal.friction.forces, ways, normals[np.array(self.rough)])
         bounds = self.bounds(nodal.pressures, nodal.friction)
-        has_slipped = root(jnp.sum(slips**2, axis=-1)) > LEAST_SLIP
-        return (bounds > 0) & ((root(jnp.sum(exerted**2, axis=-1)) < bounds) | ~has_slipped)
+        has_slipped = lengths(slips)[..., 0] > LEAST_SLIP
+        return (bounds > 0) & ((lengths(exerted)[..., 0] < bounds) | ~has_slipped)
 
     def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
         """The contacts of the model of a step from a point, to gaps and ways."""
@@ -340,7 +342,7 @@ class NodalForm(Form):
         # Of a gap and a pressure one is zero, none is negative.
         weighted = GAP_WEIGHT * gaps
         amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
-        if nodal.friction is not None:
+        if nodal.friction is not None and contacts.ways is not None:
             normals = contacts.rows.normals[np.array(self.rough)]
             exerted, slips = pulled(nodal.friction.forces, contacts.ways, normals)
             allowed = clipped(jnp.swapaxes(exerted, 1, 2), self.bounds(pressures, nodal.friction))
@@ -356,6 +358,20 @@ class NodalForm(Form):
         return jnp.diff(point.nodal.places, axis=0) - ways
 
     # --- friction ----------------------------------------------------------------------------------------------------
+
+    def exerted(self, point: Any) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1 3"], Int[Array, "k n+1"]]:
+        """What each obstacle does at each node: push, drag, and whether it is not touched, sticks or slips."""
+        nodal = point.nodal
+        _, normals = self.distances_and_normals(nodal.places)
+        pushes = nodal.pressures[..., None] * normals
+        states = jnp.where(nodal.pressures > 0, SLIPS, OPEN)
+        if nodal.friction is None:
+            return pushes, jnp.zeros_like(pushes), states
+        rough = np.array(self.rough)
+        drags, _ = self._friction_at(nodal)
+        sticks = self.sticks(nodal, normals, self.travelled(nodal.places, nodal.friction))
+        states = states.at[rough].set(jnp.where(sticks, STICKS, states[rough]))
+        return pushes, jnp.zeros_like(pushes).at[rough].set(drags), states
 
     def by_law(self, point: Any) -> Any:
         """The point with the tangential forces of what slips as pressures, places and scene make them."""
@@ -401,9 +417,7 @@ class NodalForm(Form):
         free = jnp.where(self.is_held, 0.0, 1.0).astype(forces.dtype)[:, None]
         pushes = contacts.normals.at[rough].add(dragging * free[None])
         rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.places.shape) * free[None]
-        rows = ContactRows(
-            jnp.concatenate([contacts.normals[:k], rows]), contacts.softness, contacts.is_closed, pushes
-        )
+        rows = ContactRows(jnp.concatenate([contacts.normals[:k], rows]), contacts.softness, contacts.is_closed, pushes)
         stiffness = system.stiffness - free[..., None] * jnp.einsum("dfnc->ncd", forces)
         return dataclasses.replace(system, contacts=rows, stiffness=stiffness)
 
@@ -488,7 +502,7 @@ class NodalForm(Form):
             return is_better
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before
-        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        distance = jnp.sqrt(jnp.sum(ways**2, axis=1))
         radius = self.radius
         rim = jnp.concatenate([radius, *[least(radius[:-1], radius[1:])] * len(LOOKED_AT)])
 
@@ -504,17 +518,17 @@ class NodalForm(Form):
 
         def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             gone, _, count = state
-            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
+            parts = jnp.minimum(gone / jnp.where(distance > 0, distance, 1.0), 1.0)
             gaps = distances(before + parts[:, None] * ways) - bound
             return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
 
         def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
             gone, is_blocked, count = state
-            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
+            return is_better & jnp.any(gone < distance) & ~is_blocked & (count < MOST_LOOKS)
 
-        begin = ahead(jnp.zeros_like(lengths), first - bound), jnp.array(False), jnp.zeros((), int)
+        begin = ahead(jnp.zeros_like(distance), first - bound), jnp.array(False), jnp.zeros((), int)
         gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
-        return is_better & ~is_blocked & jnp.all(gone >= lengths)
+        return is_better & ~is_blocked & jnp.all(gone >= distance)
 
     def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
         nodes, slopes = point.nodal.places, point.tangents[:, ::2].T

@@ -16,7 +16,7 @@ Coulomb friction with bounds that are given stays within that: with s the slip, 
     q(u) = q0 - (s + P u)/softness, no longer than its bound
 
 of the energy softness |q|^2/2, and beyond the bound one that is linear in |q0 - (s + P u)/softness|: convex as well.
-A contact that sticks is one of three closed rows, P; that of one that slips is in the stiffness, as its direction turns.
+A contact that sticks is three closed rows, P; what one that slips does as it turns is in the stiffness of its node.
 """
 
 import equinox as eqx
@@ -121,6 +121,7 @@ class Unilateral(eqx.Module):
 
     def _slipping(self, tangential: Float[Array, "f 3 n+1"]) -> tuple[Array, Array]:
         """Directions, zero for what sticks; and bounds as parts of what would be exerted, at most 1."""
+        assert self.bounds is not None
         lengths = _lengths(tangential)
         slips = lengths >= self.bounds
         safe = jnp.where(lengths > 0, lengths, 1.0)

@@ -40,7 +40,8 @@ AT_ONCE = 2**16
 
 def coefficient(friction: Any) -> Float[Array, ""] | None:
     """A coefficient of friction as an obstacle stores it: `None` for the plain number 0."""
-    if friction is None or (isinstance(friction, int | float) and friction == 0):
+    is_plain = isinstance(friction, int | float | np.ndarray | np.generic) and not isinstance(friction, bool)
+    if friction is None or (is_plain and np.ndim(friction) == 0 and friction == 0):
         return None
     return leaf(not_negative(friction, "friction"))
 

@@ -537,9 +537,7 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
             before = _before(scene, guess)
             pressures = _pressures(scene, options, state)
             friction = _friction(scene, guess.nodes, state)
-            state = dataclasses.replace(
-                state, clip_moments=None, before=before, pressures=pressures, friction=friction
-            )
+            state = dataclasses.replace(state, clip_moments=None, before=before, pressures=pressures, friction=friction)
             return state, first
     return _first_state(scene, guess, options)
 
@@ -869,6 +867,4 @@ def _in_units(state: SolverState, units: Units) -> SolverState:
     if friction is not None:
         forces = friction.forces * (state.units.force / units.force)
         friction = dataclasses.replace(friction, forces=forces)
-    return SolverState(
-        shape, force, units, state.places, before=state.before, pressures=pressures, friction=friction
-    )
+    return SolverState(shape, force, units, state.places, before=state.before, pressures=pressures, friction=friction)

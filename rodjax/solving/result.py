@@ -37,7 +37,7 @@ from rodjax.discretization.framed_results import (
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import SLIPS, STICKS, NodalForm
 from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import cubic
@@ -137,8 +137,11 @@ class Equilibrium(eqx.Module):
       when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
       just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
-      n+1, 3] N: what each of them does; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to
-      each obstacle, negative within it. Computed when asked for
+      n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
+      part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
+      not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
+      friction; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to each obstacle, negative
+      within it. Computed when asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
       whose largest |axial_strain| is above the `strain_limit` of the solve
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
@@ -210,11 +213,19 @@ class Equilibrium(eqx.Module):
 
     @property
     def obstacle_forces(self) -> Float[Array, "... obstacles n+1 3"]:
-        return _contacts(self)[0]
+        return _contacts(self).forces
+
+    @property
+    def friction_forces(self) -> Float[Array, "... obstacles n+1 3"]:
+        return _contacts(self).friction
+
+    @property
+    def contact_states(self) -> Int[Array, "... obstacles n+1"]:
+        return _contacts(self).states
 
     @property
     def gaps(self) -> Float[Array, "... obstacles n+1"]:
-        return _contacts(self)[1]
+        return _contacts(self).gaps
 
     @property
     def clip_moments(self) -> Float[Array, "... clips 3"]:
@@ -462,22 +473,33 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 
 
-def _contacts(equilibrium: Equilibrium) -> tuple[Float[Array, "... k n+1 3"], Float[Array, "... k n+1"]]:
-    """The forces of each obstacle on the nodes, and their gaps."""
+class _Contacts(eqx.Module):
+    """Of each obstacle with each node, as the properties of `Equilibrium`."""
+
+    forces: Float[Array, "... k n+1 3"]
+    friction: Float[Array, "... k n+1 3"]
+    states: Int[Array, "... k n+1"]
+    gaps: Float[Array, "... k n+1"]
+
+
+def _contacts(equilibrium: Equilibrium) -> _Contacts:
     if equilibrium.scene.obstacles:
         return _contacts_of(equilibrium)
     shape = *equilibrium.s.shape[:-1], 0, equilibrium.s.shape[-1]
-    return jnp.zeros((*shape, 3), equilibrium.s.dtype), jnp.zeros(shape, equilibrium.s.dtype)
+    nothing = jnp.zeros(shape, equilibrium.s.dtype)
+    none = jnp.zeros((*shape, 3), equilibrium.s.dtype)
+    return _Contacts(none, none, jnp.zeros(shape, int), nothing)
 
 
 @over_leading_axes
-def _contacts_of(equilibrium: Equilibrium) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1"]]:
+def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     units = equilibrium.state.units
-    distances, normals = form.distances_and_normals(point.nodal.places)
-    forces = point.nodal.pressures[..., None] * normals
-    return forces * units.force, (distances - form.radius[None]) * units.length
+    distances, _ = form.distances_and_normals(point.nodal.places)
+    pushes, drags, states = form.exerted(point)
+    gaps = (distances - form.radius[None]) * units.length
+    return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
 
 @over_leading_axes
@@ -571,15 +593,27 @@ def _contacts_told(equilibrium: Equilibrium) -> list[str]:
     told = []
     if not equilibrium.scene.obstacles or not bool(equilibrium.converged):
         return told
-    s = np.asarray(equilibrium.s)
-    for k, forces in enumerate(np.asarray(equilibrium.obstacle_forces)):
+    s, contacts = np.asarray(equilibrium.s), jax.tree.map(np.asarray, _contacts(equilibrium))
+    for k, forces in enumerate(contacts.forces - contacts.friction):
         touched = s[np.linalg.norm(forces, axis=-1) > 0]
         if touched.size:
             first, last = float(touched[0]), float(touched[-1])
             where = f"at s = {first:.4g} m" if first == last else f"between s = {first:.4g} and {last:.4g} m"
             kind = type(equilibrium.scene.obstacles[k]).__name__
-            told.append(f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}")
+            pushes = f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}"
+            told.append(pushes + _friction_told(equilibrium, contacts, k))
     return told
+
+
+def _friction_told(equilibrium: Equilibrium, contacts: _Contacts, k: int) -> str:
+    if equilibrium.scene.obstacles[k].friction is None:
+        return ""
+    friction = equilibrium.state.friction
+    if friction is None or np.any(np.isnan(friction.reference)):
+        return ", without friction as from rest"
+    drag = np.linalg.norm(contacts.friction[k].sum(0))
+    sticks, slips = (int(np.sum(contacts.states[k] == state)) for state in (STICKS, SLIPS))
+    return f", drags with {drag:.4g} N, sticks at {sticks} nodes and slips at {slips}"
 
 
 def _errors_told(equilibrium: Equilibrium) -> list[str]:

@@ -25,7 +25,7 @@ from rodjax.checks import file_path, whole_number
 from rodjax.io.files import FIELDS
 from rodjax.io.scene_file import SceneFile
 from rodjax.io.scene_keys import unit_of
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, check_without_friction
 from rodjax.paths.batch import solve_batch
 from rodjax.programs.answers import numpy_first
 from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS, solve
@@ -239,6 +239,10 @@ def sweep(
     except (TypeError, ValueError) as error:
         raise SweepError(str(error)) from None
     reader = CaseReader(file_path(scene, "scene"), file_path(over, "over"))
+    try:
+        check_without_friction(reader.first.scenes[0], "a sweep")
+    except ValueError as error:
+        raise SweepError(f"{scene}: {error}") from None
     parts = output.with_name(output.name + ".parts")
     if resume and chunk is None:
         chunk = _earlier_chunk(output, parts)

@@ -29,6 +29,12 @@ def pulled(
     return tangential(forces, normals) - SLIP_WEIGHT * slips, slips
 
 
+def within(forces: Float[Array, "f n+1 3"], bounds: Float[Array, "f n+1"]) -> Float[Array, "f n+1 3"]:
+    """Forces cut to their bounds."""
+    sizes, bounds = lengths(forces), bounds[..., None]
+    return forces * jnp.where(sizes > bounds, bounds / jnp.where(sizes > 0, sizes, 1.0), 1.0)
+
+
 def directions(exerted: Float[Array, "f n+1 3"], slips: Float[Array, "f n+1 3"]) -> Float[Array, "f n+1 3"]:
     """Of friction: that of `exerted`, which is against the slips, with the derivatives of -s/|s|; zero without slip."""
     fixed = jax.lax.stop_gradient(slips)

@@ -32,14 +32,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
-from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential
+from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential, within
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows
 from rodjax.linalg.saddle_point import AnySystem
-from rodjax.linalg.unilateral import Unilateral, clipped, minimized
+from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.obstacles import InUnits, Obstacle, least
@@ -345,9 +345,9 @@ class NodalForm(Form):
         if nodal.friction is not None and contacts.ways is not None:
             normals = contacts.rows.normals[np.array(self.rough)]
             exerted, slips = pulled(nodal.friction.forces, contacts.ways, normals)
-            allowed = clipped(jnp.swapaxes(exerted, 1, 2), self.bounds(pressures, nodal.friction))
-            held = tangential(nodal.friction.forces, normals)
-            off = jnp.max(jnp.abs(jnp.swapaxes(held, 1, 2) - allowed))
+            off = tangential(nodal.friction.forces, normals)
+            off -= within(exerted, self.bounds(pressures, nodal.friction))
+            off = jnp.max(jnp.abs(off))
             amiss = jnp.where(off > amiss, off, amiss)
             gaps = jnp.concatenate([gaps, jnp.swapaxes(slips, 1, 2).reshape(-1, gaps.shape[1])])
         rows = -jnp.where(contacts.rows.is_closed, gaps, forces)
@@ -369,6 +369,8 @@ class NodalForm(Form):
             return pushes, jnp.zeros_like(pushes), states
         rough = np.array(self.rough)
         drags, _ = self._friction_at(nodal)
+        # What sticks may be beyond its bound by what the search has left.
+        drags = within(drags, self.bounds(nodal.pressures, nodal.friction))
         sticks = self.sticks(nodal, normals, self.travelled(nodal.places, nodal.friction))
         states = states.at[rough].set(jnp.where(sticks, STICKS, states[rough]))
         return pushes, jnp.zeros_like(pushes).at[rough].set(drags), states

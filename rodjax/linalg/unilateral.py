@@ -54,7 +54,7 @@ class Unilateral(eqx.Module):
         if self.bounds is None:
             return jnp.where(trial > 0, trial, 0.0)
         normal, tangential = self._parted(trial)
-        return self._joined(jnp.where(normal > 0, normal, 0.0), clipped(tangential, self.bounds))
+        return self._joined(jnp.where(normal > 0, normal, 0.0), _clipped(tangential, self.bounds))
 
     def is_closed(self, trial: Float[Array, "r n+1"]) -> Bool[Array, "r n+1"]:
         """Whether a contact closes, or sticks."""
@@ -129,7 +129,7 @@ class Unilateral(eqx.Module):
         return directions, jnp.where(slips, self.bounds / safe, 1.0)
 
 
-def clipped(forces: Float[Array, "f 3 n+1"], bounds: Float[Array, "f n+1"]) -> Float[Array, "f 3 n+1"]:
+def _clipped(forces: Float[Array, "f 3 n+1"], bounds: Float[Array, "f n+1"]) -> Float[Array, "f 3 n+1"]:
     """No longer than their bounds."""
     lengths = _lengths(forces)
     return forces * jnp.where(lengths > bounds, bounds / jnp.where(lengths > 0, lengths, 1.0), 1.0)[:, None]
@@ -204,7 +204,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         softness = state.softness
         is_minimum, x, y = solved(state.is_closed, state.trial, softness)
         # Without symmetry there is no model that could be least.
-        is_early = (state.since < WHOLE_STEPS) | (system.loads is not None)
+        is_early = (state.since < WHOLE_STEPS) | (system.loads is not None and contacts.bounds is None)
         dx, dy = x - state.x, y - state.y
         _, _, du, _ = open_system.parted(dy)
         # The model along the way from the last iterate to this one: the rows of border and elements hold at both.

@@ -198,6 +198,7 @@ def test_capstan():
     np.testing.assert_allclose(pulls[3:], math.exp(-MU * math.pi), rtol=2e-4)
 
 
+@pytest.mark.slow
 def test_capstan_of_a_stiff_cable():
     pulls = pulled((0, 0.002, 0.004), stiffness=1e-4, segments=96)
     # A node of 96 may lie half an element off where the cable leaves the cylinder.
@@ -235,7 +236,7 @@ def step_from(last: rj.Equilibrium, p: jax.Array) -> rj.Equilibrium:
 
 @pytest.mark.slow
 def test_the_coupled_system_is_the_derivative_of_what_is_out_of_balance(last):
-    """By the places of nodes, what sticks and slips on curved obstacles, and by the pressures that friction goes with."""
+    """By the places of nodes that stick and slip on a cylinder and a floor, and by the pressures that bound friction."""
     form, point = form_and_point(step_from(last, NOMINAL))
     _, _, states = form.exerted(point)
     assert {*np.asarray(states[0])} == {0, 1, 2}
@@ -331,14 +332,12 @@ def test_a_finer_mesh_has_the_same_memory():
     for result in (step, chosen):
         assert result.converged
         check_cone(result)
-        np.testing.assert_allclose(
-            result.start_force[0], same.start_force[0], rtol=0, atol=MU * WEIGHT * H
-        )
+        np.testing.assert_allclose(result.start_force[0], same.start_force[0], rtol=0, atol=MU * WEIGHT * H)
     assert len(chosen.s) > len(there.s)
 
 
 def test_files_keep_friction(there_and_back, tmp_path):
-    ways, path = there_and_back
+    _, path = there_and_back
     rj.save(path, tmp_path / "drawn.vtkhdf")
     again = rj.load(tmp_path / "drawn.vtkhdf")
     assert jax.tree.structure(again) == jax.tree.structure(path)
@@ -387,6 +386,15 @@ def test_no_friction_is_no_term():
             "obstacles[0].friction must be 0 within a Union",
         ),
         (lambda: rj.follow([on_floor(), on_floor(-0.1)]), "needs scenes without obstacles"),
+        (
+            lambda: rj.solve_path(
+                [
+                    on_floor(),
+                    dataclasses.replace(on_floor(), obstacles=[rj.Plane((0, 0, -0.1), (0, 0, 1), friction=MU)]),
+                ]
+            ),
+            "obstacles[0] must stay the same along a path, as it has friction",
+        ),
         (
             lambda: rj.route(on_floor(), []),
             "obstacles[0].friction must be 0 in a route",

@@ -7,7 +7,8 @@ With u the motion of the nodes, a contact of the pressure p0 and the gap g has i
 and the energy softness p(u)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
 Each step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate.
 The first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model
-itself, so that the method cannot cycle; under loads without a potential, where the model has no value, all are whole.
+itself, so that the method cannot cycle; under loads without a potential, where the model has no value, all are whole
+without friction, and with it the slope of a model of the same symmetric part is looked for along the line.
 It ends where a whole step closes and opens no contact. Where many contacts close or open, it would advance by one or
 two at a time: then much softer contacts are sought first, and from these harder ones.
 

@@ -51,7 +51,8 @@ class Obstacle(eqx.Module):
 
     `friction`: Coulomb's coefficient mu >= 0 between it and a rod, by keyword, of every obstacle: the tangential force
     at a contact is at most mu times its pressure. The plain number 0, the default, is stored as `None`: no term at all.
-    `rodjax.solve_path` says how friction acts; where only distances are looked at, it does nothing.
+    It acts at the centerline, without a couple; `rodjax.solve_path` says how. Where only distances are looked at, as in
+    clearances, it has no meaning.
     """
 
     friction: Float[Array, ""] | None = eqx.field(default=None, kw_only=True, converter=coefficient)

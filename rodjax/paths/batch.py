@@ -21,7 +21,7 @@ from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.model.scene import Scene, has_friction, has_node_places, slides
-from rodjax.paths.path import path_from, stack_scenes
+from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import (
@@ -78,7 +78,7 @@ def solve_batch(
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
         one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps.
-    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each.
+    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each, from which friction acts.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `progress`: show a progress bar.
@@ -127,6 +127,8 @@ def solve_stack(
     count = given.rod.length.shape[0]
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
+    if given.rod.length.ndim == 2:
+        check_still(given, axis=1)
     options, rtol = checked_options(given, guess=guess, **settings)
     strain_limit = checked_strain_limit(strain_limit)
 

@@ -170,6 +170,11 @@ def solve(
     - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
         beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
 
+    Friction of obstacles has a memory (`rodjax.solve_path`): where the guess is an `Equilibrium`, the solve is one step
+    from there, and slips are counted from its nodes, in global axes, on another mesh from the same places of the rod.
+    Else it is from rest, as if all obstacles were without friction. `stable` and `index` speak of motions with the
+    pressures that bound friction held.
+
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
     """

@@ -236,7 +236,7 @@ def step_from(last: rj.Equilibrium, p: jax.Array) -> rj.Equilibrium:
 
 @pytest.mark.slow
 def test_the_coupled_system_is_the_derivative_of_what_is_out_of_balance(last):
-    """By the places of nodes that stick and slip on a cylinder and a floor, and by the pressures that bound friction."""
+    """By the places of nodes that stick and slip on a cylinder and a floor, and by pressures that bound friction."""
     form, point = form_and_point(step_from(last, NOMINAL))
     _, _, states = form.exerted(point)
     assert {*np.asarray(states[0])} == {0, 1, 2}
@@ -355,6 +355,30 @@ def test_files_keep_friction(there_and_back, tmp_path):
 
 
 # --- what a scene lacks, and bad input -------------------------------------------------------------------------------
+
+
+SCENE_FILE = """
+rod = {{ length = "1 m", EI = "0.01 N m^2", GJ = "0.008 N m^2", EA = "100 N", radius = "5 mm" }}
+start = {{ support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0] }}
+end = {{ support = "free" }}
+obstacles = [{{ kind = "plane", point = "[0, 0, -5] mm", normal = [0, 0, 1], friction = {friction} }}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("friction", "message"),
+    [("-0.1", "obstacles[0].friction must not be negative"), ('"0.3 m"', "obstacles[0].friction")],
+)
+def test_scene_files_say_what_friction_may_be(friction, message, tmp_path):
+    path = tmp_path / "floor.toml"
+    path.write_text(SCENE_FILE.format(friction=0.3))
+    assert float(rj.read_scene(path).obstacles[0].friction) == 0.3
+    path.write_text(SCENE_FILE.format(friction=0))
+    assert rj.read_scene(path).obstacles[0].friction is None
+    path.write_text(SCENE_FILE.format(friction=friction))
+    with pytest.raises(ValueError, match="floor") as caught:
+        rj.read_scene(path)
+    assert message in str(caught.value)
 
 
 class Own(rj.Obstacle):

@@ -1,9 +1,10 @@
-"""Contact: heavy cables let down on pegs, and random cold scenes with one to three obstacles.
+"""Contact: heavy cables let down on pegs, random cold scenes with one to three obstacles, and friction.
 
     python experiments/contact.py [scenes]
 
 Prints how many converge, iterations, and what becomes of the rest; of the pegs also milliseconds of a warm step beside
-those of the same rod far from all pegs (medians of 21, compiled).
+those of the same rod far from all pegs (medians of 21, compiled). Of friction the pull of a taut cable half around a
+cylinder beside exp(mu pi), and of one that is drawn a little over a floor, and back, beside its closed form.
 """
 
 import sys
@@ -100,9 +101,59 @@ def cold(count: int, segments: int = 48) -> None:
     )
 
 
+def capstan(friction: float = 0.3, segments: int = 160, stiffness: float = 1e-6) -> None:
+    """A cable half around a cylinder, 1 N on one end, the other drawn out and back."""
+    around, half = 0.1, (1 - np.pi * 0.1) / 2
+    cylinder = rj.Cylinder((around, -1, 0), (around, 1, 0), around - 0.002, friction=friction)
+    rod = rj.Rod(1.0, stiffness, stiffness, 1e4, radius=0.002)
+    s = np.linspace(0, 1, 401)
+    angle = np.pi - np.clip(s - half, 0, np.pi * around) / around
+    x = np.stack([around + around * np.cos(angle), 0 * s, around * np.sin(angle)], axis=1)
+    x[:, 2] += np.minimum(s - half, 0) - np.maximum(s - half - np.pi * around, 0)
+    result, pulls, iterations = rj.Guess(x), [], []
+    for drawn in (0, *np.arange(1, 8), 6, 5):
+        ends = rj.Pin((0, 0, -half - 0.002 * drawn)), rj.Free(force=(0, 0, -1.0))
+        scene = rj.Scene(rod, *ends, obstacles=[cylinder])
+        result = rj.solve(scene, segments=segments, guess=result, strain_limit=None)
+        pulls.append(float(np.linalg.norm(result.start_force)) if result.converged else np.nan)
+        iterations.append(int(result.iterations))
+    out, back = np.array(pulls[1:8]) * np.exp(-friction * np.pi), np.array(pulls[8:]) * np.exp(friction * np.pi)
+    print(
+        f"capstan, mu = {friction}, {segments} elements: pull over exp(mu pi) - 1: {np.min(out) - 1:.1e} to "
+        f"{np.max(out) - 1:.1e}, back over exp(-mu pi) - 1: {np.min(back) - 1:.1e} to {np.max(back) - 1:.1e}; "
+        f"iterations median {np.median(iterations[1:]):g}, most {max(iterations[1:])}"
+    )
+
+
+def dragged(friction: float = 0.3, segments: int = 64) -> None:
+    """A cable of 1 N on a floor, its end drawn by 0.2 mm and back: where EA = 100 N most of it sticks."""
+    floor, rod = (
+        rj.Plane((0, 0, -RADIUS), (0, 0, 1), friction=friction),
+        rj.Rod(1.0, 0.01, 0.008, 100.0, 0.1, radius=RADIUS),
+    )
+    way, stiffness, first = 2e-4, 100.0 * friction, friction / segments / 2
+    ways = np.concatenate([np.linspace(0, way, 5), np.linspace(way, 0, 5)[1:]])
+    scenes = [
+        rj.Scene(rod, rj.Swivel((-x, 0, 0), (1, 0, 0)), rj.Free(), (0, 0, -10.0), obstacles=[floor]) for x in ways
+    ]
+    path = rj.solve_path(scenes, segments=segments, guess=rj.Guess([(0, 0, 0), (1, 0, 0)]))
+    pull, most = np.asarray(path.start_force)[:, 0], np.sqrt(2 * stiffness * way)
+    expected = np.sqrt(2 * stiffness * ways[:5]) - first, most - 2 * np.sqrt(stiffness * (way - ways[5:])) + first
+    off = np.max(np.abs(pull - np.concatenate(expected))[1:])
+    states = np.asarray(path.contact_states)[:, 0]
+    print(
+        f"drawn over a floor and back, {segments} elements: {np.sum(path.converged)} of {len(ways)} converged, "
+        f"iterations most {np.max(path.iterations)}; pull at most {off:.1e} N off, {off * segments / friction:.2f} of "
+        f"what a node holds; nodes that slip {[int(np.sum(state == 2)) for state in states[1:]]}"
+    )
+
+
 if __name__ == "__main__":
     set_up()
     warnings.simplefilter("ignore")
+    capstan()
+    capstan(friction=0.8)
+    dragged()
     let_down()
     warm()
     cold(int(sys.argv[1]) if len(sys.argv) > 1 else 150)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
-from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.potentials import OnElements
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
@@ -34,7 +34,7 @@ class Linearization(eqx.Module):
 
     `gradient`: by the rotations; `closure`: by F, what the rod lacks of the span, before it a zero for the torque;
     `residual`: largest force left on a node; `energy`: L, without the work of a dead moment; `gaps`: of contacts,
-    which `energy` leaves out.
+    which `energy` leaves out; `ways`: of the nodes since the last equilibrium, where there is friction.
     """
 
     bases: Float[Array, "3 b n"]
@@ -44,6 +44,7 @@ class Linearization(eqx.Module):
     energy: Float[Array, ""]
     residual: Float[Array, ""]
     gaps: Float[Array, "k n+1"] | None = None
+    ways: Float[Array, "n+1 3"] | None = None
 
 
 class Point(Protocol):
@@ -167,6 +168,10 @@ class Form(eqx.Module):
         factors, rotation, multipliers = found
         return factors.is_minimum, rotation, multipliers
 
+    def coupled(self, point: Any, system: AnySystem) -> AnySystem:
+        """The system of a linearisation with what makes it the derivative of `unbalanced`, if that has no symmetry."""
+        return system
+
     def unbalanced(self, point: Any) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         """The gradient and the closure of the linearisation alone."""
         here = self.linearized(point)
@@ -218,8 +223,14 @@ class Form(eqx.Module):
         """Nodes along the edges, at held places to the last digit."""
         return nodes_along(self.scene, self.field.s, self.clip_nodes, edges)
 
-    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
-        """The point with what it has beside obstacles, of nodes and pressures."""
+    def begun(
+        self,
+        point: Any,
+        nodes: Float[Array, "n+1 3"],
+        pressures: Float[Array, "k n+1"] | None,
+        friction: Friction | None,
+    ) -> Any:
+        """The point with what it has beside obstacles, of nodes, pressures and friction."""
         return point
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:

@@ -6,9 +6,13 @@ unknowns of their own: so what acts on an element depends on what is local, the 
 Newton's method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
 
 No node is nearer to an obstacle than the rod is thick: gap g >= 0. The pressure p >= 0 [a force, for each obstacle and
-node] is the multiplier of that, without friction:
+node] is the multiplier of that:
 
     L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
+
+With friction the multiplier of the slip s, what a node has gone along the obstacle since the last equilibrium, is the
+tangential force q, |q| <= mu p. In the model of a step the bound has the pressure as it is, so that the model has a
+minimum and is symmetric; both agree in the end. `friction` has what friction is as a function of places and pressures.
 
 A step is the minimum of a model, L to second order with each gap to first: every node stays on its side of the
 tangent plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which
@@ -25,12 +29,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization import potentials
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
+from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential, within
 from rodjax.discretization.layout import SpanForces
-from rodjax.discretization.nodal_point import Nodal, NodalChange
+from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import NodeEnergy, OnElements
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
@@ -39,7 +44,7 @@ from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
-from rodjax.model.obstacles import least
+from rodjax.model.obstacles import InUnits, Obstacle, least
 from rodjax.model.supports import Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
@@ -60,6 +65,8 @@ THIN = 0.5
 LOOKED_AT = tuple(k / 8 for k in range(1, 8))
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
+# What a contact does.
+OPEN, STICKS, SLIPS = 0, 1, 2
 # A node lies on an obstacle where its gap is below this [L].
 LIES_ON = 1e-9
 # A start touches where its gap is below this part of the radius.
@@ -67,11 +74,14 @@ TOUCHES = 1e-3
 
 
 class Contacts(NamedTuple):
-    """At a point: gaps, their gradients, and the second derivatives of what L has of them by the places of nodes."""
+    """At a point: gaps, their gradients with those of slips below, and the second derivatives of what L has of gaps by
+    the places of nodes; with friction the ways of nodes since the last equilibrium.
+    """
 
     gaps: Float[Array, "k n+1"]
     rows: ContactRows
     stiffness: Float[Array, "n+1 3 3"]
+    ways: Float[Array, "n+1 3"] | None
 
 
 class NodalForm(Form):
@@ -118,18 +128,30 @@ class NodalForm(Form):
         return super().is_closed(self.closure(closure), tolerance)
 
     def others(self, multipliers: Float[Array, "k"]) -> NodalChange:
-        nodes, obstacles = len(self.field.s), len(self.scene.obstacles)
+        nodes, rows = len(self.field.s), len(self.scene.obstacles) + 3 * len(self.rough)
         pressures, displacements = jnp.split(
-            multipliers[-3 * (2 * nodes - 1) - obstacles * nodes : -3 * (nodes - 1)], [obstacles * nodes]
+            multipliers[-3 * (2 * nodes - 1) - rows * nodes : -3 * (nodes - 1)], [rows * nodes]
         )
-        return NodalChange(displacements.reshape(nodes, 3), pressures.reshape(obstacles, nodes))
+        return NodalChange(displacements.reshape(nodes, 3), pressures.reshape(rows, nodes))
 
     def nodal_moved(self, point: Any, others: NodalChange | None) -> Nodal:
         nodal = point.nodal
         if others is None:
             return nodal
-        places, pressures = nodal.places + others.displacements, nodal.pressures + others.pressures
-        return Nodal(places, pressures, nodal.relaxed)
+        moved = nodal.with_contact_forces(nodal.places + others.displacements, nodal.contact_forces + others.pressures)
+        return moved if nodal.friction is None else self._on_surfaces(nodal, others, moved)
+
+    def _on_surfaces(self, nodal: Nodal, others: NodalChange, moved: Nodal) -> Nodal:
+        """With nodes that press on obstacles as far from them as their tangent planes have it: these go along them.
+
+        A taut cable slides over a cylinder in whole steps so; along straight lines it would gain length.
+        """
+        gaps, normals = self.gaps_and_normals(nodal.places)
+        beyond, there = self.gaps_and_normals(moved.places)
+        beyond -= gaps + jnp.einsum("knc,nc->kn", normals, others.displacements)
+        pushes = (moved.pressures > 0) & ~self.is_held[None]
+        places = moved.places - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
+        return dataclasses.replace(moved, places=places)
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
@@ -139,6 +161,10 @@ class NodalForm(Form):
     def accepted(self, point: Any, here: Linearization) -> Any:
         assert here.gaps is not None
         nodal = dataclasses.replace(point.nodal, relaxed=self.led_out(here.gaps))
+        if nodal.friction is not None:
+            assert isinstance(here.system, ChainSystem)
+            forces = tangential(nodal.friction.forces, here.system.contacts.normals[np.array(self.rough)])
+            nodal = dataclasses.replace(nodal, friction=dataclasses.replace(nodal.friction, forces=forces))
         return dataclasses.replace(point, nodal=nodal)
 
     def nodal_held(self, nodal: Nodal | None) -> Nodal | None:
@@ -147,10 +173,18 @@ class NodalForm(Form):
         positions, held = self.held_places
         return dataclasses.replace(nodal, places=nodal.places.at[held].set(positions.T))
 
-    def begun(self, point: Any, nodes: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"] | None) -> Any:
+    def begun(
+        self,
+        point: Any,
+        nodes: Float[Array, "n+1 3"],
+        pressures: Float[Array, "k n+1"] | None,
+        friction: Friction | None,
+    ) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
         nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
-        nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0]))
+        if self.rough and friction is None:
+            friction = Friction.from_rest(len(self.rough), nodes)
+        nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0], friction if self.rough else None))
         assert nodal is not None
         point = dataclasses.replace(point, nodal=nodal)
         if point.end_force.shape[1] != len(nodes) - 1:
@@ -265,14 +299,69 @@ class NodalForm(Form):
         distances, normals = self.distances_and_normals(places)
         return jnp.where(self.is_held[None], 1.0, distances - self.radius[None]), normals
 
+    @property
+    def rough(self) -> tuple[int, ...]:
+        """The numbers of the obstacles with friction."""
+        return tuple(k for k, obstacle in enumerate(self.scene.obstacles) if _friction(obstacle) is not None)
+
+    def travelled(self, places: Float[Array, "n+1 3"], friction: Friction) -> Float[Array, "n+1 3"]:
+        """Of the nodes since the last equilibrium; none from rest, and of nodes that are held."""
+        (obstacle, *_) = self.scene.obstacles
+        assert isinstance(obstacle, InUnits)
+        is_still = jnp.isnan(friction.reference) | self.is_held[:, None]
+        before = (jnp.where(is_still, 0.0, friction.reference) - obstacle.origin[None]) / obstacle.length
+        return jnp.where(is_still, 0.0, places - before)
+
+    def bounds(self, pressures: Float[Array, "k n+1"], friction: Friction) -> Float[Array, "f n+1"]:
+        """Of the tangential forces; 0 from rest."""
+        coefficients = jnp.stack([_friction(self.scene.obstacles[k]) for k in self.rough])
+        is_still = jnp.isnan(friction.reference[:, 0]) | self.is_held
+        pressures = pressures[np.array(self.rough)]
+        return jnp.where(is_still[None] | (pressures < 0), 0.0, coefficients[:, None] * pressures)
+
     def contacts(self, point: Any) -> Contacts:
         nodal = point.nodal
         gaps, normals = self.gaps_and_normals(nodal.places)
         is_free = jnp.where(self.is_held, 0.0, 1.0).astype(normals.dtype)[:, None]
-        is_closed = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None])
-        rows = ContactRows(normals * is_free[None], self.softness, is_closed)
+        normals *= is_free[None]
+        is_closed, ways = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]), None
+        if nodal.friction is not None:
+            ways = self.travelled(nodal.places, nodal.friction)
+            sticks = self.sticks(nodal, normals, ways)
+            is_closed = jnp.concatenate([is_closed, jnp.repeat(sticks, 3, axis=0)])
+            normals = jnp.concatenate([normals, self._across(normals)])
+        rows = ContactRows(normals, self.softness, is_closed)
         curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures)
-        return Contacts(gaps, rows, curving)
+        return Contacts(gaps, rows, curving, ways)
+
+    def _across(self, normals: Float[Array, "k n+1 3"]) -> Float[Array, "3f n+1 3"]:
+        """The gradients of slips, the rows of projections on tangent planes."""
+        normals = normals[np.array(self.rough)]
+        identity = jnp.eye(3, dtype=normals.dtype)[None, None]
+        projections = identity - normals[..., :, None] * normals[..., None, :]
+        projections = jnp.where(self.is_held[None, :, None, None], 0.0, projections)
+        return jnp.swapaxes(projections, 1, 2).reshape(-1, *normals.shape[1:])
+
+    def sticks(
+        self, nodal: Nodal, normals: Float[Array, "k n+1 3"], ways: Float[Array, "n+1 3"]
+    ) -> Bool[Array, "f n+1"]:
+        """Whether contacts with friction stick: nodes that have not slipped, and where less than the bound holds."""
+        assert nodal.friction is not None
+        exerted, slips = pulled(nodal.friction.forces, ways, normals[np.array(self.rough)])
+        bounds = self.bounds(nodal.pressures, nodal.friction)
+        has_slipped = lengths(slips)[..., 0] > LEAST_SLIP
+        return (bounds > 0) & ((lengths(exerted)[..., 0] < bounds) | ~has_slipped)
+
+    def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
+        """The contacts of the model of a step from a point, to gaps and ways."""
+        nodal = point.nodal
+        gaps = gaps + nodal.relaxed[:, None]
+        if nodal.friction is None or ways is None:
+            return Unilateral(gaps, nodal.pressures)
+        _, normals = self.gaps_and_normals(nodal.places)
+        slips = jnp.einsum("knc,nc->kn", self._across(normals), ways)
+        bounds = self.bounds(nodal.pressures, nodal.friction)
+        return Unilateral(jnp.concatenate([gaps, slips]), nodal.contact_forces, bounds)
 
     def _curving(self, places: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3 3"]:
         """Second derivatives of what L has of the contacts, by the places of the nodes."""
@@ -291,27 +380,101 @@ class NodalForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        pressures = point.nodal.pressures
-        balance = self.applied(point).T - contacts.rows.pushed(pressures)
+        nodal, gaps = point.nodal, contacts.gaps
+        pressures, forces = nodal.pressures, nodal.contact_forces
+        balance = self.applied(point).T - contacts.rows.pushed(forces)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
-        rows = -jnp.where(contacts.rows.is_closed, contacts.gaps, pressures)
         # Of a gap and a pressure one is zero, none is negative.
-        weighted = GAP_WEIGHT * contacts.gaps
+        weighted = GAP_WEIGHT * gaps
         amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
+        if nodal.friction is not None and contacts.ways is not None:
+            normals = contacts.rows.normals[np.array(self.rough)]
+            exerted, slips = pulled(nodal.friction.forces, contacts.ways, normals)
+            off = tangential(nodal.friction.forces, normals)
+            off -= within(exerted, self.bounds(pressures, nodal.friction))
+            off = jnp.max(jnp.abs(off))
+            amiss = jnp.where(off > amiss, off, amiss)
+            gaps = jnp.concatenate([gaps, jnp.swapaxes(slips, 1, 2).reshape(-1, gaps.shape[1])])
+        rows = -jnp.where(contacts.rows.is_closed, gaps, forces)
         return rows.reshape(-1), balance, amiss
 
     def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """What the elements lack of the ways between their nodes."""
         return jnp.diff(point.nodal.places, axis=0) - ways
 
+    # --- friction ----------------------------------------------------------------------------------------------------
+
+    def exerted(self, point: Any) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1 3"], Int[Array, "k n+1"]]:
+        """What each obstacle does at each node: push, drag, and whether it is not touched, sticks or slips."""
+        nodal = point.nodal
+        _, normals = self.distances_and_normals(nodal.places)
+        pushes = nodal.pressures[..., None] * normals
+        states = jnp.where(nodal.pressures > 0, SLIPS, OPEN)
+        if nodal.friction is None:
+            return pushes, jnp.zeros_like(pushes), states
+        rough = np.array(self.rough)
+        drags, _ = self._friction_at(nodal)
+        # What sticks may be beyond its bound by what the search has left.
+        drags = within(drags, self.bounds(nodal.pressures, nodal.friction))
+        sticks = self.sticks(nodal, normals, self.travelled(nodal.places, nodal.friction))
+        states = states.at[rough].set(jnp.where(sticks, STICKS, states[rough]))
+        return pushes, jnp.zeros_like(pushes).at[rough].set(drags), states
+
+    def by_law(self, point: Any) -> Any:
+        """The point with the tangential forces of what slips as pressures, places and scene make them."""
+        if point.nodal is None or point.nodal.friction is None:
+            return point
+        forces, _ = self._friction_at(point.nodal)
+        friction = dataclasses.replace(point.nodal.friction, forces=forces)
+        return dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, friction=friction))
+
+    def _friction_at(self, nodal: Nodal) -> tuple[Float[Array, "f n+1 3"], Float[Array, "f n+1 3"]]:
+        """Tangential forces, and slips. What slips and what sticks, and the forces of the latter, are those given."""
+        friction = nodal.friction
+        assert friction is not None
+        _, normals = self.gaps_and_normals(nodal.places)
+        normals, bounds = normals[np.array(self.rough)], self.bounds(nodal.pressures, friction)
+        ways = self.travelled(nodal.places, friction)
+        held, slips = tangential(friction.forces, normals), tangential(ways[None], normals)
+        exerted, _ = jax.lax.stop_gradient(pulled(friction.forces, ways, normals))
+        sticks = jax.lax.stop_gradient(self.sticks(nodal, self.gaps_and_normals(nodal.places)[1], ways))
+        return jnp.where(sticks[..., None], held, bounds[..., None] * directions(exerted, slips)), slips
+
+    def coupled(self, point: Any, system: AnySystem) -> AnySystem:
+        """With friction as it depends on pressures and places, without symmetry."""
+        nodal = point.nodal
+        if nodal is None or nodal.friction is None:
+            return system
+        assert isinstance(system, ChainSystem)
+        rough, contacts = np.array(self.rough), system.contacts
+        k = len(nodal.pressures)
+
+        def friction_at(places: Array, pressures: Array) -> tuple[Array, Array]:
+            return self._friction_at(dataclasses.replace(nodal, places=places, pressures=pressures))
+
+        def by_places(axis: Float[Array, "3"]) -> tuple[Array, Array]:
+            turned = jnp.broadcast_to(axis[None], nodal.places.shape)
+            return jax.jvp(lambda places: friction_at(places, nodal.pressures), (nodal.places,), (turned,))[1]
+
+        def by_pressures(pressures: Array) -> Array:
+            return friction_at(nodal.places, pressures)[0]
+
+        forces, slips = jax.vmap(by_places)(jnp.eye(3, dtype=nodal.places.dtype))  # [direction, f, node, component]
+        _, dragging = jax.jvp(by_pressures, (nodal.pressures,), (jnp.ones_like(nodal.pressures),))
+        free = jnp.where(self.is_held, 0.0, 1.0).astype(forces.dtype)[:, None]
+        pushes = contacts.normals.at[rough].add(dragging * free[None])
+        rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.places.shape) * free[None]
+        rows = ContactRows(jnp.concatenate([contacts.normals[:k], rows]), contacts.softness, contacts.is_closed, pushes)
+        stiffness = system.stiffness - free[..., None] * jnp.einsum("dfnc->ncd", forces)
+        return dataclasses.replace(system, contacts=rows, stiffness=stiffness)
+
     # --- the search --------------------------------------------------------------------------------------------------
 
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
         """L with the contacts as of the model, with the pressures of a point."""
         assert here.gaps is not None
-        softness = self.softness
-        pressures = point.nodal.pressures - (here.gaps + point.nodal.relaxed[:, None]) / softness
-        return here.energy + softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+        softness, model = self.softness, self.model(point, here.gaps, here.ways)
+        return here.energy + softness / 2 * model.energy(model.pressures - model.gaps / softness)
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -325,13 +488,22 @@ class NodalForm(Form):
         assert here.gaps is not None
         nodal = point.nodal
         first, _, balance, gaps = system.parted(-here.closure)
-        balance -= system.contacts.pushed(nodal.pressures)  # which the model has
-        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(nodal.pressures), balance, gaps)])
+        forces = nodal.contact_forces
+        balance -= system.contacts.pushed(forces)  # which the model has
+        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(forces), balance, gaps)])
         if not self.scene.obstacles:
             return super().sought(here, point, system, push)
-        contacts = Unilateral(here.gaps + nodal.relaxed[:, None], nodal.pressures)
+        contacts = self.model(point, here.gaps, here.ways)
         # What lies on an obstacle without pressure is more likely to press on it than to leave it.
-        system = system.closed_where(system.contacts.is_closed | (contacts.gaps < LIES_ON))
+        is_closed = system.contacts.is_closed
+        if nodal.friction is None:
+            is_closed |= contacts.gaps < LIES_ON
+        else:
+            k = len(here.gaps)
+            # What slips, and by how much, is a matter of the model.
+            sticks = contacts.is_closed(contacts.pressures - contacts.gaps / self.softness)[k:]
+            is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
+        system = system.closed_where(is_closed)
         found = minimized(system, push - here.gradient, c, contacts)
         return found.is_minimum, found.x, found.y
 
@@ -364,9 +536,9 @@ class NodalForm(Form):
         )
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        contacts, nodal = here.system.contacts, point.nodal
-        seen = nodal.pressures - (here.gaps + nodal.relaxed[:, None]) / self.softness
-        rate -= jnp.sum(jnp.where(seen > 0, seen, 0.0) * contacts.rates(others.displacements))
+        model = self.model(point, here.gaps, here.ways)
+        pushing = model.allowed(model.pressures - model.gaps / self.softness)
+        rate -= jnp.sum(pushing * here.system.contacts.rates(others.displacements))
         if self.scene.potentials:
             by_place = potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
             rate += jnp.sum(by_place * others.displacements)
@@ -380,7 +552,7 @@ class NodalForm(Form):
             return is_better
         before, after = self._looked_at(point), self._looked_at(trial)
         ways = after - before
-        lengths = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        distance = jnp.sqrt(jnp.sum(ways**2, axis=1))
         radius = self.radius
         rim = jnp.concatenate([radius, *[least(radius[:-1], radius[1:])] * len(LOOKED_AT)])
 
@@ -398,8 +570,8 @@ class NodalForm(Form):
                 def nearest(place: Float[Array, "3"]) -> Float[Array, ""]:
                     return least(*(obstacle.at(place) for obstacle in self.scene.obstacles))
 
-                distance, normal = jax.value_and_grad(nearest)(place)
-                return nearest(place - (distance + rim) * normal) > -THIN * rim
+                depth, normal = jax.value_and_grad(nearest)(place)
+                return nearest(place - (depth + rim) * normal) > -THIN * rim
 
             return jax.lax.cond(
                 jnp.any(is_near), lambda: jnp.any(is_near & jax.vmap(is_thin)(after, rim)), lambda: jnp.array(False)
@@ -411,17 +583,17 @@ class NodalForm(Form):
 
         def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             gone, _, count = state
-            parts = jnp.minimum(gone / jnp.where(lengths > 0, lengths, 1.0), 1.0)
+            parts = jnp.minimum(gone / jnp.where(distance > 0, distance, 1.0), 1.0)
             gaps = distances(before + parts[:, None] * ways) - bound
             return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
 
         def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
             gone, is_blocked, count = state
-            return is_better & jnp.any(gone < lengths) & ~is_blocked & (count < MOST_LOOKS)
+            return is_better & jnp.any(gone < distance) & ~is_blocked & (count < MOST_LOOKS)
 
-        begin = ahead(jnp.zeros_like(lengths), first - bound), pierces(), jnp.zeros((), int)
+        begin = ahead(jnp.zeros_like(distance), first - bound), pierces(), jnp.zeros((), int)
         gone, is_blocked, _ = jax.lax.while_loop(goes_on, looked, begin)
-        return is_better & ~is_blocked & jnp.all(gone >= lengths)
+        return is_better & ~is_blocked & jnp.all(gone >= distance)
 
     def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
         nodes, slopes = point.nodal.places, point.tangents[:, ::2].T
@@ -451,3 +623,8 @@ class NodalForm(Form):
         if not self.scene.obstacles:
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
+
+
+def _friction(obstacle: Obstacle) -> Any:
+    """The coefficient of friction of an obstacle of a nondimensional scene."""
+    return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction

@@ -100,7 +100,11 @@ class NodalTangents(NodalForm, MixedForm):
             energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
             residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, residual)),
             gaps=contacts.gaps,
+            ways=contacts.ways,
         )
+
+    def unbalanced(self, point: MixedPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        return super().unbalanced(self.by_law(point))
 
     def turning_elements(
         self, point: MixedPoint, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]
@@ -244,6 +248,7 @@ class NodalFrames(NodalForm, FrameForm):
             energy=energy if fields is None else energy + jnp.sum(fields.energy),
             residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, self._residual(gradient))),
             gaps=contacts.gaps,
+            ways=contacts.ways,
         )
 
     def _by_force(self, cells: CellDerivatives) -> Float[Array, "3 3 3 n"]:
@@ -253,6 +258,7 @@ class NodalFrames(NodalForm, FrameForm):
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
+        point = self.by_law(point)
         gradient, fields = self._moments(point), self.at_nodes(point)
         if fields is not None:
             gradient = gradient.at[:, ::2].add(fields.by_rotation)

@@ -1,5 +1,6 @@
 """What is unknown of a rod whose nodes have positions of their own, beyond what others have."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,33 +8,66 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+class Friction(eqx.Module):
+    """Of f obstacles with friction: their tangential forces on each node; and the memory, where the nodes were in the
+    last equilibrium [m]: a step from there slips by what a node goes along the surface. Not numbers: from rest, where
+    nothing has slipped and friction does not act.
+    """
+
+    forces: Float[Array, "... f n+1 3"]
+    reference: Float[Array, "... n+1 3"]
+
+    @staticmethod
+    def from_rest(count: int, nodes: Float[Array, "n+1 3"]) -> "Friction":
+        """Of so many obstacles."""
+        return Friction(jnp.zeros((count, *nodes.shape), nodes.dtype), jnp.full_like(nodes, jnp.nan))
+
+
 class Nodal(eqx.Module):
     """The positions of the nodes, the pressure of each obstacle at each node, and by how much the gaps of each obstacle
-    are seen larger in the next step.
+    are seen larger in the next step; `friction`: where an obstacle has some.
     """
 
     places: Float[Array, "n+1 3"]
     pressures: Float[Array, "k n+1"]
     relaxed: Float[Array, "k"]
+    friction: Friction | None = None
+
+    @property
+    def contact_forces(self) -> Float[Array, "r n+1"]:
+        """The multipliers of the rows of contacts: pressures, then three components of each tangential force."""
+        if self.friction is None:
+            return self.pressures
+        components = jnp.swapaxes(self.friction.forces, 1, 2).reshape(-1, len(self.places))
+        return jnp.concatenate([self.pressures, components])
+
+    def with_contact_forces(self, places: Float[Array, "n+1 3"], forces: Float[Array, "r n+1"]) -> "Nodal":
+        """With other places, and multipliers as of `contact_forces`."""
+        if self.friction is None:
+            return dataclasses.replace(self, places=places, pressures=forces)
+        k, nodes = self.pressures.shape
+        friction = jnp.swapaxes(forces[k:].reshape(-1, 3, nodes), 1, 2)
+        friction = dataclasses.replace(self.friction, forces=friction)
+        return dataclasses.replace(self, places=places, pressures=forces[:k], friction=friction)
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "Nodal":
         """With all nodes in the plane of two axes through the first one."""
         first = self.places[:1]
         places = first + (self.places - first) @ axes @ axes.T
-        return Nodal(places, self.pressures, self.relaxed)
+        return dataclasses.replace(self, places=places)
 
     def without(self, normal: Float[Array, "3"]) -> "Nodal":
         """The same, of the plane with this normal."""
         ways = self.places - self.places[:1]
-        return Nodal(self.places - (ways @ normal)[:, None] * normal[None], self.pressures, self.relaxed)
+        return dataclasses.replace(self, places=self.places - (ways @ normal)[:, None] * normal[None])
 
 
 class NodalChange(NamedTuple):
-    """Of a step."""
+    """Of a step; `pressures`: of all rows of contacts, as of `Nodal.contact_forces`."""
 
     displacements: Float[Array, "n+1 3"]
-    pressures: Float[Array, "k n+1"]
+    pressures: Float[Array, "r n+1"]
 
     @staticmethod
     def nothing(nodal: Nodal) -> "NodalChange":
-        return NodalChange(jnp.zeros_like(nodal.places), jnp.zeros_like(nodal.pressures))
+        return NodalChange(jnp.zeros_like(nodal.places), jnp.zeros_like(nodal.contact_forces))

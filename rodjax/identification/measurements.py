@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.checks import instance, is_known, leaf, number_array, number_list, one_of, positive, shown, vector
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, check_without_friction
 from rodjax.model.supports import frame, rotate
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.guess import Guess
@@ -349,6 +349,7 @@ class Experiment(eqx.Module):
         instance(scene, "scene", Scene)
         if scene.rod.length.ndim:
             raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
+        check_without_friction(scene, "an Experiment")
         measured = (measured,) if isinstance(measured, Measurement) else tuple(measured)
         if not measured:
             raise ValueError("measured must hold at least one measurement, got none")

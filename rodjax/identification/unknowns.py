@@ -110,7 +110,7 @@ def unit_of(name: str) -> str:
     if name.startswith("distributed.") and _matches(name, ("force",)):
         return "N/m"
     if name.startswith("obstacles."):
-        return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal",)) else "m"
+        return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal", "friction")) else "m"
     return next((unit for part, unit in UNITS.items() if _matches(name, (part,))), "")
 
 

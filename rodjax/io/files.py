@@ -39,7 +39,7 @@ from rodjax.version import __version__
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 11
+FORMAT = 12
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -78,6 +78,8 @@ FIELDS = {
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
     "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
     "state/pressures": ("1", "with obstacles: force of each on each node, in the solver's units"),
+    "state/friction/forces": ("1", "tangential forces of obstacles with friction on each node, in the solver's units"),
+    "state/friction/reference": ("m", "nodes in the equilibrium before, from which slips are counted; NaN from rest"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
     "state/units/length": ("m", "the solver's unit of length, L"),
     "state/units/energy": ("J", "the solver's unit of energy, EI/L"),
@@ -127,6 +129,7 @@ FIELDS = {
             ("size", "m", "edges of a box"),
             ("frame", "1", "directions of these edges, in columns"),
             ("triangles", "m", "corners of the triangles of a body"),
+            ("friction", "1", "coefficient of friction"),
         )
     },
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),

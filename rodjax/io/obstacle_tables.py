@@ -13,6 +13,8 @@ The keys besides the kind (optional ones in brackets):
 - "mesh", not in scene files: file = "engine.stl", in a folder as seen from this file [unit = "1 mm", that of the file;
   without it metres]
 - "union": parts, a list of obstacles
+
+and each, but for the parts of a union and obstacles of routes, [friction = 0.3]: Coulomb's coefficient.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,18 +26,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from rodjax.checks import shown
-from rodjax.io.quantities import SceneFileError, assignment, check_keys, choice, named, quantity, si_values, table_list
+from rodjax.io.quantities import SceneFileError, assignment, choice, named, quantity, si_values, table_list
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.triangle_mesh import Mesh
 
 # What makes an obstacle, and the keys that it must and may have.
 OBSTACLES: dict[str, tuple[Callable[..., Obstacle], tuple[str, ...], tuple[str, ...]]] = {
-    "plane": (Plane, ("point", "normal"), ()),
-    "sphere": (Sphere, ("center", "radius"), ()),
-    "capsule": (Capsule, ("start", "end", "radius"), ()),
-    "pipe": (Pipe, ("points", "radius"), ()),
-    "cylinder": (Cylinder, ("start", "end", "radius"), ()),
-    "box": (Box, ("center", "size"), ("frame",)),
+    "plane": (Plane, ("point", "normal"), ("friction",)),
+    "sphere": (Sphere, ("center", "radius"), ("friction",)),
+    "capsule": (Capsule, ("start", "end", "radius"), ("friction",)),
+    "pipe": (Pipe, ("points", "radius"), ("friction",)),
+    "cylinder": (Cylinder, ("start", "end", "radius"), ("friction",)),
+    "box": (Box, ("center", "size"), ("frame", "friction")),
 }
 KINDS = [*OBSTACLES, "mesh", "union"]
 M = TypeVar("M", bound=eqx.Module)
@@ -47,11 +49,13 @@ def obstacle(table: Any, where: str, folder: Path | None, other: tuple[str, ...]
     if kind == "mesh" and folder is not None:
         return _mesh(table, where, folder, other)
     if kind == "union":
-        check_keys(table, where, (), ("kind", "parts", *other))
+        values = si_values(table, where, (), ("friction",), other=("kind", "parts", *other))
         parts = table_list(table.get("parts", []), f"{where}.parts")
         if not parts:
             raise SceneFileError(f'{where}.parts must be a list of obstacles, such as {{ kind = "sphere", ... }}')
-        return Union(*(obstacle(part, f"{where}.parts[{k}]", folder) for k, part in enumerate(parts)))
+        bodies = [obstacle(part, f"{where}.parts[{k}]", folder) for k, part in enumerate(parts)]
+        with named(where):
+            return Union(*bodies, **values)
     make, required, optional = OBSTACLES[kind]
     values = si_values(table, where, required, optional, other=("kind", *other))
     with named(where):
@@ -76,7 +80,7 @@ def kind_of(table: Any, where: str, allowed: list[str]) -> str:
 
 
 def _mesh(table: dict[str, Any], where: str, folder: Path, other: tuple[str, ...]) -> Obstacle:
-    values = si_values(table, where, (), ("unit",), other=("kind", "file", *other))
+    values = si_values(table, where, (), ("unit", "friction"), other=("kind", "file", *other))
     file = table.get("file")
     if not isinstance(file, str) or not file or "\0" in file:
         got = shown(file) if "file" in table else "none"
@@ -85,7 +89,7 @@ def _mesh(table: dict[str, Any], where: str, folder: Path, other: tuple[str, ...
     if not unit > 0:
         raise SceneFileError(f"{where}.unit must be positive, got {shown(table['unit'])}")
     try:
-        return Mesh.from_stl(folder / file, unit)
+        return Mesh.from_stl(folder / file, unit, values.get("friction", 0.0))
     except OSError as error:
         raise SceneFileError(f"{where}.file: {shown(str(folder / file))} cannot be read: {error.strerror}") from None
     except (ValueError, ImportError) as error:
@@ -98,7 +102,8 @@ def written_obstacle(obstacle: Obstacle, name: str) -> list[str]:
         parts = [
             ", ".join(written_obstacle(part, f"{name}.obstacles[{k}]")) for k, part in enumerate(obstacle.obstacles)
         ]
-        return ['kind = "union"', f"parts = [{', '.join(f'{{ {part} }}' for part in parts)}]"]
+        friction = [] if obstacle.friction is None else [assignment("friction", obstacle.friction, "")]
+        return ['kind = "union"', f"parts = [{', '.join(f'{{ {part} }}' for part in parts)}]", *friction]
     kind = next((kind for kind, (make, _, _) in OBSTACLES.items() if make is type(obstacle)), None)
     if kind is None:
         raise ValueError(

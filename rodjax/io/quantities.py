@@ -68,6 +68,7 @@ OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
         "end": ("m", (3,), '"[0.3, 0, 0] m"'),
         "size": ("m", (3,), '"[100, 50, 20] mm"'),
         "unit": ("m", (), '"1 mm"'),
+        "friction": ("", (), "0.3"),
     },
     "limits": {
         "bend_radius": ("", (), "6"),

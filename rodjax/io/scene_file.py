@@ -51,6 +51,7 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # kind = "plane"
     # point = "[0, 0, -20] cm"
     # normal = [0, 0, 1]
+    # friction = 0.3               # optional: Coulomb's coefficient; it acts along a path
 
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50

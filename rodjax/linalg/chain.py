@@ -31,12 +31,14 @@ HARDENINGS = 5
 
 class ContactRows(eqx.Module):
     """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held. `softness`: of the
-    pressures; `is_closed`: where there is one.
+    pressures; `is_closed`: where there is one. `pushes`: along what a pressure pushes, where that is not N, as where it
+    brings friction with it, without symmetry then.
     """
 
     normals: Float[Array, "k n+1 3"]
     softness: Float[Array, ""]
     is_closed: Bool[Array, "k n+1"]
+    pushes: Float[Array, "k n+1 3"] | None = None
 
     def rates(self, u: Float[Array, "n+1 3"]) -> Float[Array, "k n+1"]:
         """Of the gaps, as nodes move."""
@@ -44,12 +46,16 @@ class ContactRows(eqx.Module):
 
     def pushed(self, pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3"]:
         """The forces of pressures on the nodes."""
-        return jnp.einsum("knc,kn->nc", self.normals, pressures)
+        return jnp.einsum("knc,kn->nc", self._pushes, pressures)
 
     def condensed(self) -> Float[Array, "n+1 3 3"]:
         """What closed contacts add to the stiffness."""
         weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
-        return jnp.einsum("knc,kne,kn->nce", self.normals, self.normals, weights)
+        return jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
+
+    @property
+    def _pushes(self) -> Float[Array, "k n+1 3"]:
+        return self.normals if self.pushes is None else self.pushes
 
 
 class LoadRows(eqx.Module):
@@ -342,7 +348,8 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     begin, first = inverted(blocks[0], scale[0])
     _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, above, scale[1:]))
     pivots, inverses = jnp.concatenate([begin[None], pivots]), jnp.concatenate([first[None], inverses])
-    if system.loads is None:
+    is_symmetric = system.loads is None and contacts.pushes is None
+    if is_symmetric:
         # Each force is a multiplier, and so is that of the element before the first node.
         signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
         negative += jnp.sum(signs < 0) - 3 * (n + 1)
@@ -354,7 +361,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
         return factors
     solution = factors._without_border(system.border, *nothing)
     matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, solution[0])
-    if system.loads is None:
+    if is_symmetric:
         negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
     complement = jnp.linalg.inv(matrix)
     return ChainFactors(contacts, system, middles, inverses, below, above, solution, complement, negative)

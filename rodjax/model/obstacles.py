@@ -22,6 +22,7 @@ from rodjax.checks import (
     instance,
     is_known,
     leaf,
+    not_negative,
     number_array,
     positive,
     rotation,
@@ -37,8 +38,24 @@ from rodjax.programs.compilation import compiled
 AT_ONCE = 2**16
 
 
+def coefficient(friction: Any) -> Float[Array, ""] | None:
+    """A coefficient of friction as an obstacle stores it: `None` for the plain number 0."""
+    is_plain = isinstance(friction, int | float | np.ndarray | np.generic) and not isinstance(friction, bool)
+    if friction is None or (is_plain and np.ndim(friction) == 0 and friction == 0):
+        return None
+    return leaf(not_negative(friction, "friction"))
+
+
 class Obstacle(eqx.Module):
-    """A body, or several. Its numbers are differentiable; subclass it, with numbers for fields, for one's own."""
+    """A body, or several. Its numbers are differentiable; subclass it, with numbers for fields, for one's own.
+
+    `friction`: Coulomb's coefficient mu >= 0 between it and a rod, by keyword, of every obstacle: the tangential force
+    at a contact is at most mu times its pressure. The plain number 0, the default, is stored as `None`: no term at all.
+    It acts at the centerline, without a couple; `rodjax.solve_path` says how. Where only distances are looked at, as in
+    clearances, it has no meaning.
+    """
+
+    friction: Float[Array, ""] | None = eqx.field(default=None, kw_only=True, converter=coefficient)
 
     @abstractmethod
     def at(self, point: Float[Array, "3"]) -> Float[Array, ""]:
@@ -68,7 +85,8 @@ class Plane(Obstacle):
     point: Float[Array, "3"]
     normal: Float[Array, "3"]
 
-    def __init__(self, point: Any, normal: Any):
+    def __init__(self, point: Any, normal: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.point = leaf(vector(point, "point"))
         self.normal = leaf(direction(normal, "normal"))
 
@@ -82,7 +100,8 @@ class Sphere(Obstacle):
     center: Float[Array, "3"]
     radius: Float[Array, ""]
 
-    def __init__(self, center: Any, radius: Any):
+    def __init__(self, center: Any, radius: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.center = leaf(vector(center, "center"))
         self.radius = leaf(positive(radius, "radius"))
 
@@ -101,7 +120,8 @@ class Capsule(Obstacle):
     end: Float[Array, "3"]
     radius: Float[Array, ""]
 
-    def __init__(self, start: Any, end: Any, radius: Any):
+    def __init__(self, start: Any, end: Any, radius: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.start, self.end = _segment(start, end)
         self.radius = leaf(positive(radius, "radius"))
 
@@ -118,7 +138,8 @@ class Pipe(Obstacle):
     points: Float[Array, "n 3"]
     radius: Float[Array, ""]
 
-    def __init__(self, points: Any, radius: Any):
+    def __init__(self, points: Any, radius: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.points = leaf(rows(points, "points", least=2, shape="(n, 3), n >= 2"))
         if self.points.ndim != 2:
             raise ValueError(f"points must be numbers of shape (n, 3), got an array of shape {self.points.shape}")
@@ -136,7 +157,8 @@ class Cylinder(Obstacle):
     end: Float[Array, "3"]
     radius: Float[Array, ""]
 
-    def __init__(self, start: Any, end: Any, radius: Any):
+    def __init__(self, start: Any, end: Any, radius: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.start, self.end = _segment(start, end)
         self.radius = leaf(positive(radius, "radius"))
 
@@ -160,7 +182,8 @@ class Box(Obstacle):
     size: Float[Array, "3"]
     frame: Float[Array, "3 3"] | None
 
-    def __init__(self, center: Any, size: Any, frame: Any = None):
+    def __init__(self, center: Any, size: Any, frame: Any = None, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.center = leaf(vector(center, "center"))
         self.size = leaf(vector(size, "size"))
         if is_known(self.size) and not np.all(np.asarray(self.size) > 0):
@@ -181,8 +204,12 @@ class Union(Obstacle):
 
     obstacles: tuple[Obstacle, ...]
 
-    def __init__(self, *obstacles: Obstacle):
+    def __init__(self, *obstacles: Obstacle, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         self.obstacles = checked_obstacles(obstacles)
+        for k, obstacle in enumerate(self.obstacles):
+            if obstacle.friction is not None:
+                raise ValueError(f"obstacles[{k}].friction must be 0 within a Union, which has a friction of its own")
 
     def at(self, point: Float[Array, "3"]) -> Float[Array, ""]:
         return least(*(obstacle.at(point) for obstacle in self.obstacles))
@@ -198,7 +225,8 @@ class Distance(Obstacle):
 
     function: Callable[[Float[Array, "3"]], Float[Array, ""]] = eqx.field(static=True)
 
-    def __init__(self, function: Callable[[Float[Array, "3"]], Float[Array, ""]]):
+    def __init__(self, function: Callable[[Float[Array, "3"]], Float[Array, ""]], friction: Any = 0.0):
+        self.friction = coefficient(friction)
         if not callable(function):
             raise TypeError(f"function must be a function of a point (3,), got {shown(function)}")
         found = jax.eval_shape(function, jax.ShapeDtypeStruct((3,), jnp.zeros(()).dtype))

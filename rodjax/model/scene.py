@@ -43,14 +43,14 @@ class Scene(eqx.Module):
         earlier equilibrium as a guess carries the turns of each span.
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
-    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back without friction, at
-        the nodes of the mesh, where it touches them to rounding. Of a mesh that is chosen for a tolerance elements lie
-        no deeper than 1e-4 of the radius between their nodes either, as far as finer ones help. Bent over an edge, or
-        on a mesh that is given, the rod may lie deeper there: `rodjax.describe` says so, and `rodjax.clearance` tells
-        where. A rod that came through an obstacle since its guess or the last step of its
-        path, or whose centerline lies within one, is not converged. Where no obstacle touches the rod they only cost
-        time: to see how far it is from what it stays away from, `rodjax.clearance` needs none in the scene. Double
-        precision only.
+    - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
+        it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding. Of a mesh
+        that is chosen for a tolerance elements lie no deeper than 1e-4 of the radius between their nodes either, as far
+        as finer ones help. Bent over an edge, or on a mesh that is given, the rod may lie deeper there:
+        `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod that came through an obstacle since its
+        guess or the last step of its path, or whose centerline lies within one, is not converged. Where no obstacle
+        touches the rod they only cost time: to see how far it is from what it stays away from, `rodjax.clearance` needs
+        none in the scene. Double precision only.
     - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
@@ -354,6 +354,18 @@ def has_node_places(scene: Scene) -> bool:
     without a potential.
     """
     return bool(scene.obstacles or scene.potentials) or (needs_frames(scene) and not has_potential(scene))
+
+
+def has_friction(scene: Scene) -> bool:
+    """Whether an obstacle has friction, so that an equilibrium depends on how the rod came there."""
+    return any(obstacle.friction is not None for obstacle in scene.obstacles)
+
+
+def check_without_friction(scene: Scene, name: str) -> None:
+    """Raises `ValueError` where what `name` does has no path along which friction could act."""
+    for k, obstacle in enumerate(scene.obstacles):
+        if obstacle.friction is not None:
+            raise ValueError(f"obstacles[{k}].friction must be 0 in {name}: it acts along a path only")
 
 
 def _follows(end: Support) -> bool:

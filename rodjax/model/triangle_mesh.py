@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.checks import file_path, leaf, line, positive, shown
 from rodjax.geometry.vectors import cross, dot, root
-from rodjax.model.obstacles import Obstacle, least, rows, squared_distance_to_segment
+from rodjax.model.obstacles import Obstacle, coefficient, least, rows, squared_distance_to_segment
 
 # Edges without a partner that a message shows.
 MOST_EDGES = 3
@@ -35,7 +35,8 @@ class Mesh(Obstacle):
 
     triangles: Float[Array, "f 3 3"]
 
-    def __init__(self, vertices: Any, faces: Any):
+    def __init__(self, vertices: Any, faces: Any, friction: Any = 0.0):
+        self.friction = coefficient(friction)
         vertices = rows(vertices, "vertices", least=4, shape="(v, 3), v >= 4")
         if vertices.ndim != 2:
             raise ValueError(
@@ -46,7 +47,7 @@ class Mesh(Obstacle):
         self.triangles = leaf(vertices[faces])
 
     @staticmethod
-    def from_stl(path: str | os.PathLike[str], scale: Any = 1.0) -> "Mesh":
+    def from_stl(path: str | os.PathLike[str], scale: Any = 1.0, friction: Any = 0.0) -> "Mesh":
         """The body in an STL file, text or binary. It takes `pip install 'rodjax[meshes]'`.
 
         `scale`: metres in the unit of the file, which STL does not tell: 1e-3 where it is in mm.
@@ -70,7 +71,7 @@ class Mesh(Obstacle):
         if len(faces) == 0:
             raise ValueError(f"path must name an STL file with triangles, got {str(path)!r} with none")
         try:
-            return Mesh(scale * vertices, faces)
+            return Mesh(scale * vertices, faces, friction)
         except ValueError as error:
             raise ValueError(f"path must name an STL file of a closed surface, got {str(path)!r}: {error}") from None
 

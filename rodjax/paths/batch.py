@@ -21,8 +21,8 @@ from tqdm import tqdm
 from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
-from rodjax.model.scene import Scene, has_node_places, slides
-from rodjax.paths.path import path_from, stack_scenes
+from rodjax.model.scene import Scene, has_friction, has_node_places, slides
+from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import as_completed, checked_threads
@@ -82,7 +82,7 @@ def solve_batch(
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
         one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps.
-    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each.
+    - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each, from which friction acts.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `threads`: the most that share more than 256 scenes, without `mesh`; `None`: the environment variable
@@ -136,12 +136,14 @@ def solve_stack(
     count = given.rod.length.shape[0]
     if isinstance(guess, Equilibrium) and guess.s.ndim > 1 and guess.s.shape[:-1] != (count,):
         raise ValueError(f"guess must be single or hold {count}, one for each scene; got a stack {guess.s.shape[:-1]}")
+    if given.rod.length.ndim == 2:
+        check_still(given, axis=1)
     options, rtol = checked_options(given, guess=guess, **settings)
     strain_limit = checked_strain_limit(strain_limit)
 
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
-        # A path has one guess, for its first scene.
-        begin = guess if last is None or last.s.ndim > 2 else last
+        # A path has one guess, for its first scene; a step with friction is one from the guess.
+        begin = guess if last is None or last.s.ndim > 2 or has_friction(given) else last
         return _in_chunks(given, begin, strain_limit, options, mesh, threads, progress)
 
     result = with_ranges(given, refined_together(solve, options, rtol))

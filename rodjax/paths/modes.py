@@ -97,7 +97,7 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
         cells = on_elements.field
     # Forces on nodes are right sides where these have places of their own.
     form = NodalFrames.of(scene, cells)
-    point = form.begun(point, state.shape.nodes, state.pressures)
+    point = form.begun(point, state.shape.nodes, state.pressures, state.friction)
     here = form.linearized(point)
     # A rod that can spin, or turn as a whole, is held softly.
     factors = factor(form.regular(here.system))

@@ -10,13 +10,14 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
-from rodjax.model.scene import Scene, between, has_node_places, has_potential, nondimensional, slides
+from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional, slides
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -84,6 +85,12 @@ def solve_path(
     A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
     step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
 
+    Friction of obstacles acts from step to step: the slip of a node is what it goes along an obstacle from one
+    equilibrium to the next, and the tangential force there is at most mu times the pressure, as much where the node
+    slips, and against the slip. The first scene is solved from rest, without friction, unless the guess is an
+    `Equilibrium`. A step that is split has more equilibria on its way, and slips are counted from each. Obstacles with
+    friction stay where they are. Derivatives are those of each step, with the places of the last equilibrium held.
+
     - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`.
         The guess is for the first scene; where the estimated error of any step is above `rtol`, the whole path is
         solved on a finer mesh of equal segments.
@@ -95,6 +102,7 @@ def solve_path(
     fixed_scenes, guess = not_differentiated(stacked, guess)
     if isinstance(scenes, Scene) or fixed_scenes is not stacked:
         check_ranges(fixed_scenes)
+    check_still(fixed_scenes)
     check_single(guess)
     options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
@@ -111,6 +119,16 @@ def solve_path(
         count = _before_critical(fixed_scenes, path)
         stacked, path = jax.tree.map(lambda leaf: leaf[:count], (stacked, path))
     return differentiable(stacked, path)
+
+
+def check_still(scenes: Scene, axis: int = 0) -> None:
+    """Raises `ValueError` where an obstacle with friction moves along a path, whose steps are along an axis."""
+    for k, obstacle in enumerate(scenes.obstacles):
+        if obstacle.friction is None:
+            continue
+        body = jax.tree.leaves(eqx.tree_at(lambda body: body.friction, obstacle, None))
+        if is_known(body) and any(np.any(np.ptp(np.asarray(leaf), axis=axis) > 0) for leaf in body):
+            raise ValueError(f"obstacles[{k}] must stay the same along a path, as it has friction")
 
 
 def _check_stop(scenes: Scene) -> None:
@@ -188,7 +206,11 @@ def _solve_path(
         found, substeps = _step(last, before, scene, options, may_split=number > 0)
         if meter is not None:
             bar = meter.step(bar, (number + 1) / count)
-        return (_Station(scene, found.state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
+        state = found.state
+        if has_friction(scenes):
+            converged = is_converged(found.outcome.status)
+            state = jax.tree.map(lambda new, old: jnp.where(converged, new, old), state.as_memory(), state)
+        return (_Station(scene, state, found.point.total_twist, last_of(scene)), last, bar), (found, substeps)
 
     bar = None if meter is None else meter.init()
     assert first.last is not None
@@ -247,7 +269,9 @@ def _step(
         first = FirstTwist(progress.total_twist, progress.last._replace(shape=progress.reached.shape))
         found = solve_from(here, progress.begin, first, options)
         converged = is_converged(found.outcome.status)
-        reached = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found.state, progress.reached)
+        reached = jax.tree.map(
+            lambda new, old: jnp.where(converged, new, old), found.state.as_memory(), progress.reached
+        )
         is_smallest = progress.share <= 0.5**MAX_SPLITS
         return _Progress(
             reached=reached,

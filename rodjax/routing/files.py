@@ -204,6 +204,8 @@ def _obstacles(tables: Any, folder: Path) -> tuple[tuple[str, ...], tuple[Obstac
     for k, table in enumerate(table_list(tables, "obstacles")):
         where = f"obstacles[{k}]"
         obstacles.append(obstacle(table, where, folder, ("name",)))
+        if obstacles[-1].friction is not None:
+            raise SceneFileError(f"{where}.friction must be 0: a route keeps away from its obstacles")
         name = table.get("name", f"obstacle {k}")
         if not isinstance(name, str) or not name:
             raise SceneFileError(f"{where}.name must be a text, got {shown(name)}")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, positive, whole_number
-from rodjax.model.scene import Scene, slides
+from rodjax.model.scene import Scene, check_without_friction, slides
 from rodjax.paths.batch import solve_stack
 from rodjax.programs.answers import one_answer
 from rodjax.programs.tasks import Workers, checked_executor, checked_threads, in_order, rows_of
@@ -230,6 +230,7 @@ def _problem(
     scene: Any, variables: Any, limits: Any, objective: Any, obstacles: Any, names: Any, segments: Any, solver: Any
 ) -> tuple[Problem, tuple[str, ...]]:
     instance(scene, "scene", Scene)
+    check_without_friction(scene, "a route")
     variables = checked_variables(variables, scene)
     if limits is None and obstacles:
         raise ValueError("limits must have a clearance where there are obstacles, got None")

@@ -26,6 +26,7 @@ from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal_point import Friction
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import resampled
@@ -34,6 +35,7 @@ from rodjax.model.plane import check_planar, is_planar, plane
 from rodjax.model.scene import (
     Scene,
     dead_end_moment,
+    has_friction,
     has_node_places,
     has_potential,
     needs_frames,
@@ -167,6 +169,11 @@ def solve(
         method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there.
     - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
         beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
+
+    Friction of obstacles has a memory (`rodjax.solve_path`): where the guess is an `Equilibrium`, the solve is one step
+    from there, and slips are counted from its nodes, in global axes, on another mesh from the same places of the rod.
+    Else it is from rest, as if all obstacles were without friction. `stable` and `index` speak of motions with the
+    pressures that bound friction held.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
@@ -311,7 +318,10 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
         end_force = _of_elements(end_force, state.shape.s, shape.s)
     shape, end_force = _on_its_side(coarse.scene, coarse, shape, end_force)
     pressures = _pressures(coarse.scene, options)
-    return SolverState(shape, end_force, state.units, state.places, before=state.before, pressures=pressures)
+    friction = _friction_on(state.friction, state.shape, shape, state.units)
+    return SolverState(
+        shape, end_force, state.units, state.places, before=state.before, pressures=pressures, friction=friction
+    )
 
 
 def _on_its_side(
@@ -353,6 +363,34 @@ def _pressures(scene: Scene, options: Options, state: SolverState | None = None)
     if state is not None and state.pressures is not None and state.pressures.shape == shape:
         return state.pressures
     return jnp.full(shape, jnp.nan, scene.rod.length.dtype)
+
+
+def _from_rest(scene: Scene, options: Options) -> Friction | None:
+    nodes = jnp.zeros((options.segments + 1, 3), scene.rod.length.dtype)
+    friction = _friction(scene, nodes)
+    return None if friction is None else Friction.from_rest(len(friction.forces), nodes)
+
+
+def _friction(scene: Scene, nodes: Float[Array, "n+1 3"], state: SolverState | None = None) -> Friction | None:
+    """Of a step from an equilibrium with these nodes [m], of a state on the same mesh if there is one."""
+    if not has_friction(scene):
+        return None
+    count = sum(obstacle.friction is not None for obstacle in scene.obstacles)
+    if state is not None and state.friction is not None and len(state.friction.forces) == count:
+        return Friction(state.friction.forces, nodes)
+    return Friction(jnp.zeros((count, *nodes.shape), nodes.dtype), nodes)
+
+
+def _friction_on(friction: Friction | None, coarse: Shape, fine: Shape, units: Units) -> Friction | None:
+    """On another mesh: each place has gone as far since the last equilibrium; forces are sought anew."""
+    if friction is None:
+        return None
+    assert isinstance(coarse, Curve | FramedCurve)
+    assert isinstance(fine, Curve | FramedCurve)
+    gone = units.origin[None] + units.length * coarse.nodes - friction.reference
+    gone = jnp.stack([jnp.interp(fine.s, coarse.s, component) for component in gone.T], axis=1)
+    reference = units.origin[None] + units.length * fine.nodes - gone
+    return Friction(jnp.zeros((len(friction.forces), *reference.shape), reference.dtype), reference)
 
 
 def _of_elements(
@@ -507,7 +545,9 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
                 return state, first
             before = _before(scene, guess)
             pressures = _pressures(scene, options, state)
-            return dataclasses.replace(state, clip_moments=None, before=before, pressures=pressures), first
+            friction = _friction(scene, guess.nodes, state)
+            state = dataclasses.replace(state, clip_moments=None, before=before, pressures=pressures, friction=friction)
+            return state, first
     return _first_state(scene, guess, options)
 
 
@@ -573,17 +613,19 @@ def _unsettled_state(
     pieces = options.segments if kind is Polyline else 2 * options.segments
     parts = force_parts(scene, options.segments)
     no_force = jnp.zeros((3, parts), scene.rod.length.dtype)
-    before, pressures = _before(scene, guess), _pressures(scene, options)
+    before, pressures, friction = _before(scene, guess), _pressures(scene, options), _from_rest(scene, options)
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
         places = sliding_places(scaled)
-        return SolverState(shape, no_force, units, places, before=before, pressures=pressures), FirstTwist(no_twist)
+        state = SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
+        return state, FirstTwist(no_twist)
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(scaled, units, pieces))
         twist = FirstTwist(guess.total_twist)
         places = sliding_places(scaled)
-        return SolverState(shape, no_force, units, places, before=before, pressures=pressures), twist
+        state = SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
+        return state, twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
         shape = kind.through(state.shape.points(pieces))
@@ -595,9 +637,12 @@ def _unsettled_state(
     places = sliding_places(scaled)
     if _sliding(guess.scene) == _sliding(scene):
         places = state.places
+    friction = _friction(scene, state.units.origin[None] + state.units.length * shape.nodes)
     if scene.obstacles:
         shape, end_force = _on_its_side(scene, guess, shape, end_force)
-    return SolverState(shape, end_force, state.units, places, before=before, pressures=pressures), last_twist(guess)
+    units = state.units
+    state = SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
+    return state, last_twist(guess)
 
 
 def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Options) -> tuple[SolverState, FirstTwist]:
@@ -608,10 +653,10 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     parts = force_parts(scene, options.segments)
     no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
-    before, pressures = _before(given, guess), _pressures(given, options)
+    before, pressures, friction = _before(given, guess), _pressures(given, options), _from_rest(given, options)
 
     def state(shape: FramedCurve) -> SolverState:
-        return SolverState(shape, no_force, units, places, before=before, pressures=pressures)
+        return SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
 
     if guess is None:
         shape, first = first_frames(scene, s, of_joints), FirstTwist(rest_twist(scene))
@@ -627,10 +672,14 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     if isinstance(shape, FramedCurve):
         end_force = in_parts(guess.state.end_force, parts)
         shape = shape.on(s, of_joints)
+        units = guess.state.units
+        friction = _friction(given, units.origin[None] + units.length * shape.nodes)
         if scene.obstacles:
             shape, end_force = _on_its_side(given, guess, shape, end_force)
-        units = guess.state.units
-        return SolverState(shape, end_force, units, places, before=before, pressures=pressures), first
+        begin = SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
+        return begin, first
+    if has_friction(given):
+        friction = _friction(given, guess.position_at(s * guess.scene.rod.length))
     points = _in_units(guess.state, units).shape.points(pieces)
     start = guess.scene.start
     if isinstance(start, Clamp):
@@ -710,8 +759,10 @@ class Search(eqx.Module):
             status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
-        pressures = point.nodal.pressures if self.form.scene.obstacles else None
-        state = SolverState(shape, point.end_force, self.units, places, pressures=pressures)
+        pressures, friction = (
+            (point.nodal.pressures, point.nodal.friction) if self.form.scene.obstacles else (None, None)
+        )
+        state = SolverState(shape, point.end_force, self.units, places, pressures=pressures, friction=friction)
         return Found(state, point, outcome, stable)
 
 
@@ -789,7 +840,7 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
     if isinstance(form, FrameForm):
         assert isinstance(shape, FramedCurve)
         point = form.holding(FramePoint(shape.turned_to_ends(form, first), end_force, first.total_twist))
-        return shape, form.begun(point, shape.nodes, guess.pressures)
+        return shape, form.begun(point, shape.nodes, guess.pressures, guess.friction)
     assert isinstance(form, MixedForm)
     if isinstance(shape, Curve):
         assert isinstance(field, HermiteElements)
@@ -801,7 +852,7 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
             return start, eqx.tree_at(lambda point: point.end_force, problem.mixed_point(start), end_force)
         tangents = shape.tangents
     point = MixedPoint(tangents, end_force, form.first_twist(shape, tangents, first))
-    return shape, form.begun(point, shape.nodes, guess.pressures)
+    return shape, form.begun(point, shape.nodes, guess.pressures, guess.friction)
 
 
 # Not eqx.filter_jit: it parts arrays from the rest in Python at each call, 0.08 ms of a warm solve of 0.3 ms.
@@ -821,4 +872,8 @@ def _in_units(state: SolverState, units: Units) -> SolverState:
     shape = state.shape.in_units(state.units.length / units.length, (state.units.origin - units.origin) / units.length)
     force = state.end_force * (state.units.force / units.force)
     pressures = None if state.pressures is None else state.pressures * (state.units.force / units.force)
-    return SolverState(shape, force, units, state.places, before=state.before, pressures=pressures)
+    friction = state.friction
+    if friction is not None:
+        forces = friction.forces * (state.units.force / units.force)
+        friction = dataclasses.replace(friction, forces=forces)
+    return SolverState(shape, force, units, state.places, before=state.before, pressures=pressures, friction=friction)

@@ -73,8 +73,10 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
         nodal = point.nodal if scene.obstacles else None
-        pressures = None if nodal is None else nodal.pressures
-        state = SolverState(shape, point.end_force, units, places, before=before, pressures=pressures)
+        pressures, friction = (None, None) if nodal is None else (nodal.pressures, nodal.friction)
+        state = SolverState(
+            shape, point.end_force, units, places, before=before, pressures=pressures, friction=friction
+        )
         found = Found(state, point, outcome, result.stable)
         return equilibrium(scene, found, result.substeps)
 

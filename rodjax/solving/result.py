@@ -37,8 +37,8 @@ from rodjax.discretization.framed_results import (
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
-from rodjax.discretization.nodal import NodalForm
-from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.nodal import SLIPS, STICKS, NodalForm
+from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
@@ -88,7 +88,8 @@ class SolverState(eqx.Module):
     `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it;
-    `pressures`: of each obstacle on each node.
+    `pressures`: of each obstacle on each node; `friction`: where obstacles have some, with the memory from which this
+    was found: what begins here has that of `as_memory`.
     """
 
     shape: Shape
@@ -98,6 +99,14 @@ class SolverState(eqx.Module):
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
     pressures: Float[Array, "... k n+1"] | None = None
+    friction: Friction | None = None
+
+    def as_memory(self) -> "SolverState":
+        """As what the next step of a path begins from: slips are counted from here."""
+        if self.friction is None:
+            return self
+        nodes = self.units.origin[None] + self.units.length * self.shape.nodes
+        return dataclasses.replace(self, friction=dataclasses.replace(self.friction, reference=nodes))
 
     def point(self, total_twist: Float[Array, ""]) -> Any:
         """The unknowns of the form of one equilibrium."""
@@ -105,7 +114,7 @@ class SolverState(eqx.Module):
         if self.pressures is None:
             return point
         relaxed = jnp.zeros_like(self.pressures[:, 0])
-        return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed))
+        return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed, self.friction))
 
 
 class Equilibrium(eqx.Module):
@@ -128,8 +137,11 @@ class Equilibrium(eqx.Module):
       when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
       just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
-      n+1, 3] N: what each of them does; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to
-      each obstacle, negative within it. Computed when asked for
+      n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
+      part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
+      not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
+      friction; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to each obstacle, negative
+      within it. Computed when asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
       whose largest |axial_strain| is above the `strain_limit` of the solve
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
@@ -201,11 +213,19 @@ class Equilibrium(eqx.Module):
 
     @property
     def obstacle_forces(self) -> Float[Array, "... obstacles n+1 3"]:
-        return _contacts(self)[0]
+        return _contacts(self).forces
+
+    @property
+    def friction_forces(self) -> Float[Array, "... obstacles n+1 3"]:
+        return _contacts(self).friction
+
+    @property
+    def contact_states(self) -> Int[Array, "... obstacles n+1"]:
+        return _contacts(self).states
 
     @property
     def gaps(self) -> Float[Array, "... obstacles n+1"]:
-        return _contacts(self)[1]
+        return _contacts(self).gaps
 
     @property
     def clip_moments(self) -> Float[Array, "... clips 3"]:
@@ -453,22 +473,33 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
 
 
-def _contacts(equilibrium: Equilibrium) -> tuple[Float[Array, "... k n+1 3"], Float[Array, "... k n+1"]]:
-    """The forces of each obstacle on the nodes, and their gaps."""
+class _Contacts(eqx.Module):
+    """Of each obstacle with each node, as the properties of `Equilibrium`."""
+
+    forces: Float[Array, "... k n+1 3"]
+    friction: Float[Array, "... k n+1 3"]
+    states: Int[Array, "... k n+1"]
+    gaps: Float[Array, "... k n+1"]
+
+
+def _contacts(equilibrium: Equilibrium) -> _Contacts:
     if equilibrium.scene.obstacles:
         return _contacts_of(equilibrium)
     shape = *equilibrium.s.shape[:-1], 0, equilibrium.s.shape[-1]
-    return jnp.zeros((*shape, 3), equilibrium.s.dtype), jnp.zeros(shape, equilibrium.s.dtype)
+    nothing = jnp.zeros(shape, equilibrium.s.dtype)
+    none = jnp.zeros((*shape, 3), equilibrium.s.dtype)
+    return _Contacts(none, none, jnp.zeros(shape, int), nothing)
 
 
 @over_leading_axes
-def _contacts_of(equilibrium: Equilibrium) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1"]]:
+def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     units = equilibrium.state.units
-    distances, normals = form.distances_and_normals(point.nodal.places)
-    forces = point.nodal.pressures[..., None] * normals
-    return forces * units.force, (distances - form.radius[None]) * units.length
+    distances, _ = form.distances_and_normals(point.nodal.places)
+    pushes, drags, states = form.exerted(point)
+    gaps = (distances - form.radius[None]) * units.length
+    return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
 
 @over_leading_axes
@@ -512,7 +543,7 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     scaled, _ = nondimensional(equilibrium.scene)
     state = equilibrium.state
     form, point = form_of(scaled, state.shape), state.point(equilibrium.total_twist)
-    return form, form.begun(point, state.shape.nodes, state.pressures)
+    return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
 def describe(equilibrium: Equilibrium) -> str:
@@ -562,15 +593,27 @@ def _contacts_told(equilibrium: Equilibrium) -> list[str]:
     told = []
     if not equilibrium.scene.obstacles or not bool(equilibrium.converged):
         return told
-    s = np.asarray(equilibrium.s)
-    for k, forces in enumerate(np.asarray(equilibrium.obstacle_forces)):
+    s, contacts = np.asarray(equilibrium.s), jax.tree.map(np.asarray, _contacts(equilibrium))
+    for k, forces in enumerate(contacts.forces - contacts.friction):
         touched = s[np.linalg.norm(forces, axis=-1) > 0]
         if touched.size:
             first, last = float(touched[0]), float(touched[-1])
             where = f"at s = {first:.4g} m" if first == last else f"between s = {first:.4g} and {last:.4g} m"
             kind = type(equilibrium.scene.obstacles[k]).__name__
-            told.append(f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}")
+            pushes = f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}"
+            told.append(pushes + _friction_told(equilibrium, contacts, k))
     return told
+
+
+def _friction_told(equilibrium: Equilibrium, contacts: _Contacts, k: int) -> str:
+    if equilibrium.scene.obstacles[k].friction is None:
+        return ""
+    friction = equilibrium.state.friction
+    if friction is None or np.any(np.isnan(friction.reference)):
+        return ", without friction as from rest"
+    drag = np.linalg.norm(contacts.friction[k].sum(0))
+    sticks, slips = (int(np.sum(contacts.states[k] == state)) for state in (STICKS, SLIPS))
+    return f", drags with {drag:.4g} N, sticks at {sticks} nodes and slips at {slips}"
 
 
 def _errors_told(equilibrium: Equilibrium) -> list[str]:

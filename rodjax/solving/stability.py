@@ -1,5 +1,6 @@
 """How firmly an equilibrium stands: whether its softest motion has any stiffness left."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -52,6 +53,7 @@ def examined(
 
     Critical: a motion other than the neutral ones has no stiffness left, as far as the residual allows to tell.
     """
+    here = eqx.tree_at(lambda here: here.system, here, form.coupled(point, here.system))
     places = point.tangents.shape[1]
     # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
     shift = min(SHIFT_ROUNDINGS * float(jnp.finfo(residual.dtype).eps) * 4 * places**2, MOST_SHIFT)

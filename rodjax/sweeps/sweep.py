@@ -20,6 +20,7 @@ from rodjax.atomic_write import replace_file, seal
 from rodjax.checks import file_path, whole_number
 from rodjax.file_lock import LockedError, locked
 from rodjax.io.scene_file import SceneFile
+from rodjax.model.scene import check_without_friction
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
 from rodjax.solving.equilibrium import DEFAULT_RTOL, solve
 from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
@@ -119,6 +120,10 @@ def sweep(
         raise SweepError(str(error)) from None
     executor, threads = checked_executor(executor), checked_threads(threads)
     reader = CaseReader(file_path(scene, "scene"), file_path(over, "over"))
+    try:
+        check_without_friction(reader.first.scenes[0], "a sweep")
+    except ValueError as error:
+        raise SweepError(f"{scene}: {error}") from None
     parts = output.with_name(output.name + ".parts")
     if resume and chunk is None:
         chunk = _earlier_chunk(output, parts)

@@ -46,6 +46,7 @@ from rodjax import (
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
+from rodjax.discretization.nodal_point import Friction
 from rodjax.io.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, point_data, save
 from rodjax.mechanics.passage import Before
 from rodjax.solving.result import form_and_point
@@ -324,13 +325,13 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
         rj.Sphere((0, 0, -2), 0.1),
         rj.Mesh(corners, [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]),
     ]
-    obstacles = [*bodies, rj.Union(*bodies, rj.Union(*bodies))]
+    obstacles = [*bodies, rj.Union(*bodies, rj.Union(*bodies), friction=0.2)]
     touching = Scene(scene.rod, scene.start, scene.end, scene.gravity, scene.point_forces, obstacles=obstacles)
     scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped, touching]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
     before = Before(single.nodes, touching.obstacles)
     state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1], before=before)
-    state = dataclasses.replace(state, pressures=single.s[None])
+    state = dataclasses.replace(state, pressures=single.s[None], friction=Friction.from_rest(1, single.nodes))
     results.append(dataclasses.replace(single, state=state))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")

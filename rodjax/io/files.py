@@ -129,9 +129,9 @@ FIELDS = {
             ("size", "m", "edges of a box"),
             ("frame", "1", "directions of these edges, in columns"),
             ("triangles", "m", "corners of the triangles of a body"),
-            ("friction", "1", "coefficient of friction"),
         )
     },
+    **{f"{where}/obstacles/*/friction": ("1", "coefficient of friction") for where in ("scene", "state/before")},
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{

@@ -163,6 +163,7 @@ def test_a_scheduler_that_does_not_answer_is_told_in_one_line(files, capsys, mon
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_tolerances_by_workers(cluster):
     """Numbers come back in the precision of who asked, as the workers have single precision."""
     from distributed import Client

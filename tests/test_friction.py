@@ -199,6 +199,7 @@ def test_capstan():
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_capstan_of_a_stiff_cable():
     pulls = pulled((0, 0.002, 0.004), stiffness=1e-4, segments=96)
     # A node of 96 may lie half an element off where the cable leaves the cylinder.
@@ -235,6 +236,7 @@ def step_from(last: rj.Equilibrium, p: jax.Array) -> rj.Equilibrium:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_coupled_system_is_the_derivative_of_what_is_out_of_balance(last):
     """By the places of nodes that stick and slip on a cylinder and a floor, and by pressures that bound friction."""
     form, point = form_and_point(step_from(last, NOMINAL))

@@ -639,3 +639,12 @@ def test_a_killed_sweep_loses_nothing(files, whole):
     resumed = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=True)
     assert "resumed: " in resumed.stdout
     assert_same("out.h5", whole)
+
+
+def test_friction_is_refused(files):
+    """It acts along a path, and cases of a sweep are none."""
+    floor = '[[obstacles]]\nkind = "plane"\npoint = "[0, 0, -20] cm"\nnormal = [0, 0, 1]\nfriction = 0.3\n'
+    scene = SCENE.replace("[rod]", '[rod]\nradius = "5 mm"').replace("finite_difference", "hermite")
+    Path("scene.toml").write_text(scene + floor)
+    with pytest.raises(SweepError, match=r"scene.toml: obstacles\[0\].friction must be 0 in a sweep"):
+        sweep("scene.toml", "grid.toml", "sweep.h5", chunk=CHUNK)

@@ -130,23 +130,6 @@ def test_a_softest_motion_may_be_limited(shortest):
 
 
 @pytest.mark.slow
-def test_groups_of_starts_are_searched_by_anybody(shortest, monkeypatch):
-    """In groups of two, whoever searches from them, the same to the last bit; the arc as in one group."""
-    monkeypatch.setattr("rodjax.routing.route.GROUP", 2)
-    with ThreadPoolExecutor(2) as engine:
-        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
-        with rj.numpy_first(False):  # cold solves of all starts, too
-            first, *others = (routed(**kind) for kind in kinds)
-    assert first.feasible
-    assert first.objective == pytest.approx(shortest.objective, rel=1e-5)
-    np.testing.assert_array_equal(first.starts.feasible, True)
-    for other in others:
-        assert jax.tree.structure(other) == jax.tree.structure(first)
-        for ours, theirs in zip(jax.tree.leaves(other), jax.tree.leaves(first), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-
-
-@pytest.mark.slow
 def test_an_obstacle_in_the_way_is_passed(shortest):
     """A ball on the arc: the way around it is longer, and clear of it on a finer mesh."""
     ball = rj.Sphere(np.asarray(shortest.equilibrium.nodes[8]) + np.array([0.0, 0.002, 0.0]), 0.01)
@@ -296,3 +279,23 @@ def test_arguments_are_checked():
         rj.route(corner(), length, starts=0)
     with pytest.raises(TypeError, match="solver must be a Newton"):
         rj.route(corner(), length, solver=rj.NonlinearCG())  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.slow
+def test_groups_of_starts_are_searched_by_anybody(shortest, monkeypatch):
+    """In groups of two, whoever searches from them, the same to the last bit; the arc as in one group.
+
+    The last test, as what is compiled here has other last bits than the NumPy code of the others.
+    """
+    monkeypatch.setattr("rodjax.routing.route.GROUP", 2)
+    with ThreadPoolExecutor(2) as engine:
+        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
+        with rj.numpy_first(False):  # cold solves of all starts, too
+            first, *others = (routed(**kind) for kind in kinds)
+    assert first.feasible
+    assert first.objective == pytest.approx(shortest.objective, rel=1e-5)
+    np.testing.assert_array_equal(first.starts.feasible, True)
+    for other in others:
+        assert jax.tree.structure(other) == jax.tree.structure(first)
+        for ours, theirs in zip(jax.tree.leaves(other), jax.tree.leaves(first), strict=True):
+            np.testing.assert_array_equal(ours, theirs)

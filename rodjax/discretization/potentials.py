@@ -19,12 +19,11 @@ from rodjax.model.scene import Scene
 
 
 class NodeEnergy(NamedTuple):
-    """Of the fields at the nodes: energy, its derivatives by the positions (c) and the rotations (b) of the nodes, and
-    the second ones.
+    """Of the fields at the nodes: energy, its derivatives by their rotations, and the second ones by their positions and
+    rotations.
     """
 
     energy: Float[Array, "n+1"]
-    by_place: Float[Array, "n+1 3"]
     by_rotation: Float[Array, "b n+1"]
     by_places: Float[Array, "n+1 3 3"]
     turning: Float[Array, "b 3 n+1"]
@@ -102,7 +101,6 @@ def at_nodes(
     energy, first, second = jax.vmap(of_node)(places, tangents.T, axes.transpose(2, 0, 1), s, *_weights(s))
     return NodeEnergy(
         energy,
-        first[:, :3],
         first[:, 3:].T,
         second[:, :3, :3],
         second[:, 3:, :3].transpose(1, 2, 0),

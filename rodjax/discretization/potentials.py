@@ -19,8 +19,8 @@ from rodjax.model.scene import Scene
 
 
 class NodeEnergy(NamedTuple):
-    """Of the fields at the nodes: energy, its derivatives by their rotations, the second ones by positions and rotations
-    of the nodes.
+    """Of the fields at the nodes: energy, its derivatives by their rotations, the second ones by positions and
+    rotations of the nodes.
     """
 
     energy: Float[Array, "n+1"]

@@ -5,7 +5,7 @@ along the rod or that follow it. Between two stations
 
     phi' = (1 + e) t,  R' = R [kappa]x,  n' = -f,  m' = -phi' x n - c,
 
-where kappa is that at rest and what R^T m adds to it, f the weight and the forces per length, c the couples. Nothing is
+and where sections shear phi' = (1 + e) d3 + gamma1 d1 + gamma2 d2; kappa is that at rest and what R^T m adds to it, f the weight and the forces per length, c the couples. Nothing is
 taken out of the frame's rotation. There is a station at each jump of what varies along the rod, so that all is smooth
 between two of them but for the knots of splines.
 """
@@ -60,10 +60,11 @@ Prepared = Any
 class Material(eqx.Module):
     """What a rod is made of and the loads that follow it, splines already made of their values.
 
-    `rest`: curvature along d1 and d2 and twist, or a curve in space.
+    `rest`: curvature along d1 and d2 and twist, or a curve in space; `shear`: stiffnesses along d1 and d2.
     """
 
     stiffnesses: tuple[Prepared, Prepared, Prepared, Prepared]
+    shear: tuple[Prepared, Prepared] | None
     mass: Prepared
     rest: tuple[Prepared, Prepared, Prepared] | SplinedCurve | None
     law: Law | None
@@ -83,8 +84,10 @@ class Material(eqx.Module):
         elif isinstance(rest, SpaceCurve):
             prepared = rest.splined
         EI1, EI2, GJ, EA = (_prepared(value) for value in rod.stiffnesses)
+        pair = rod.shear_pair
         return Material(
             (EI1, EI2, GJ, EA),
+            None if pair is None else (_prepared(pair[0]), _prepared(pair[1])),
             _prepared(rod.mass_per_length),
             prepared,
             rod.law,
@@ -94,7 +97,8 @@ class Material(eqx.Module):
 
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
         EI1, EI2, GJ, EA = (_at(value, s, interval) for value in self.stiffnesses)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law)
+        GA = None if self.shear is None else jnp.stack([_at(value, s, interval) for value in self.shear])
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law, GA)
 
     def rest_strains(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Float[Array, "3"]:
         if self.rest is None:
@@ -157,12 +161,20 @@ class FarEnd(eqx.Module):
 
 
 class Strained(eqx.Module):
-    """Of a cross section: its sections, strains beyond those at rest, all of the strains, and the axial one."""
+    """Of a cross section: its sections, strains beyond those at rest, all of the strains, the axial one, and with shear
+    its strains.
+    """
 
     sections: Sections
     beyond_rest: Float[Array, "3"]
     strains: Float[Array, "3"]
     axial: Float[Array, ""]
+    shear: Float[Array, "2"] | None
+
+    def slope(self, frame: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        """phi'."""
+        along = (1 + self.axial) * frame[:, 2]
+        return along if self.shear is None else along + frame[:, :2] @ self.shear
 
 
 def _strained(
@@ -175,7 +187,8 @@ def _strained(
 ) -> Strained:
     sections = material.sections(s, interval)
     beyond_rest, axial = sections.strains_under(frame.T @ moment, jnp.sum(force * frame[:, 2]))
-    return Strained(sections, beyond_rest, beyond_rest + material.rest_strains(s, interval), axial)
+    shear = None if sections.GA is None else sections.shear_under((frame.T @ force)[:2])
+    return Strained(sections, beyond_rest, beyond_rest + material.rest_strains(s, interval), axial, shear)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -191,7 +204,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
         s = piece.start + u * piece.length
         frame = rotation_of(end.quaternion)
         here = _strained(material, s, piece.interval, frame, end.force, end.moment)
-        dphi = (1 + here.axial) * frame[:, 2]
+        dphi = here.slope(frame)
         dead = origin
         if piece.gravity is not None:
             dead += _at(material.mass, s, piece.interval) * piece.gravity
@@ -209,7 +222,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
             quaternion=product(end.quaternion, jnp.concatenate([zero[None], here.strains])) / 2,
             force=-load,
             moment=dmoment,
-            elastic_energy=here.sections.density((k1, k2), twist, here.axial),
+            elastic_energy=here.sections.density((k1, k2), twist, here.axial, here.shear),
             load_energy=dead_load_energy(dead, end.position),
             twist=here.strains[2],
         )
@@ -410,5 +423,6 @@ def _equilibrium(
         load_energy=jnp.sum(ends.load_energy),
         missed=misses(scaled, start, sections, reached),
         shape=FramedCurve(nodes.position, quaternions, s),
+        shear_strain=strained.shear,
     )
     return equilibrium(scene, start, stations, iterations, result)

@@ -292,6 +292,7 @@ class Reached(eqx.Module):
     missed: Any
     shape: Shape
     clip_moments: Float[Array, "clips 3"] | None = None
+    shear_strain: Float[Array, "n+1 2"] | None = None
 
 
 def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any, reached: Reached) -> Equilibrium:
@@ -338,6 +339,7 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         scene=scene,
         state=SolverState(reached.shape, end_force, units, stations.places, reached.clip_moments),
         discretization="continuum",
+        shear_strain=reached.shear_strain,
     )
 
 

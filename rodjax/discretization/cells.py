@@ -247,7 +247,11 @@ class JointCells(eqx.Module):
         edges = stiffness_at(of_edges, (a + b) / 2, a, b)
         EA = jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
         EI1, EI2, GJ = (jnp.stack([joint, joint]) for joint in joints)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law)
+        GA = None
+        if rod.shear_pair is not None:
+            edges = jnp.stack([stiffness_at(value, (a + b) / 2, a, b) for value in rod.shear_pair])
+            GA = jnp.stack([jnp.append(edges[:, :1], edges, axis=1), jnp.append(edges, edges[:, -1:], axis=1)], axis=1)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:
         of_edges = jnp.clip((at - self.s[:-1]) / jnp.diff(self.s), 0.0, 1.0)
@@ -334,7 +338,8 @@ class ElementCells(eqx.Module):
         s = self.strain_places
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
         EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in rod.stiffnesses)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law)
+        GA = None if rod.shear_pair is None else jnp.stack([stiffness_at(value, s, a, b) for value in rod.shear_pair])
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law, GA)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
         return parts_before(self.s, at)
@@ -348,7 +353,8 @@ class ElementCells(eqx.Module):
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
     """The arclengths of the jumps of a rod and of loads along it."""
     rod = scene.rod
-    values = (*rod.stiffnesses, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
+    rest = (*(rod.rest_curvature or ()), rod.rest_twist)
+    values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
     return [value.jumps for value in values if isinstance(value, Steps)]
 
 

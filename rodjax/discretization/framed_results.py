@@ -29,12 +29,15 @@ from rodjax.model.supports import Directed, Free, Held
 
 
 class NodeStrains(eqx.Module):
-    """At the nodes: section moment (global axes), curvature along d1 and d2, twist, axial strain and tension."""
+    """At the nodes: section moment (global axes), curvature along d1 and d2, twist, axial strain and tension; with
+    shear its strains.
+    """
 
     moments: Float[Array, "3 n+1"]
     strains: Float[Array, "3 n+1"]
     axial: Float[Array, "n+1"]
     tension: Float[Array, "n+1"]
+    shear: Float[Array, "2 n+1"] | None
 
 
 def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
@@ -57,6 +60,7 @@ def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
         start_moment=moments[0],
         end_force=forces[1],
         end_moment=moments[1],
+        shear_strain=None if at_nodes.shear is None else at_nodes.shear.T,
     )
 
 
@@ -115,7 +119,14 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
         last_cell = jnp.concatenate([a, a[-1:]]), jnp.concatenate([b, b[-1:]])
         strains += rest.at(field.s, *last_cell)
     mean = jnp.concatenate([first[:, :1], (first[:, 1:] + last[:, :-1]) / 2, last[:, -1:]], axis=1)
-    return NodeStrains(moments, strains, axial, dot(mean, tangent(q)))
+    return NodeStrains(moments, strains, axial, dot(mean, tangent(q)), _shear_under(sections, q, beyond))
+
+
+def _shear_under(
+    sections: Sections, quaternions: Float[Array, "4 *k"], forces: Float[Array, "3 *k"]
+) -> Float[Array, "2 *k"] | None:
+    """Shear strains under forces in global axes; `None` where sections do not shear."""
+    return None if sections.GA is None else sections.shear_under(rotated(inverse(quaternions), forces)[:2])
 
 
 def strains_beside_nodes(
@@ -185,14 +196,16 @@ def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
     def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
         return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)
 
-    parts = ((strains[..., 1:-1], here.axial[:, 1:-1], here.tension[:, 1:-1])[k] for k in range(3))
-    return NodeStrains(moments, *(between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)))
+    parts = [strains[..., 1:-1], here.axial[:, 1:-1], here.tension[:, 1:-1]]
+    parts += [] if here.shear is None else [here.shear[..., 1:-1]]
+    found = [between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)]
+    return NodeStrains(moments, *found[:3], None if here.shear is None else found[3])
 
 
 def _strains_at_end(
     form: FrameForm, point: FramePoint, moment: Float[Array, "3"], force: Float[Array, "3"], k: int
-) -> tuple[Float[Array, "3 1"], Float[Array, "1"], Float[Array, "1"]]:
-    """Strains, axial strain and tension at the first or last node."""
+) -> tuple[Float[Array, "3 1"], Float[Array, "1"], Float[Array, "1"], Float[Array, "2 1"] | None]:
+    """Strains, axial strain, tension and shear strains at the first or last node."""
     q = point.quaternions[:, k, None]
     sections = eqx.combine(jax.tree.map(lambda leaf: leaf[..., k, k, None], _arrays(form.sections)), form.sections)
     tension = dot(force[:, None], tangent(q))
@@ -201,7 +214,7 @@ def _strains_at_end(
     if rest is not None:
         s = form.field.s
         strains += rest.at(s[k, None], s[[0, -2][k], None], s[[1, -1][k], None])
-    return strains, axial, tension
+    return strains, axial, tension, _shear_under(sections, q, force[:, None])
 
 
 def positions_between_frames(
@@ -211,10 +224,14 @@ def positions_between_frames(
     middle, where a parabola through the slopes leads.
     """
     field, q = form.field, point.quaternions
-    here = form.strained(point)
-    slopes = (1 + here.axial)[None] * here.tangents
+    slopes = form.strained(point).slopes
     if not isinstance(field, ElementCells):
-        t = tangent(field.at_nodes(q))
+        frames = field.at_nodes(q)
+        t = tangent(frames)
+        if form.sections.GA is not None:
+            at_nodes = _on_joints(form, point)
+            assert at_nodes.shear is not None
+            t = (1 + at_nodes.axial)[None] * t + short_sum(columns(frames)[:, :2] * at_nodes.shear[None], axis=1)
         return cubic(field.s, nodes, t.T, s)
     a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
     ways = field.h[None] * (5 * a + 8 * b - c) / 24
@@ -327,10 +344,13 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         here = jax.tree.map(lambda leaf: parabola(x, leaf), _arrays(sections))
         here = eqx.combine(here, sections)
         strains, axial = here.strains_under(rotated(inverse(q), pose.moment), dot(force, t))
+        shear = _shear_under(here, q, force)
         if rest is not None:
             strains += rest.at(field.s[:-1] + x * h, field.s[:-1], field.s[1:])
         rate = product(q, jnp.concatenate([jnp.zeros_like(t[:1]), strains])) / 2
         way = (1 + axial)[None] * t
+        if shear is not None:
+            way += short_sum(columns(q)[:, :2] * shear[None], axis=1)
         moment = -cross(way, force)
         if couples is not None:
             moment -= parabola(x, couples)

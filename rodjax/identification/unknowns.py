@@ -18,12 +18,13 @@ Scale = Literal["log", "linear"]
 Per = Literal["all", "experiment"]
 
 # Numbers that are positive by their nature, and so sought by their logarithm where nothing else is said.
-POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
+POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.GA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
 UNITS = {
     "jumps": "m",
     "rod.EI": "N m^2",
     "rod.GJ": "N m^2",
     "rod.EA": "N",
+    "rod.GA": "N",
     "rod.mass_per_length": "kg/m",
     "rod.length": "m",
     "rod.radius": "m",

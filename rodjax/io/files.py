@@ -39,7 +39,7 @@ from rodjax.version import __version__
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 12
+FORMAT = 13
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -51,7 +51,8 @@ FIELDS = {
     "twist": ("rad/m", "twist Omega at the nodes"),
     "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
     "tension": ("N", "tension at the nodes"),
-    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes"),
+    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes, with shear along d3"),
+    "shear_strain": ("1", "with shear: components of phi' along d1 and d2 at the nodes"),
     "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
     "elastic_energy": ("J", "elastic energy"),
     "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
@@ -93,6 +94,8 @@ FIELDS = {
             ("EI/*", "N m^2", "bending stiffness about d1 and d2"),
             ("GJ", "N m^2", "torsional stiffness"),
             ("EA", "N", "axial stiffness"),
+            ("GA", "N", "shear stiffness"),
+            ("GA/*", "N", "shear stiffness along d1 and d2"),
             ("mass_per_length", "kg/m", "mass per length"),
             ("radius", "m", "radius of the rod, for pictures"),
             ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),

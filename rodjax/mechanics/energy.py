@@ -79,7 +79,8 @@ def dead_load_energy(force: Float[Array, "3"], position: Float[Array, "3"]) -> F
 class Sections(eqx.Module):
     """What resists at k places along a rod that is not the same everywhere, or has a law of its own.
 
-    `EI`: of the components of t x t' along d1 and d2; `s`: arclengths.
+    `EI`: of the components of t x t' along d1 and d2; `s`: arclengths; `GA`: of the shear strains along d1 and d2,
+    `None` where sections do not shear.
     """
 
     EI: Float[Array, "2 *k"]
@@ -87,15 +88,28 @@ class Sections(eqx.Module):
     EA: Float[Array, "*k"]
     s: Float[Array, "*k"]
     law: Law | None
+    GA: Float[Array, "2 *k"] | None = None
 
     def at(self, k: int) -> "Sections":
         """At the strain point k of every cell."""
-        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law)
+        GA = None if self.GA is None else self.GA[:, k]
+        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law, GA)
 
     def density(
-        self, curvature: tuple[Array, Array], twist: Float[Array, "*k"], axial_strain: Float[Array, "*k"]
+        self,
+        curvature: tuple[Array, Array],
+        twist: Float[Array, "*k"],
+        axial_strain: Float[Array, "*k"],
+        shear: Float[Array, "2 *k"] | None = None,
     ) -> Float[Array, "*k"]:
-        """Energy [J/m] by what the strains exceed those of the stress-free shape by."""
+        """Energy [J/m] by what the strains exceed those of the stress-free shape by.
+
+        `shear`: the components of phi' along d1 and d2, which add GA1/2 gamma1^2 + GA2/2 gamma2^2; `None` for none.
+        """
+        if shear is not None:
+            assert self.GA is not None
+            of_shear = (self.GA[0] * shear[0] ** 2 + self.GA[1] * shear[1] ** 2) / 2
+            return self.density(curvature, twist, axial_strain) + of_shear
         if self.law is not None:
             law = self.law
             for _ in self.s.shape:
@@ -103,6 +117,11 @@ class Sections(eqx.Module):
             return law(jnp.stack(curvature), twist, axial_strain, self.s)
         bending = (self.EI[0] * curvature[0] ** 2 + self.EI[1] * curvature[1] ** 2) / 2
         return bending + self.GJ / 2 * twist**2 + self.EA / 2 * axial_strain**2
+
+    def shear_under(self, force: Float[Array, "2 *k"]) -> Float[Array, "2 *k"]:
+        """The shear strains at which their forces dw/d(gamma) along d1 and d2 are the given ones [N]."""
+        assert self.GA is not None
+        return force / self.GA
 
     def axial_strain_under(
         self, tension: Float[Array, "*k"], curvature: tuple[Array, Array], twist: Float[Array, "*k"]

@@ -93,6 +93,7 @@ class Rod(eqx.Module):
     rest_twist: Value | None
     rest_centerline: SpaceCurve | None
     law: Law | None
+    GA: Value | Pair | None
 
     def __init__(
         self,
@@ -106,6 +107,7 @@ class Rod(eqx.Module):
         rest_twist: Any = None,
         *,
         law: Law | None = None,
+        GA: Any = None,
     ):
         self.length = leaf(positive(length, "length"))
         self.EI = _pair(EI, "EI", positive) if _is_pair(EI) else _value(EI, "EI", positive)
@@ -119,6 +121,7 @@ class Rod(eqx.Module):
         self.rest_twist = None if rest_twist is None else _value(rest_twist, "rest_twist", number_array)
         self.rest_centerline = None
         self.law = None if law is None else _law(law)
+        self.GA = None if GA is None else _pair(GA, "GA", positive) if _is_pair(GA) else _value(GA, "GA", positive)
         _check_arclengths(self)
 
     @property
@@ -134,6 +137,7 @@ class Rod(eqx.Module):
             and self.rest_twist is None
             and self.rest_centerline is None
             and self.law is None
+            and self.GA is None
         )
 
     @property
@@ -144,6 +148,11 @@ class Rod(eqx.Module):
     def stiffnesses(self) -> tuple[Value, Value, Value, Value]:
         """Against bending about d1 and d2, torsion and stretching."""
         return (*self.bending_pair, self.GJ, self.EA)
+
+    @property
+    def shear_pair(self) -> tuple[Value, Value] | None:
+        """Against shear along d1 and d2; `None` where sections do not shear."""
+        return self.GA if self.GA is None or isinstance(self.GA, tuple) else (self.GA, self.GA)
 
     @property
     def rest_shape(self) -> RestShape | None:
@@ -189,6 +198,7 @@ class Rod(eqx.Module):
             strain.curvature,
             strain.twist,
             law=None if self.law is None else ScaledLaw(self.law, L, units.energy),
+            GA=None if self.shear_pair is None else tuple(scaled(value, L, units.force) for value in self.shear_pair),
         )
         return _shaped(scaled_rod, rest.scaled(L)) if isinstance(rest, SpaceCurve) else scaled_rod
 
@@ -204,6 +214,7 @@ class Rod(eqx.Module):
         d2: Any = DEFAULT_D2,
         frames: Any = None,
         law: Law | None = None,
+        GA: Any = None,
     ) -> "Rod":
         """A rod that has the shape of a curve when it is free of stress; its length is that of the curve.
 
@@ -215,7 +226,7 @@ class Rod(eqx.Module):
         `Rod.rest_ends` gives position and frame of its ends, for the supports that leave it free of stress.
         """
         curve, length = SpaceCurve.through(points, d2, frames)
-        return _shaped(Rod(length, EI, GJ, EA, mass_per_length, radius, law=law), curve)
+        return _shaped(Rod(length, EI, GJ, EA, mass_per_length, radius, law=law, GA=GA), curve)
 
     def rest_ends(
         self, position: Any = None, frame: Any = None
@@ -487,7 +498,7 @@ def _check_arclengths(rod: Rod) -> None:
     if not is_known(rod):
         return
     length = float(rod.length)
-    for field in ("EI", "GJ", "EA", "mass_per_length", "radius", "rest_curvature", "rest_twist"):
+    for field in ("EI", "GJ", "EA", "GA", "mass_per_length", "radius", "rest_curvature", "rest_twist"):
         values = getattr(rod, field)
         named = {field: values}
         if isinstance(values, tuple):

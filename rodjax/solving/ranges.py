@@ -107,7 +107,7 @@ def _checked_when_made(scenes: Scene) -> Any:
 
 def _values_of(rod: Rod) -> list[Any]:
     """What may vary along the rod."""
-    values = [*rod.stiffnesses, rod.mass_per_length, rod.radius, rod.rest_twist]
+    values = [*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, rod.radius, rod.rest_twist]
     return [value for value in (*values, *(rod.rest_curvature or ())) if value is not None]
 
 
@@ -119,7 +119,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     good = [
         _each(xp.isfinite(leaf), scenes) for leaf in jax.tree.leaves(scenes) if jnp.issubdtype(leaf.dtype, jnp.floating)
     ]
-    positive = [length, *rod.stiffnesses, *([] if rod.radius is None else [rod.radius])]
+    positive = [length, *rod.stiffnesses, *(rod.shear_pair or ()), *([] if rod.radius is None else [rod.radius])]
     good += [_each(_numbers(value) > 0, scenes) for value in positive]
     good.append(_each(_numbers(rod.mass_per_length) >= 0, scenes))
     places = [xp.zeros_like(length), *(clip.at for clip in clips), length]

@@ -5,9 +5,9 @@ along the rod or that follow it. Between two stations
 
     phi' = (1 + e) t,  R' = R [kappa]x,  n' = -f,  m' = -phi' x n - c,
 
-and where sections shear phi' = (1 + e) d3 + gamma1 d1 + gamma2 d2; kappa is that at rest and what R^T m adds to it, f the weight and the forces per length, c the couples. Nothing is
-taken out of the frame's rotation. There is a station at each jump of what varies along the rod, so that all is smooth
-between two of them but for the knots of splines.
+and where sections shear phi' = (1 + e) d3 + gamma1 d1 + gamma2 d2; kappa is that at rest and what R^T m adds to it, f
+the weight and the forces per length, c the couples. Nothing is taken out of the frame's rotation. There is a station at
+each jump of what varies along the rod, so that all is smooth between two of them but for the knots of splines.
 """
 
 import functools

@@ -256,8 +256,14 @@ class FrameForm(Form):
         return self.layout.spans(self.held_places[0])
 
     def tangents_in_clips(self, point: FramePoint) -> Float[Array, "3 clips"]:
-        assert self.clip_nodes is not None
-        return point.tangents[:, 2 * self.clip_nodes]
+        nodes = self.clip_nodes
+        assert nodes is not None
+        if self.sections.GA is None:
+            return point.tangents[:, 2 * nodes]
+        # The centerline has a kink where the force jumps: the work of this force is that on the mean of both sides.
+        slopes = self.strained(point).slopes
+        mean = slopes[:, -1, nodes - 1] + slopes[:, 0, nodes]
+        return mean / jnp.sqrt(dot(mean, mean))[None]
 
     def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
         """The force through the cells besides that of the loads."""

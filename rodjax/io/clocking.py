@@ -63,6 +63,7 @@ class Clocking(NamedTuple):
         (other,) = {"start", "end"} - {name}
         if (
             isinstance(self.rod.EI, tuple)
+            or isinstance(self.rod.GA, tuple)
             or self.rod.rest_curvature is not None
             or self.rod.rest_centerline is not None
         ):

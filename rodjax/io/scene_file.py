@@ -69,13 +69,13 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 The keys of a rod, besides its section (optional ones in brackets; all but those of "centerline" have a length):
 
 - none: EI = "4.9e-3 N m^2", or EI1 and EI2, GJ = "3.3e-3 N m^2", EA = "785 N" [mass_per_length = "0.1 kg/m", radius,
-  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m"]
-- "circular": radius, material; "tube": outer_radius, inner_radius, material
-- "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist]
+  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m", GA = "260 N", or GA1 and GA2: shear]
+- "circular": radius, material; "tube": outer_radius, inner_radius, material [shear = true: sections shear]
+- "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist, shear]
 - "bundle": wires = 7, wire_radius, stick = 0.2, material
 - "layered": radii = "[0, 2, 3] mm", youngs_moduli = "[1, 50] MPa", poisson_ratios or shear_moduli [densities]
 - "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, d2 = [0, 1, 0], EI, or EI1 and EI2,
-  GJ, EA [mass_per_length, radius]
+  GJ, EA [mass_per_length, radius, GA, or GA1 and GA2]
 
 material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
 twist, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps, EI = {
@@ -142,6 +142,7 @@ MAX_STEPS = 10_000
 
 _ELASTIC = ("shear_modulus", "poisson_ratio", "density")
 _BENDING = ("EI", "EI1", "EI2")
+_SHEAR = ("GA", "GA1", "GA2")
 _REST = ("rest_curvature_1", "rest_curvature_2", "rest_twist")
 # What makes the rod, and the keys it must and may have.
 _SECTIONS = {
@@ -150,12 +151,18 @@ _SECTIONS = {
     "rectangular": (Rod.rectangular, ("length", "width", "height", "youngs_modulus"), (*_ELASTIC, *_REST)),
     "bundle": (Rod.bundle, ("length", "wires", "wire_radius", "youngs_modulus", "stick"), _ELASTIC),
     "layered": (Rod.layered, ("length", "radii", "youngs_moduli"), ("shear_moduli", "poisson_ratios", "densities")),
-    "centerline": (Rod.from_centerline, ("points", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", "d2")),
-    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", *_REST)),
+    "centerline": (
+        Rod.from_centerline,
+        ("points", "GJ", "EA"),
+        (*_BENDING, *_SHEAR, "mass_per_length", "radius", "d2"),
+    ),
+    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, *_SHEAR, "mass_per_length", "radius", *_REST)),
 }
+# Those whose stiffnesses follow from their material.
+_SHEARING = ("circular", "tube", "rectangular")
 # The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
-_VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", "radius", *_REST)
-PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
+_VARYING = (*_BENDING, *_SHEAR, "GJ", "EA", "mass_per_length", "radius", *_REST)
+PAIRS = {"EI": ("EI1", "EI2"), "GA": ("GA1", "GA2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
 DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
 # The keys that a support must have, may have, and may change along a path.
 _SUPPORTS = {
@@ -359,7 +366,8 @@ def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:
 def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
-    check_keys(table, "rod", required, (*optional, "section"))
+    may_shear = ("shear",) if section in _SHEARING else ()
+    check_keys(table, "rod", required, (*optional, *may_shear, "section"))
     if section == "centerline" and "d2" not in table:
         raise SceneFileError(
             "rod.d2 is missing: where d2 of the first frame along the centerline points, for example d2 = [0, 1, 0]"
@@ -367,10 +375,13 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
     # Not the radius from which the stiffnesses of a circular section come.
     may_vary = [key for key in _VARYING if key != "radius" or key in optional]
     varying = {key: value for key, value in table.items() if key in may_vary and isinstance(value, dict)}
-    values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=("section", *varying))
+    other = ("section", *may_shear, *varying)
+    values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=other)
     values |= {key: reader.part(_along, key, value) for key, value in varying.items()}
+    if may_shear and flag(table, "rod", "shear"):
+        values["shear"] = True
     if "EI" in optional:
-        _check_bending(table)
+        _check_stiffnesses(table)
     for name, keys in PAIRS.items():
         pair = [values.pop(key) for key in keys if key in values]
         if len(pair) == 1:
@@ -389,11 +400,13 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
             raise ValueError(_by_keys(str(error))) from None
 
 
-def _check_bending(table: dict[str, Any]) -> None:
+def _check_stiffnesses(table: dict[str, Any]) -> None:
     if not any(key in table for key in _BENDING):
         raise SceneFileError(f"rod.EI is missing, for example EI = {quantity('EI')[2]}; or rod.EI1 and rod.EI2")
     if "EI" in table and ("EI1" in table or "EI2" in table):
         raise SceneFileError("rod.EI is not allowed together with rod.EI1 and rod.EI2")
+    if "GA" in table and ("GA1" in table or "GA2" in table):
+        raise SceneFileError("rod.GA is not allowed together with rod.GA1 and rod.GA2")
 
 
 def _by_keys(message: str) -> str:

@@ -61,7 +61,7 @@ class ScaledLaw(Law):
 
 
 class Rod(eqx.Module):
-    """An extensible Kirchhoff rod.
+    """An extensible Kirchhoff rod; with `GA` the rod of Simo and Reissner, whose sections shear too.
 
     **Arguments:**
 
@@ -75,10 +75,14 @@ class Rod(eqx.Module):
         for a straight one. Not a first guess.
     - `rest_twist` [rad/m] in the shape without stress; `None` for none.
     - `law`: a density of energy of one's own, in place of the quadratic one. The stiffnesses above are then its scale.
+    - `GA`: shear stiffness [N], shear factor included; or a pair (GA1, GA2) for the components of phi' along d1 and d2,
+        whose energy GA1/2 gamma1^2 + GA2/2 gamma2^2 is added to any law. The frames (d1, d2, d3) are then those of the
+        sections, as is what clamps and tangents of supports hold: the centerline leaves d3 by the shear. `None`:
+        sections do not shear.
 
     Stiffnesses, mass, radius and components of the rest shape may be `Along`: `rodjax.Steps` or `rodjax.Smooth`. A rod
-    with one EI, nothing but its radius that varies, no rest shape and no law of its own needs no angle about its
-    tangent, and is solved faster.
+    with one EI, nothing but its radius that varies, no rest shape, no shear and no law of its own needs no angle about
+    its tangent, and is solved faster.
 
     Raises `ValueError` or `TypeError` where a stiffness or the length is not a positive finite number.
     """
@@ -246,14 +250,17 @@ class Rod(eqx.Module):
         shear_modulus: Any = None,
         poisson_ratio: Any = None,
         density: Any = 0.0,
+        shear: bool = False,
     ) -> "Rod":
         """A rod of solid circular section: EI = E pi R^4/4, GJ = G pi R^4/2, EA = E pi R^2.
 
         `length` and `radius` [m], `youngs_modulus` [Pa], `density` [kg/m^3], and exactly one of `shear_modulus` [Pa]
-        and `poisson_ratio`.
+        and `poisson_ratio`. `shear`: whether sections shear, GA = k G pi R^2 with the factor k = 6 (1 + nu)/(7 + 6 nu),
+        nu = E/(2 G) - 1, of Cowper, J. Appl. Mech. 33 (1966) 335.
         """
         radius = positive(radius, "radius")
-        return _round_section(length, radius, 0.0 * radius, youngs_modulus, shear_modulus, poisson_ratio, density)
+        section = radius, 0.0 * radius, youngs_modulus, shear_modulus, poisson_ratio, density
+        return _round_section(length, *section, shear=shear)
 
     @staticmethod
     def tube(
@@ -264,11 +271,16 @@ class Rod(eqx.Module):
         shear_modulus: Any = None,
         poisson_ratio: Any = None,
         density: Any = 0.0,
+        shear: bool = False,
     ) -> "Rod":
-        """A rod of annular section, a hose or pipe; arguments as for `Rod.circular`, radii [m]."""
+        """A rod of annular section, a hose or pipe; arguments as for `Rod.circular`, radii [m], shear factor likewise:
+
+        k = 6 (1 + nu) (1 + m^2)^2 / ((7 + 6 nu) (1 + m^2)^2 + (20 + 12 nu) m^2), m = inner_radius/outer_radius.
+        """
         outer = positive(outer_radius, "outer_radius")
         inner = positive(inner_radius, "inner_radius")
-        return _round_section(length, outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density)
+        section = outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density
+        return _round_section(length, *section, shear=shear)
 
     @staticmethod
     def layered(
@@ -318,11 +330,14 @@ class Rod(eqx.Module):
         density: Any = 0.0,
         rest_curvature: Any = None,
         rest_twist: Any = None,
+        shear: bool = False,
     ) -> "Rod":
         """A ribbon or strip: `width` [m] along d1, `height` [m] along d2; other arguments as for `Rod.circular`.
 
         EI1 = E width height^3/12 resists the bending that turns the section about d1. GJ by the series of St-Venant.
+        Cowper's factor of the shear is 10 (1 + nu)/(12 + 11 nu), along d1 and d2 alike.
         """
+        instance(shear, "shear", bool)
         width, height = positive(width, "width"), positive(height, "height")
         E = positive(youngs_modulus, "youngs_modulus")
         G = _shear_modulus(E, shear_modulus, poisson_ratio)
@@ -337,6 +352,7 @@ class Rod(eqx.Module):
             density * area,
             rest_curvature=rest_curvature,
             rest_twist=rest_twist,
+            GA=10 * E / (2 * G + 11 * E) * G * area if shear else None,
         )
 
     @staticmethod
@@ -388,9 +404,19 @@ def _round_section(
     shear_modulus: Any,
     poisson_ratio: Any,
     density: Any,
+    *,
+    shear: bool,
 ) -> Rod:
+    instance(shear, "shear", bool)
     EI, GJ, EA, mass = _ring(outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density)
-    return Rod(length, EI, GJ, EA, mass_per_length=mass, radius=outer)
+    GA = None
+    if shear:
+        # Cowper's factor with 1 + nu = E/(2 G), times G A = G EA/E.
+        E = positive(youngs_modulus, "youngs_modulus")
+        G, m = _shear_modulus(E, shear_modulus, poisson_ratio), (inner / outer) ** 2
+        ring = (1 + m) ** 2
+        GA = 3 * G * EA * ring / ((G + 3 * E) * ring + (8 * G + 6 * E) * m)
+    return Rod(length, EI, GJ, EA, mass_per_length=mass, radius=outer, GA=GA)
 
 
 def _ring(

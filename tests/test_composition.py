@@ -57,6 +57,7 @@ FEATURES = {
         "varying": lambda: rod(rj.Smooth([0.0, 0.5, 1.0], [1.0, 1.5, 2.0])),
         "stepped": lambda: rod(Steps([0.5], [1.0, 2.0])),
         "law": lambda: rod(law=Stiffening()),
+        "shearing": lambda: rod(GA=(200.0, 300.0)),
     },
     "ends": {
         "clamps": (CLAMP, FAR),

@@ -60,11 +60,13 @@ Prepared = Any
 class Material(eqx.Module):
     """What a rod is made of and the loads that follow it, splines already made of their values.
 
-    `rest`: curvature along d1 and d2 and twist, or a curve in space; `shear`: stiffnesses along d1 and d2.
+    `rest`: curvature along d1 and d2 and twist, or a curve in space; `shear`: stiffnesses along d1 and d2;
+    `rest_axial`: the axial strain without stress.
     """
 
     stiffnesses: tuple[Prepared, Prepared, Prepared, Prepared]
     shear: tuple[Prepared, Prepared] | None
+    rest_axial: Prepared | None
     mass: Prepared
     rest: tuple[Prepared, Prepared, Prepared] | SplinedCurve | None
     law: Law | None
@@ -88,6 +90,7 @@ class Material(eqx.Module):
         return Material(
             (EI1, EI2, GJ, EA),
             None if pair is None else (_prepared(pair[0]), _prepared(pair[1])),
+            None if rod.rest_strain is None else _prepared(rod.rest_strain),
             _prepared(rod.mass_per_length),
             prepared,
             rod.law,
@@ -98,7 +101,8 @@ class Material(eqx.Module):
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
         EI1, EI2, GJ, EA = (_at(value, s, interval) for value in self.stiffnesses)
         GA = None if self.shear is None else jnp.stack([_at(value, s, interval) for value in self.shear])
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law, GA)
+        rest_axial = None if self.rest_axial is None else _at(self.rest_axial, s, interval)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law, GA, rest_axial)
 
     def rest_strains(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Float[Array, "3"]:
         if self.rest is None:
@@ -161,19 +165,20 @@ class FarEnd(eqx.Module):
 
 
 class Strained(eqx.Module):
-    """Of a cross section: its sections, strains beyond those at rest, all of the strains, the axial one, and with shear
-    its strains.
+    """Of a cross section: its sections, strains beyond those at rest, all of the strains, the axial one beyond that at
+    rest and all of it, and with shear its strains.
     """
 
     sections: Sections
     beyond_rest: Float[Array, "3"]
     strains: Float[Array, "3"]
     axial: Float[Array, ""]
+    stretched: Float[Array, ""]
     shear: Float[Array, "2"] | None
 
     def slope(self, frame: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """phi'."""
-        along = (1 + self.axial) * frame[:, 2]
+        along = (1 + self.stretched) * frame[:, 2]
         return along if self.shear is None else along + frame[:, :2] @ self.shear
 
 
@@ -188,7 +193,8 @@ def _strained(
     sections = material.sections(s, interval)
     beyond_rest, axial = sections.strains_under(frame.T @ moment, jnp.sum(force * frame[:, 2]))
     shear = None if sections.GA is None else sections.shear_under((frame.T @ force)[:2])
-    return Strained(sections, beyond_rest, beyond_rest + material.rest_strains(s, interval), axial, shear)
+    strains = beyond_rest + material.rest_strains(s, interval)
+    return Strained(sections, beyond_rest, strains, axial, sections.stretched(axial), shear)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -417,7 +423,7 @@ def _equilibrium(
         nodes=nodes,
         curvature=root(dot(strains[:2], strains[:2])),
         twist=strains[2],
-        axial_strain=strained.axial,
+        axial_strain=strained.stretched,
         total_twist=jnp.sum(ends.twist),
         elastic_energy=jnp.sum(ends.elastic_energy),
         load_energy=jnp.sum(ends.load_energy),

@@ -87,9 +87,10 @@ def density(cells: CellStates, strains: Float[Array, "v p n"]) -> Float[Array, "
     if across:
         forces = jnp.stack(across)
         shear = sections.shear_under(forces)
-        enthalpy = sections.density(bent, twist, axial, shear) - tension * (1 + axial) - dot(forces, shear)
+        enthalpy = sections.density(bent, twist, axial, shear) - tension * (1 + sections.stretched(axial))
+        enthalpy -= dot(forces, shear)
     else:
-        enthalpy = sections.density(bent, twist, axial) - tension * (1 + axial)
+        enthalpy = sections.density(bent, twist, axial) - tension * (1 + sections.stretched(axial))
     value = cells.field.lengths * enthalpy
     if cells.rest_ways is not None and cells.rest_ways.along is not None:
         assert cells.rest_strains is not None

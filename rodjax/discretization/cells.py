@@ -25,7 +25,7 @@ from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes
 from rodjax.geometry.rotations import inverse, product, unit
 from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
-from rodjax.model.along import Steps, stiffness_at
+from rodjax.model.along import Steps, stiffness_at, value_at
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
 
@@ -251,7 +251,11 @@ class JointCells(eqx.Module):
         if rod.shear_pair is not None:
             edges = jnp.stack([stiffness_at(value, (a + b) / 2, a, b) for value in rod.shear_pair])
             GA = jnp.stack([jnp.append(edges[:, :1], edges, axis=1), jnp.append(edges, edges[:, -1:], axis=1)], axis=1)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA)
+        rest_axial = None
+        if rod.rest_strain is not None:
+            edges = value_at(rod.rest_strain, (a + b) / 2, a, b)
+            rest_axial = jnp.stack([jnp.append(edges[:1], edges), jnp.append(edges, edges[-1:])])
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:
         of_edges = jnp.clip((at - self.s[:-1]) / jnp.diff(self.s), 0.0, 1.0)
@@ -339,7 +343,8 @@ class ElementCells(eqx.Module):
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
         EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in rod.stiffnesses)
         GA = None if rod.shear_pair is None else jnp.stack([stiffness_at(value, s, a, b) for value in rod.shear_pair])
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law, GA)
+        rest_axial = None if rod.rest_strain is None else value_at(rod.rest_strain, s, a, b)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
         return parts_before(self.s, at)
@@ -353,7 +358,7 @@ class ElementCells(eqx.Module):
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
     """The arclengths of the jumps of a rod and of loads along it."""
     rod = scene.rod
-    rest = (*(rod.rest_curvature or ()), rod.rest_twist)
+    rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
     values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
     return [value.jumps for value in values if isinstance(value, Steps)]
 

@@ -72,14 +72,15 @@ class FramePoint(eqx.Module):
 
 
 class Strained(eqx.Module):
-    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, axial strains under
-    the tension, tangents, and the lengths along these to the next node; the lengths of rod that they stand for, and
-    with shear its strains and what it adds to phi'.
+    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, and `axial` ones
+    under the tension, which with those at rest are `stretched`; tangents, and the lengths along these to the next node;
+    the lengths of rod that they stand for, and with shear its strains and what it adds to phi'.
     """
 
     curvature: Float[Array, "2 p n"]
     twist: Float[Array, "p n"]
     axial: Float[Array, "p n"]
+    stretched: Float[Array, "p n"]
     tension: Float[Array, "p n"]
     tangents: Float[Array, "3 p n"]
     lengths: Float[Array, "p n"]
@@ -95,7 +96,7 @@ class Strained(eqx.Module):
     @property
     def slopes(self) -> Float[Array, "3 p n"]:
         """phi'."""
-        along = (1 + self.axial)[None] * self.tangents
+        along = (1 + self.stretched)[None] * self.tangents
         return along if self.sideways is None else along + self.sideways
 
     def work(self, forces: Float[Array, "3 p n"]) -> Float[Array, "p n"]:
@@ -305,14 +306,16 @@ class FrameForm(Form):
         tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
         weights = self.field.lengths
-        lengths = weights * (1 + axial)
+        stretched = self.sections.stretched(axial)
+        lengths = weights * (1 + stretched)
         if here.along is not None:
             lengths += here.along
         shear = sideways = None
         if here.across is not None:
             shear = self.sections.shear_under(short_sum(here.across * forces[:, None], axis=0))
             sideways = short_sum(here.across * shear[None], axis=1)
-        return Strained(strains[:2], strains[2], axial, tension, tangents, lengths, weights, shear, sideways)
+        of_axis = strains[2], axial, stretched, tension
+        return Strained(strains[:2], *of_axis, tangents, lengths, weights, shear, sideways)
 
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)

@@ -16,11 +16,12 @@ from rodjax.model.supports import Free, Held
 
 def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     """The fields of a `framed.FrameForm`."""
-    rest_strains, rest_ways = _at_rest(scene, field)
+    sections = field.sections(scene.rod)
+    rest_strains, rest_ways = _at_rest(scene, field, sections.rest_axial)
     return {
         "scene": scene,
         "field": field,
-        "sections": field.sections(scene.rod),
+        "sections": sections,
         "rest_strains": rest_strains,
         "rest_ways": rest_ways,
         "loads": _dead_loads(scene, field),
@@ -28,7 +29,9 @@ def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     }
 
 
-def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
+def _at_rest(
+    scene: Scene, cells: Cells, rest_axial: Float[Array, "k n"] | None
+) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
     """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
     rest = scene.rod.rest_shape
     if rest is None:
@@ -40,7 +43,8 @@ def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, 
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
     strains = strains_between(cells, frames)
-    return strains, RestWays.of(cells, frames, strains, jnp.diff(poses.positions[:, ::2], axis=1), q[:, 1::2])
+    edges = jnp.diff(poses.positions[:, ::2], axis=1)
+    return strains, RestWays.of(cells, frames, strains, edges, q[:, 1::2], rest_axial)
 
 
 def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:

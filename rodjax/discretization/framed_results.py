@@ -119,7 +119,8 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
         last_cell = jnp.concatenate([a, a[-1:]]), jnp.concatenate([b, b[-1:]])
         strains += rest.at(field.s, *last_cell)
     mean = jnp.concatenate([first[:, :1], (first[:, 1:] + last[:, :-1]) / 2, last[:, -1:]], axis=1)
-    return NodeStrains(moments, strains, axial, dot(mean, tangent(q)), _shear_under(sections, q, beyond))
+    shear = _shear_under(sections, q, beyond)
+    return NodeStrains(moments, strains, sections.stretched(axial), dot(mean, tangent(q)), shear)
 
 
 def _shear_under(
@@ -158,7 +159,7 @@ def _strains_at_ends(
     if rest is not None:
         s = field.strain_places[::2]
         strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
-    return strains, axial
+    return strains, sections.stretched(axial)
 
 
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
@@ -196,7 +197,7 @@ def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
     def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
         return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)
 
-    parts = [strains[..., 1:-1], here.axial[:, 1:-1], here.tension[:, 1:-1]]
+    parts = [strains[..., 1:-1], here.stretched[:, 1:-1], here.tension[:, 1:-1]]
     parts += [] if here.shear is None else [here.shear[..., 1:-1]]
     found = [between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)]
     return NodeStrains(moments, *found[:3], None if here.shear is None else found[3])
@@ -214,7 +215,7 @@ def _strains_at_end(
     if rest is not None:
         s = form.field.s
         strains += rest.at(s[k, None], s[[0, -2][k], None], s[[1, -1][k], None])
-    return strains, axial, tension, _shear_under(sections, q, force[:, None])
+    return strains, sections.stretched(axial), tension, _shear_under(sections, q, force[:, None])
 
 
 def positions_between_frames(
@@ -348,7 +349,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         if rest is not None:
             strains += rest.at(field.s[:-1] + x * h, field.s[:-1], field.s[1:])
         rate = product(q, jnp.concatenate([jnp.zeros_like(t[:1]), strains])) / 2
-        way = (1 + axial)[None] * t
+        way = (1 + here.stretched(axial))[None] * t
         if shear is not None:
             way += short_sum(columns(q)[:, :2] * shear[None], axis=1)
         moment = -cross(way, force)

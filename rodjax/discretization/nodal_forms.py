@@ -132,7 +132,7 @@ class NodalFrames(NodalForm, FrameForm):
 
     def node_slopes(self, point: FramePoint) -> Float[Array, "n+1 3"]:
         here = self.strained(point)
-        strain = self.field.assembled(self.field.lengths * here.axial) / self.field.weights
+        strain = self.field.assembled(self.field.lengths * here.stretched) / self.field.weights
         slopes = (1 + strain)[None] * point.tangents
         if here.sideways is not None:
             slopes += self.field.assembled(self.field.lengths[None] * here.sideways) / self.field.weights[None]

@@ -30,6 +30,7 @@ UNITS = {
     "rod.radius": "m",
     "rod.rest_curvature": "1/m",
     "rod.rest_twist": "rad/m",
+    "rod.rest_strain": "",
     "position": "m",
     "tangent": "",
     "frame": "rad",

@@ -100,6 +100,7 @@ FIELDS = {
             ("radius", "m", "radius of the rod, for pictures"),
             ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
             ("rest_twist", "rad/m", "twist without stress"),
+            ("rest_strain", "1", "axial strain without stress"),
         )
         for leaf, leaf_unit, what in (
             ("", "", ""),

@@ -40,6 +40,7 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "rest_curvature_1": ("1/m", (), '"2 1/m"'),
     "rest_curvature_2": ("1/m", (), '"0 1/m"'),
     "rest_twist": ("rad/m", (), '"0.5 rad/m"'),
+    "rest_strain": ("", (), "0.002"),
     "width": ("m", (), '"10 mm"'),
     "height": ("m", (), '"1 mm"'),
     "wires": ("", (), "7"),

@@ -69,17 +69,18 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 The keys of a rod, besides its section (optional ones in brackets; all but those of "centerline" have a length):
 
 - none: EI = "4.9e-3 N m^2", or EI1 and EI2, GJ = "3.3e-3 N m^2", EA = "785 N" [mass_per_length = "0.1 kg/m", radius,
-  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m", GA = "260 N", or GA1 and GA2: shear]
-- "circular": radius, material; "tube": outer_radius, inner_radius, material [shear = true: sections shear]
+  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m", rest_strain = 0.002; GA = "260 N", or GA1
+  and GA2: sections shear]
+- "circular": radius, material; "tube": outer_radius, inner_radius, material [shear = true: GA of the material]
 - "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist, shear]
 - "bundle": wires = 7, wire_radius, stick = 0.2, material
 - "layered": radii = "[0, 2, 3] mm", youngs_moduli = "[1, 50] MPa", poisson_ratios or shear_moduli [densities]
 - "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, d2 = [0, 1, 0], EI, or EI1 and EI2,
   GJ, EA [mass_per_length, radius, GA, or GA1 and GA2]
 
-material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
-twist, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps, EI = {
-jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
+material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures, twist
+and strain, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps,
+EI = { jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
 
 A clamp with a tangent alone says nothing of its clocking, the angle about that tangent. Such an end is fitted without
 torsion: its frame follows the rod, which is a swivel in energy. Where one clamp alone resists a moment about the
@@ -156,12 +157,12 @@ _SECTIONS = {
         ("points", "GJ", "EA"),
         (*_BENDING, *_SHEAR, "mass_per_length", "radius", "d2"),
     ),
-    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, *_SHEAR, "mass_per_length", "radius", *_REST)),
+    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, *_SHEAR, "mass_per_length", "radius", *_REST, "rest_strain")),
 }
 # Those whose stiffnesses follow from their material.
 _SHEARING = ("circular", "tube", "rectangular")
 # The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
-_VARYING = (*_BENDING, *_SHEAR, "GJ", "EA", "mass_per_length", "radius", *_REST)
+_VARYING = (*_BENDING, *_SHEAR, "GJ", "EA", "mass_per_length", "radius", *_REST, "rest_strain")
 PAIRS = {"EI": ("EI1", "EI2"), "GA": ("GA1", "GA2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
 DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
 # The keys that a support must have, may have, and may change along a path.

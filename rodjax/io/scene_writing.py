@@ -82,7 +82,7 @@ def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[s
 
 def _written_rod(rod: Rod) -> list[str]:
     lines = _written(rod, ("length",))
-    for name in ("radius", "EI", "GJ", "EA", "GA", "mass_per_length", "rest_curvature", "rest_twist"):
+    for name in ("radius", "EI", "GJ", "EA", "GA", "mass_per_length", "rest_curvature", "rest_twist", "rest_strain"):
         value = getattr(rod, name)
         values = zip(PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
         lines += [_written_value(key, value) for key, value in values if value is not None]

@@ -80,7 +80,7 @@ class Sections(eqx.Module):
     """What resists at k places along a rod that is not the same everywhere, or has a law of its own.
 
     `EI`: of the components of t x t' along d1 and d2; `s`: arclengths; `GA`: of the shear strains along d1 and d2,
-    `None` where sections do not shear.
+    `None` where sections do not shear; `rest_axial`: the axial strains without stress, `None` where these are none.
     """
 
     EI: Float[Array, "2 *k"]
@@ -89,11 +89,13 @@ class Sections(eqx.Module):
     s: Float[Array, "*k"]
     law: Law | None
     GA: Float[Array, "2 *k"] | None = None
+    rest_axial: Float[Array, "*k"] | None = None
 
     def at(self, k: int) -> "Sections":
         """At the strain point k of every cell."""
         GA = None if self.GA is None else self.GA[:, k]
-        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law, GA)
+        rest_axial = None if self.rest_axial is None else self.rest_axial[k]
+        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law, GA, rest_axial)
 
     def density(
         self,
@@ -118,6 +120,10 @@ class Sections(eqx.Module):
         bending = (self.EI[0] * curvature[0] ** 2 + self.EI[1] * curvature[1] ** 2) / 2
         return bending + self.GJ / 2 * twist**2 + self.EA / 2 * axial_strain**2
 
+    def stretched(self, axial_strain: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """All of the axial strain, of what it exceeds that without stress by."""
+        return axial_strain if self.rest_axial is None else axial_strain + self.rest_axial
+
     def shear_under(self, force: Float[Array, "2 *k"]) -> Float[Array, "2 *k"]:
         """The shear strains at which their forces dw/d(gamma) along d1 and d2 are the given ones [N]."""
         assert self.GA is not None
@@ -126,7 +132,7 @@ class Sections(eqx.Module):
     def axial_strain_under(
         self, tension: Float[Array, "*k"], curvature: tuple[Array, Array], twist: Float[Array, "*k"]
     ) -> Float[Array, "*k"]:
-        """The axial strain at which the tension dw/d(axial strain) is the given one [N].
+        """What the axial strain exceeds that at rest by where the tension dw/d(axial strain) is the given one [N].
 
         By Newton's method where there is a law; the derivatives of the last step are those of the solution as far as
         they enter derivatives of the energy (to the third).
@@ -150,7 +156,7 @@ class Sections(eqx.Module):
     def strains_under(
         self, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
     ) -> tuple[Float[Array, "3 *k"], Float[Array, "*k"]]:
-        """What the strains exceed those at rest by, under a moment in material axes, and the axial strain."""
+        """What the strains exceed those at rest by, under a moment in material axes, and the axial strain likewise."""
         strains = moment / jnp.concatenate([self.EI, self.GJ[None]])
         if self.law is None:
             return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])

@@ -79,10 +79,12 @@ class Rod(eqx.Module):
         whose energy GA1/2 gamma1^2 + GA2/2 gamma2^2 is added to any law. The frames (d1, d2, d3) are then those of the
         sections, as is what clamps and tangents of supports hold: the centerline leaves d3 by the shear. `None`:
         sections do not shear.
+    - `rest_strain`: the axial strain |phi'| - 1 without stress, above -1: of a heated part its expansion times the rise
+        of temperature, of a shrunk part negative; `None` for none. Rest curvature and twist stay per length s.
 
     Stiffnesses, mass, radius and components of the rest shape may be `Along`: `rodjax.Steps` or `rodjax.Smooth`. A rod
-    with one EI, nothing but its radius that varies, no rest shape, no shear and no law of its own needs no angle about
-    its tangent, and is solved faster.
+    with one EI, nothing but its radius that varies, no rest shape or strain, no shear and no law of its own needs no
+    angle about its tangent, and is solved faster.
 
     Raises `ValueError` or `TypeError` where a stiffness or the length is not a positive finite number.
     """
@@ -98,6 +100,7 @@ class Rod(eqx.Module):
     rest_centerline: SpaceCurve | None
     law: Law | None
     GA: Value | Pair | None
+    rest_strain: Value | None
 
     def __init__(
         self,
@@ -112,6 +115,7 @@ class Rod(eqx.Module):
         *,
         law: Law | None = None,
         GA: Any = None,
+        rest_strain: Any = None,
     ):
         self.length = leaf(positive(length, "length"))
         self.EI = _pair(EI, "EI", positive) if _is_pair(EI) else _value(EI, "EI", positive)
@@ -126,6 +130,7 @@ class Rod(eqx.Module):
         self.rest_centerline = None
         self.law = None if law is None else _law(law)
         self.GA = None if GA is None else _pair(GA, "GA", positive) if _is_pair(GA) else _value(GA, "GA", positive)
+        self.rest_strain = None if rest_strain is None else _value(rest_strain, "rest_strain", _above_minus_one)
         _check_arclengths(self)
 
     @property
@@ -142,6 +147,7 @@ class Rod(eqx.Module):
             and self.rest_centerline is None
             and self.law is None
             and self.GA is None
+            and self.rest_strain is None
         )
 
     @property
@@ -164,7 +170,13 @@ class Rod(eqx.Module):
             return self.rest_centerline
         if self.rest_curvature is None and self.rest_twist is None:
             return None
-        return RestStrain(self.rest_curvature, self.rest_twist)
+        return RestStrain(self.rest_curvature, self.rest_twist, self.rest_strain)
+
+    @property
+    def stress_free(self) -> RestShape:
+        """The rest shape, or the straight rod where there is none."""
+        shape = self.rest_shape
+        return RestStrain(None, None, self.rest_strain) if shape is None else shape
 
     @property
     def bending_scale(self) -> Float[Array, ""]:
@@ -191,7 +203,7 @@ class Rod(eqx.Module):
         EI = tuple(scaled(value, L, bending) for value in self.bending_pair)
         mass = self.mass_per_length
         rest = self.rest_shape
-        strain = rest.scaled(L) if isinstance(rest, RestStrain) else RestStrain(None, None)
+        strain = rest.scaled(L) if isinstance(rest, RestStrain) else RestStrain(None, None, None)
         scaled_rod = Rod(
             one,
             EI,
@@ -203,6 +215,7 @@ class Rod(eqx.Module):
             strain.twist,
             law=None if self.law is None else ScaledLaw(self.law, L, units.energy),
             GA=None if self.shear_pair is None else tuple(scaled(value, L, units.force) for value in self.shear_pair),
+            rest_strain=None if self.rest_strain is None else scaled(self.rest_strain, L, one),
         )
         return _shaped(scaled_rod, rest.scaled(L)) if isinstance(rest, SpaceCurve) else scaled_rod
 
@@ -240,7 +253,7 @@ class Rod(eqx.Module):
         `position`, `frame`: of the start; `None` for where `from_centerline` was given the points, else for the origin
         and the global axes.
         """
-        return ends(self.rest_shape, self.length, position, frame)
+        return ends(self.stress_free, self.length, position, frame)
 
     @staticmethod
     def circular(
@@ -479,6 +492,13 @@ def _shaped(rod: Rod, curve: SpaceCurve) -> Rod:
     return eqx.tree_at(lambda rod: rod.rest_centerline, rod, curve, is_leaf=lambda value: value is None)
 
 
+def _above_minus_one(value: Any, name: str) -> Float[Numbers, ""]:
+    number = number_array(value, name)
+    if is_known(number) and not float(number) > -1:
+        raise ValueError(f"{name} must be above -1, where nothing of the rod is left, got {float(number):g}")
+    return number
+
+
 def _law(law: Any) -> Law:
     """A law with arrays for its numbers, which gives a number."""
     instance(law, "law", Law)
@@ -524,7 +544,7 @@ def _check_arclengths(rod: Rod) -> None:
     if not is_known(rod):
         return
     length = float(rod.length)
-    for field in ("EI", "GJ", "EA", "GA", "mass_per_length", "radius", "rest_curvature", "rest_twist"):
+    for field in ("EI", "GJ", "EA", "GA", "mass_per_length", "radius", "rest_curvature", "rest_twist", "rest_strain"):
         values = getattr(rod, field)
         named = {field: values}
         if isinstance(values, tuple):

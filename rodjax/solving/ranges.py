@@ -107,7 +107,14 @@ def _checked_when_made(scenes: Scene) -> Any:
 
 def _values_of(rod: Rod) -> list[Any]:
     """What may vary along the rod."""
-    values = [*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, rod.radius, rod.rest_twist]
+    values = [
+        *rod.stiffnesses,
+        *(rod.shear_pair or ()),
+        rod.mass_per_length,
+        rod.radius,
+        rod.rest_twist,
+        rod.rest_strain,
+    ]
     return [value for value in (*values, *(rod.rest_curvature or ())) if value is not None]
 
 
@@ -122,6 +129,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     positive = [length, *rod.stiffnesses, *(rod.shear_pair or ()), *([] if rod.radius is None else [rod.radius])]
     good += [_each(_numbers(value) > 0, scenes) for value in positive]
     good.append(_each(_numbers(rod.mass_per_length) >= 0, scenes))
+    good += [] if rod.rest_strain is None else [_each(_numbers(rod.rest_strain) > -1, scenes)]
     places = [xp.zeros_like(length), *(clip.at for clip in clips), length]
     good += [before < after for before, after in itertools.pairwise(places)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]

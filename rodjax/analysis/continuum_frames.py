@@ -10,6 +10,7 @@ the weight and the forces per length, c the couples. Nothing is taken out of the
 each jump of what varies along the rod, so that all is smooth between two of them but for the knots of splines.
 """
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -94,9 +95,14 @@ class Material(eqx.Module):
             _prepared(rod.mass_per_length),
             prepared,
             rod.law,
-            sum_of_loads(scene, DistributedForce, True),
-            sum_of_loads(scene, DistributedCouple, True),
+            None,
+            None,
         )
+
+    def loaded(self, scene: Scene, s: Float[Array, ""]) -> "Material":
+        """With the loads that follow it at an arclength."""
+        loads = (sum_of_loads(scene, kind, True, s) for kind in (DistributedForce, DistributedCouple))
+        return dataclasses.replace(self, **dict(zip(("force", "couple"), loads, strict=True)))
 
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
         EI1, EI2, GJ, EA = (_at(value, s, interval) for value in self.stiffnesses)
@@ -286,14 +292,13 @@ def _reached(
 ) -> tuple[Section, FarEnd]:
     """The cross sections at the other ends of pieces of rod from cross sections on, and those ends."""
     material = Material.of(scene)
-    along = (sum_of_loads(scene, kind, False) for kind in (DistributedForce, DistributedCouple))
-    dead = (scene.gravity, *along)
 
     def reached(section, start, length, interval):
-        axes = section.frame.T
-        gravity, force, couple = (None if load is None else axes @ load for load in dead)
+        axes, middle = section.frame.T, jnp.mean(interval)
+        along = (sum_of_loads(scene, kind, False, middle) for kind in (DistributedForce, DistributedCouple))
+        gravity, force, couple = (None if load is None else axes @ load for load in (scene.gravity, *along))
         n, m = axes @ section.force, axes @ section.moment
-        piece = Piece(start, length, interval, n, m, gravity, force, couple, material)
+        piece = Piece(start, length, interval, n, m, gravity, force, couple, material.loaded(scene, middle))
         end = far_end(rtol, piece)
         beyond = Section(
             position=section.position + section.frame @ end.position,

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from rodjax.discretization.shape import Shape
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.along import Along
-from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.loads import DistributedForce, per_length
 from rodjax.model.scene import Scene, held_at_both_ends, nondimensional, slid
 from rodjax.model.supports import Clamp, Free, Held, Support, Swivel
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState
@@ -373,9 +373,9 @@ def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Fl
         mass = scene.rod.mass_per_length
         before = mass.integral(start.s) if isinstance(mass, Along) else start.s
         by_interval.append(jnp.diff(before)[:, None] * scene.gravity[None])
-    dead_force = sum_of_loads(scene, DistributedForce, False)
+    dead_force = sum_of_loads(scene, DistributedForce, False, (start.s[:-1] + start.s[1:]) / 2)
     if dead_force is not None:
-        by_interval.append(jnp.diff(start.s)[:, None] * dead_force[None])
+        by_interval.append(jnp.diff(start.s)[:, None] * dead_force.T)
     for forces in by_interval:
         energy += jnp.sum(jax.vmap(dead_load_energy)(forces, positions[:-1]))
     if scene.point_forces:
@@ -386,10 +386,10 @@ def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Fl
     return energy
 
 
-def sum_of_loads(scene: Scene, kind: type, follower: bool) -> Float[Array, "3"] | None:
-    """Of the loads of one kind all along the rod, per length."""
+def sum_of_loads(scene: Scene, kind: type, follower: bool, s: Float[Array, "*k"]) -> Float[Array, "3 *k"] | None:
+    """Of the loads of one kind along the rod, per length, at arclengths that are none of those where a part ends."""
     loads = [load for load in scene.distributed if isinstance(load, kind) and load.follower == follower]
-    values = [load.couple if isinstance(load, DistributedCouple) else load.force for load in loads]
+    values = [per_length(load, s) for load in loads]
     return sum(values[1:], values[0]) if values else None
 
 

@@ -360,7 +360,8 @@ def varying(scene: Scene) -> list[Float[Array, "k"]]:
     rod = scene.rod
     rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
     values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
-    return [value.jumps for value in values if isinstance(value, Steps)]
+    jumps = [value.jumps for value in values if isinstance(value, Steps)]
+    return jumps + [load.part for load in scene.distributed if load.part is not None]
 
 
 def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbers, "..."]] | None:

@@ -9,7 +9,7 @@ from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.rest_ways import RestWays
 from rodjax.model.along import Along
-from rodjax.model.loads import DistributedForce
+from rodjax.model.loads import DistributedForce, length_before, loaded_length
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Free, Held
 
@@ -51,14 +51,15 @@ def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
     """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
     starts_held = isinstance(scene.start, Held)
     s = cells.strain_places
-    forces = jnp.zeros((3, *s.shape), s.dtype)
+    forces, one = jnp.zeros((3, *s.shape), s.dtype), jnp.ones((), s.dtype)
     if scene.gravity is not None:
         mass = scene.rod.mass_per_length
         before = mass.integral(s) if isinstance(mass, Along) else s
         forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
     for load in scene.distributed:
         if isinstance(load, DistributedForce) and not load.follower:
-            forces += load.force[:, None, None] * (1.0 - s if starts_held else -s)[None]
+            before = length_before(load, s)
+            forces += load.force[:, None, None] * (loaded_length(load, one) - before if starts_held else -before)[None]
     for load in scene.point_forces:
         before = cells.parts_before(load.at)
         forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]

@@ -9,14 +9,13 @@ import functools
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.hermite import SIMPSON
 from rodjax.geometry.rotations import inverse, rotated
-from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.loads import DistributedCouple, DistributedForce, per_length
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Free, Support
 
@@ -25,7 +24,7 @@ def following(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 
     """What the follower forces along the rod exert on each strain point from there to the end of its element, by
     parabolas through the three points; `None` without such.
     """
-    force = _follower_force(scene, quaternions)
+    force = _follower_force(scene, field, quaternions)
     if force is None:
         return None
     a, b, c = (force[:, k] for k in range(3))
@@ -36,7 +35,7 @@ def following(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 
 
 def on_nodes(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "2 3 n"]:
     """What follower forces are for the balance of the nodes at both ends of each element."""
-    force = _follower_force(scene, quaternions)
+    force = _follower_force(scene, field, quaternions)
     loads = jnp.zeros((2, *quaternions[1:, 0].shape), quaternions.dtype)
     if force is not None:
         loads = loads.at[0].set(_whole(field, force))
@@ -46,14 +45,22 @@ def on_nodes(scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n
     return loads
 
 
-def _follower_force(scene: Scene, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "3 3 n"] | None:
+def _follower_force(
+    scene: Scene, field: ElementCells, quaternions: Float[Array, "4 3 n"]
+) -> Float[Array, "3 3 n"] | None:
     """Per length, global axes."""
     parts = [
-        rotated(quaternions, jnp.broadcast_to(load.force[:, None, None], quaternions[1:].shape))
+        rotated(quaternions, _at_points(load, field))
         for load in scene.distributed
         if isinstance(load, DistributedForce) and load.follower
     ]
     return functools.reduce(jnp.add, parts) if parts else None
+
+
+def _at_points(load: DistributedForce | DistributedCouple, field: ElementCells) -> Float[Array, "3 3 n"]:
+    """Per length at the points of elements, on which it is the same: a part has nodes where it ends."""
+    by_element = per_length(load, field.strain_places[1])
+    return jnp.broadcast_to(by_element[:, None], (3, *field.strain_places.shape))
 
 
 def _whole(field: ElementCells, force: Float[Array, "3 3 n"]) -> Float[Array, "3 n"]:
@@ -67,7 +74,7 @@ def couples_along(
     parts = []
     for load in scene.distributed:
         if isinstance(load, DistributedCouple):
-            couple = jnp.broadcast_to(load.couple[:, None, None], quaternions[1:].shape)
+            couple = _at_points(load, field)
             parts.append(field.lengths[None] * (couple if load.follower else rotated(inverse(quaternions), couple)))
     return functools.reduce(jnp.add, parts) if parts else None
 
@@ -98,7 +105,10 @@ def scaled(scene: Scene, part: Float[Array, ""]) -> Scene:
     """The scene with a part of these loads."""
 
     def of(load: Any) -> Any:
-        return jax.tree.map(lambda leaf: part * leaf, load) if _is_nonconservative(load) else load
+        if not _is_nonconservative(load):
+            return load
+        kind = DistributedCouple if isinstance(load, DistributedCouple) else DistributedForce
+        return kind(part * (load.couple if kind is DistributedCouple else load.force), load.follower, load.part)
 
     def at(end: Support) -> Support:
         if not isinstance(end, Free):

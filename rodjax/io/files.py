@@ -137,6 +137,7 @@ FIELDS = {
     },
     **{f"{where}/obstacles/*/friction": ("1", "coefficient of friction") for where in ("scene", "state/before")},
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
+    "scene/distributed/*/part": ("m", "arclengths between which a load acts"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
         f"scene/{end}/{name}": (unit, f"{description} at s = {place}, {axes}")

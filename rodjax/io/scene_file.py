@@ -35,6 +35,7 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 
     # [[loads.distributed_force]]  # any number of these, too: all along the rod
     # force = "[0, 0, -0.02] N/m"
+    # part = "[0.2, 0.5] m"        # optional: the arclengths between which it acts
     # follower = true              # optional: where it turns with the rod
     # [[loads.distributed_couple]]
     # couple = "[0, 1e-5, 0] N m/m"
@@ -488,8 +489,9 @@ def _loads(
         make, key = DISTRIBUTED[name]
         for k, load in enumerate(table_list(table[name], f"loads.{name}")):
             where = f"loads.{name}[{k}]"
-            numbers = reader.si_values(load, where, (key,), (), other=("follower",))
-            distributed.append(make(numbers[key], flag(load, where, "follower")))
+            numbers = reader.si_values(load, where, (key,), ("part",), other=("follower",))
+            with named(where):
+                distributed.append(make(numbers[key], flag(load, where, "follower"), numbers.get("part")))
     return values, forces, distributed
 
 

@@ -63,7 +63,7 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
         name, key = next((name, key) for name, (of_name, key) in DISTRIBUTED.items() if of_name is kind)
         for load in scene.distributed:
             if isinstance(load, kind):
-                lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
+                lines += ["", f"[[loads.{name}]]", *_written(load, (key, "part"), name), *_written_follower(load)]
     for clip in scene.clips:
         lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
         lines += ["sliding = true"] if clip.sliding else []

@@ -41,7 +41,7 @@ class Scene(eqx.Module):
         whose frames turn by less than pi to those of this scene, so that turns are carried along a path; else the total
         twist nearest to that of the initial shape. Two clamps only, and no clip with a frame between them: there an
         earlier equilibrium as a guess carries the turns of each span.
-    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
+    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod, or along a part of it.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
         it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding. Of a mesh
@@ -163,6 +163,11 @@ def _check_numbers(scene: Scene) -> None:
     for k, force in enumerate(scene.point_forces):
         if float(force.at) > length:
             raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
+    for k, load in enumerate(scene.distributed):
+        if load.part is not None and float(load.part[1]) > length * (1 + ONE_PLACE):
+            raise ValueError(
+                f"distributed[{k}].part must lie in 0 to {length:g} m, got {np.asarray(load.part).tolist()}"
+            )
     start, end = scene.start, scene.end
     if isinstance(start, Held) and isinstance(end, Held):
         with np.errstate(over="ignore"):

@@ -133,6 +133,8 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     places = [xp.zeros_like(length), *(clip.at for clip in clips), length]
     good += [before < after for before, after in itertools.pairwise(places)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]
+    for part in (load.part for load in scenes.distributed if load.part is not None):
+        good += [part[..., 0] >= 0, part[..., 0] < part[..., 1], part[..., 1] <= length * (1 + ARCLENGTH_TOLERANCE)]
     frames = [end.frame for end in (scenes.start, scenes.end) if isinstance(end, Clamp)]
     good += [
         _each(_is_rotation(frame), scenes) for frame in (*frames, *(clip.frame for clip in clips)) if frame is not None

@@ -11,7 +11,7 @@ from rodjax.io.files import load, save
 from rodjax.io.scene_file import SceneFileError, read_scene
 from rodjax.io.scene_writing import write_scene
 from rodjax.model.along import Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
@@ -105,6 +105,7 @@ __all__ = [
     "Pin",
     "Pipe",
     "Plane",
+    "PointCouple",
     "PointForce",
     "Potential",
     "Reading",

@@ -305,7 +305,7 @@ def test_scene_files_take_shear(tmp_path):
         with pytest.raises(ValueError, match=message):
             read(rod)
     # Where sections differ in two directions it counts how they stand.
-    with pytest.raises(ValueError, match="start.d2"):
+    with pytest.raises(ValueError, match=r"start\.d2"):
         read(of_numbers + 'GA1 = "1 N"\nGA2 = "2 N"\n', d2="")
 
 

@@ -27,7 +27,7 @@ from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
 from rodjax.model.along import Steps, stiffness_at, value_at
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, loads_at_nodes
 
 # The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
 REFERENCE = 1
@@ -356,12 +356,14 @@ class ElementCells(eqx.Module):
 
 
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
-    """The arclengths of the jumps of a rod and of loads along it."""
+    """The arclengths of the jumps of a rod and of loads along it, and of loads that all belong to one node."""
     rod = scene.rod
     rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
     values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
     jumps = [value.jumps for value in values if isinstance(value, Steps)]
-    return jumps + [load.part for load in scene.distributed if load.part is not None]
+    jumps += [load.part for load in scene.distributed if load.part is not None]
+    # Of such a load all is on one node, and what it does jumps there.
+    return jumps + [load.at[..., None] for load in loads_at_nodes(scene)]
 
 
 def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbers, "..."]] | None:

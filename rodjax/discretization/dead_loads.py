@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.loads import DistributedForce, loaded_length
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, dead_forces
 from rodjax.model.supports import Free, Held
 from rodjax.units import Units
 
@@ -42,7 +42,7 @@ def forces_on_nodes(scene: Scene, segments: int, s: Float[Array, "n+1"] | None =
 
 def total_force(scene: Scene) -> Float[Array, "3"]:
     """All dead forces together."""
-    forces = [load.force for load in scene.point_forces]
+    forces = [load.force for load in dead_forces(scene)]
     ends = [end for end in (scene.start, scene.end) if isinstance(end, Free) and not end.follower]
     forces += [end.force for end in ends if end.force is not None]
     if scene.gravity is not None:

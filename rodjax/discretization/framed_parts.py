@@ -10,7 +10,7 @@ from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.rest_ways import RestWays
 from rodjax.model.along import Along
 from rodjax.model.loads import DistributedForce, length_before, loaded_length
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, dead_forces
 from rodjax.model.supports import Free, Held
 
 
@@ -60,7 +60,7 @@ def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
         if isinstance(load, DistributedForce) and not load.follower:
             before = length_before(load, s)
             forces += load.force[:, None, None] * (loaded_length(load, one) - before if starts_held else -before)[None]
-    for load in scene.point_forces:
+    for load in dead_forces(scene):
         before = cells.parts_before(load.at)
         forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
     for end, sign in ((scene.start, -1), (scene.end, 1)):

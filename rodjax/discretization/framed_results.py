@@ -17,6 +17,7 @@ from rodjax.discretization.error import (
     of_sections,
 )
 from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.nonconservative import point_couples
 from rodjax.discretization.rest_ways import RestWays
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
@@ -94,12 +95,15 @@ def section_forces(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
 
 
 def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
-    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip they may
-    jump, and are those beyond it.
+    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip or a
+    couple they may jump, and are those beyond it.
     """
     field = form.field
     own = own_moments(form, point)
-    moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
+    if form.scene.point_couples:
+        moments = jnp.concatenate([-own[:, 0], own[:, 2, -1:]], axis=1)
+    else:
+        moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
     if form.clip_nodes is not None:
         moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
@@ -167,6 +171,11 @@ def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "
     own, nodes = own_moments(form, point), form.clip_nodes
     assert nodes is not None
     jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
+    if form.scene.point_couples and isinstance(form.field, ElementCells):
+        q = form.field.of_cells(point.quaternions)
+        couples = point_couples(form.scene, form.field, q)
+        assert couples is not None
+        jumps -= rotated(q[:, 0], couples)[:, nodes]
     moments = []
     for k, clip in enumerate(form.scene.clips):
         moment = jnp.zeros_like(jumps[:, k])
@@ -197,10 +206,17 @@ def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
     def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
         return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)
 
-    parts = [strains[..., 1:-1], here.stretched[:, 1:-1], here.tension[:, 1:-1]]
-    parts += [] if here.shear is None else [here.shear[..., 1:-1]]
-    found = [between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)]
-    return NodeStrains(moments, *found[:3], None if here.shear is None else found[3])
+    first, last = ends
+    shear = None
+    if here.shear is not None and first[3] is not None and last[3] is not None:
+        shear = between(first[3], here.shear[..., 1:-1], last[3])
+    return NodeStrains(
+        moments,
+        between(first[0], strains[..., 1:-1], last[0]),
+        between(first[1], here.stretched[:, 1:-1], last[1]),
+        between(first[2], here.tension[:, 1:-1], last[2]),
+        shear,
+    )
 
 
 def _strains_at_end(
@@ -269,7 +285,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
         return _errors_of_joints(form, point, axis)
     ends = _end_moments(form, point)
     moments = ends[:, 0]
-    if not form.scene.clips:
+    if not (form.scene.clips or form.scene.point_couples):
         moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
     nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments), nodes[:, :-1], moments)

@@ -111,6 +111,8 @@ def unit_of(name: str) -> str:
     """SI unit of a number by its dotted name; none of a number without one."""
     if name.startswith("distributed.") and _matches(name, ("force",)):
         return "N/m"
+    if name.startswith("point_couples.") and _matches(name, ("couple",)):
+        return "N m"
     if name.startswith("obstacles."):
         return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal", "friction")) else "m"
     return next((unit for part, unit in UNITS.items() if _matches(name, (part,))), "")

@@ -112,8 +112,10 @@ FIELDS = {
     "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
     "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
     "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
-    "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
-    "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/point_forces/*/at": ("m", "arclength at which a force acts"),
+    "scene/point_forces/*/force": ("N", "force on the rod, global axes or, of a follower, the frame there"),
+    "scene/point_couples/*/at": ("m", "arclength at which a couple acts"),
+    "scene/point_couples/*/couple": ("N m", "couple on the rod, global axes or, of a follower, the frame there"),
     "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
     "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
@@ -339,7 +341,9 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
 
 
 def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
-    value = group.attrs[field.name]
+    # Files until format 12 have no `follower` of a point force.
+    has_default = field.default is not dataclasses.MISSING
+    value = group.attrs.get(field.name, np.bool_(field.default)) if has_default else group.attrs[field.name]
     if field.type is not bool:
         one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
         return value

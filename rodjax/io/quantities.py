@@ -64,6 +64,7 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
 # The same of keys that mean something else in one table, by the name of that table.
 OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
     "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"'), "part": ("m", (2,), '"[0.2, 0.5] m"')},
+    "point_couple": {"couple": ("N m", (3,), '"[0, 0, 0.01] N m"')},
     "distributed_couple": {"part": ("m", (2,), '"[0.2, 0.5] m"')},
     "obstacles": {
         "point": ("m", (3,), '"[0, 0, -0.1] m"'),

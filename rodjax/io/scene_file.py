@@ -32,6 +32,12 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     [[loads.point_force]]          # any number of these
     at = "0.5 m"
     force = "[0, 0, -0.2] N"
+    # follower = true              # optional: where it turns with the rod
+
+    # [[loads.point_couple]]       # any number of these, too
+    # at = "0.5 m"
+    # couple = "[0, 0.01, 0] N m"
+    # follower = true
 
     # [[loads.distributed_force]]  # any number of these, too: all along the rod
     # force = "[0, 0, -0.02] N/m"
@@ -125,7 +131,7 @@ from rodjax.io.quantities import (
     table_list,
 )
 from rodjax.model.along import Along, Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
@@ -177,6 +183,7 @@ _SUPPORTS = {
 _SCENE_KEYS = {
     "turns": "end.turns",
     "point_forces": "loads.point_force",
+    "point_couples": "loads.point_couple",
     "clips": "clips",
     "obstacles": "obstacles",
     "rod": "rod",
@@ -309,7 +316,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: dict(part(_end_values, content[name], name, kind)) for name, kind in kinds.items()}
     followers = {name: kind == "free" and flag(content[name], name, "follower") for name, kind in kinds.items()}
-    loads, point_forces, distributed = part(_loads, content.get("loads", {}))
+    loads, point_forces, distributed, point_couples = part(_loads, content.get("loads", {}))
     clips = part(_clips, content.get("clips", []))
     obstacles = part(_obstacles, content.get("obstacles", []))
     values["loads"] = dict(loads)
@@ -333,7 +340,8 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     if unclocked:
         spun = {name for name in kinds if "spin" in content[name]}
         along = [target for _, _, target in changes]
-        resists = Clocking(kinds, unclocked, rod, clips, distributed, values, along, followers, spun, turns).check()
+        loads_on_rod = [*point_forces, *point_couples, *distributed]
+        resists = Clocking(kinds, unclocked, rod, clips, loads_on_rod, values, along, followers, spun, turns).check()
 
     def scene(values: Values, where: str = "") -> Scene:
         gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
@@ -342,7 +350,8 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             for name, kind in kinds.items()
         )
         try:
-            return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles)
+            others = distributed, clips, obstacles, (), point_couples
+            return Scene(rod, start, end, gravity, point_forces, turns, *others)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -477,13 +486,19 @@ def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.nda
 
 def _loads(
     reader: SceneReader, table: Any
-) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple]]:
-    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", *DISTRIBUTED))
-    forces = []
-    for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
-        where = f"loads.point_force[{k}]"
-        with named(where):
-            forces.append(PointForce(**reader.si_values(force, where, ("at", "force"), ())))
+) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple], list[PointCouple]]:
+    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", "point_couple", *DISTRIBUTED))
+
+    def at_points(make: Callable[..., Any], name: str, key: str) -> list[Any]:
+        found = []
+        for k, load in enumerate(table_list(table.get(name, []), f"loads.{name}")):
+            where = f"loads.{name}[{k}]"
+            with named(where):
+                numbers = reader.si_values(load, where, ("at", key), (), other=("follower",))
+                found.append(make(**numbers, follower=flag(load, where, "follower")))
+        return found
+
+    forces = at_points(PointForce, "point_force", "force")
     distributed = []
     for name in (name for name in table if name in DISTRIBUTED):
         make, key = DISTRIBUTED[name]
@@ -492,7 +507,7 @@ def _loads(
             numbers = reader.si_values(load, where, (key,), ("part",), other=("follower",))
             with named(where):
                 distributed.append(make(numbers[key], flag(load, where, "follower"), numbers.get("part")))
-    return values, forces, distributed
+    return values, forces, distributed, at_points(PointCouple, "point_couple", "couple")
 
 
 def _clips(reader: SceneReader, tables: Any) -> list[Clip]:

@@ -58,7 +58,10 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
     if scene.gravity is not None:
         lines += ["", "[loads]", *_written(scene, ("gravity",))]
     for force in scene.point_forces:
-        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
+        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force")), *_written_follower(force)]
+    for couple in scene.point_couples:
+        where = "point_couple"
+        lines += ["", f"[[loads.{where}]]", *_written(couple, ("at", "couple"), where), *_written_follower(couple)]
     for kind in dict.fromkeys(type(load) for load in scene.distributed):
         name, key = next((name, key) for name, (of_name, key) in DISTRIBUTED.items() if of_name is kind)
         for load in scene.distributed:

@@ -15,18 +15,43 @@ from rodjax.units import Units
 
 
 class PointForce(eqx.Module):
-    """A dead force at an arclength. `at`: arclength s [m]; `force`: (3,) [N], global axes."""
+    """A force at an arclength. `at`: arclength s [m]; `force`: (3,) [N], a dead one along global axes; or, where
+    `follower` is True, along the material frame (d1, d2, t) of the section, which has no potential: inside the rod, as
+    on an end it is one of `Free`.
+    """
 
     at: Float[Array, ""]
     force: Float[Array, "3"]
+    follower: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, at: Any, force: Any):
+    def __init__(self, at: Any, force: Any, follower: bool = False):
         self.at = leaf(not_negative(at, "at"))
         self.force = leaf(vector(force, "force"))
+        instance(follower, "follower", bool)
+        self.follower = follower
 
     def in_units(self, units: Units) -> "PointForce":
         """The same force in the units of the rod: see `rodjax.model.scene.nondimensional`."""
-        return PointForce(self.at / units.length, self.force / units.force)
+        return PointForce(self.at / units.length, self.force / units.force, self.follower)
+
+
+class PointCouple(eqx.Module):
+    """A couple at an arclength inside the rod; it has no potential. `at`: arclength s [m]; `couple`: (3,) [N m], along
+    global axes, or, where `follower` is True, along the material frame (d1, d2, t) of the section.
+    """
+
+    at: Float[Array, ""]
+    couple: Float[Array, "3"]
+    follower: bool = eqx.field(static=True)
+
+    def __init__(self, at: Any, couple: Any, follower: bool = False):
+        self.at = leaf(not_negative(at, "at"))
+        self.couple = leaf(vector(couple, "couple"))
+        instance(follower, "follower", bool)
+        self.follower = follower
+
+    def in_units(self, units: Units) -> "PointCouple":
+        return PointCouple(self.at / units.length, self.couple / units.energy, self.follower)
 
 
 class DistributedForce(eqx.Module):

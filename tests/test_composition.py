@@ -139,7 +139,7 @@ def test_what_is_refused_is_listed():
         assert any(reason in message for reason in PHYSICS), message
     for reason in PHYSICS:
         assert any(reason in message for message in messages), reason
-    assert (len(pairs()), len(messages)) == (316, 2)
+    assert (len(pairs()), len(messages)) == (336, 2)
 
 
 def solved(names: dict[str, str]) -> rj.Equilibrium:

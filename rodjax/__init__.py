@@ -3,13 +3,6 @@
 import importlib
 from typing import TYPE_CHECKING
 
-from rodjax import problems
-from rodjax.analysis.clearance import Clearance, clearance
-from rodjax.analysis.curvature import most_curved
-from rodjax.analysis.sensitivity import end_stiffness, sensitivities
-from rodjax.io.files import load, save
-from rodjax.io.scene_file import SceneFileError, read_scene
-from rodjax.io.scene_writing import write_scene
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
@@ -17,11 +10,6 @@ from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.paths.batch import solve_batch
-from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
-from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
-from rodjax.paths.path import solve_path
-from rodjax.paths.tracing import BranchEnd
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
@@ -35,7 +23,11 @@ from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from rodjax import problems
+    from rodjax.analysis.clearance import Clearance, clearance
     from rodjax.analysis.continuum import solve_continuum
+    from rodjax.analysis.curvature import most_curved
+    from rodjax.analysis.sensitivity import end_stiffness, sensitivities
     from rodjax.identification.each import Fits, fit_each
     from rodjax.identification.fit import fit
     from rodjax.identification.measurements import (
@@ -50,6 +42,14 @@ if TYPE_CHECKING:
     )
     from rodjax.identification.result import Fit, NotIdentifiableError
     from rodjax.identification.unknowns import Unknown
+    from rodjax.io.files import load, save
+    from rodjax.io.scene_file import SceneFileError, read_scene
+    from rodjax.io.scene_writing import write_scene
+    from rodjax.paths.batch import solve_batch
+    from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+    from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
+    from rodjax.paths.path import solve_path
+    from rodjax.paths.tracing import BranchEnd
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
     from rodjax.routing.objective import Objective
@@ -161,8 +161,23 @@ __all__ = [
 ]
 
 
-# diffrax, optimistix and scipy take a second to import, which a solve without them need not wait for.
+# What a single solve does not need is imported where it is first asked for: diffrax, optimistix and scipy alone take a
+# second, files, paths and the analysis of equilibria a third of what is left.
 _LATER = {
+    **dict.fromkeys(("Clearance", "clearance"), "analysis.clearance"),
+    "most_curved": "analysis.curvature",
+    **dict.fromkeys(("end_stiffness", "sensitivities"), "analysis.sensitivity"),
+    **dict.fromkeys(("load", "save"), "io.files"),
+    **dict.fromkeys(("SceneFileError", "read_scene"), "io.scene_file"),
+    "write_scene": "io.scene_writing",
+    "solve_batch": "paths.batch",
+    **dict.fromkeys(
+        ("Branch", "CriticalPoint", "critical_point", "critical_points", "follow", "switch_branch"),
+        "paths.continuation",
+    ),
+    **dict.fromkeys(("Mode", "lowest_mode", "squared_frequencies"), "paths.modes"),
+    "solve_path": "paths.path",
+    "BranchEnd": "paths.tracing",
     "solve_continuum": "analysis.continuum",
     "fit": "identification.fit",
     "Fit": "identification.result",
@@ -202,5 +217,9 @@ _LATER = {
 
 def __getattr__(name: str):
     if name in _LATER:
-        return getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+        value = getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+        globals()[name] = value  # found there from now on
+        return value
+    if name == "problems":
+        return importlib.import_module("rodjax.problems")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,9 +7,11 @@ from rodjax import problems
 from rodjax.analysis.clearance import Clearance, clearance
 from rodjax.analysis.curvature import most_curved
 from rodjax.analysis.sensitivity import end_stiffness, sensitivities
+from rodjax.io.cad import write_dxf
 from rodjax.io.files import load, save
 from rodjax.io.scene_file import SceneFileError, read_scene
 from rodjax.io.scene_writing import write_scene
+from rodjax.io.tables import centerline_table, write_table
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
@@ -122,6 +124,7 @@ __all__ = [
     "Turned",
     "Union",
     "Unknown",
+    "centerline_table",
     "clearance",
     "critical_point",
     "critical_points",
@@ -156,7 +159,9 @@ __all__ = [
     "switch_branch",
     "tolerances",
     "view",
+    "write_dxf",
     "write_scene",
+    "write_table",
 ]
 
 

@@ -14,14 +14,14 @@ import trimesh
 from matplotlib.image import imread
 
 import rodjax as rj
+from rodjax.analysis.reactions import axes_of
+from rodjax.model.surfaces import MOST_TRIANGLES, surfaces
 from rodjax.plot import AZIMUTH, seen_axes
 from rodjax.routing import surfaces as routing_surfaces
 from rodjax.routing import web_page, words
 from rodjax.routing.findings import Gradients
-from rodjax.routing.reactions import axes_of
 from rodjax.routing.report import FILES
 from rodjax.routing.sights import azimuth, coloring, extent, sight
-from rodjax.routing.surfaces import MOST_TRIANGLES, surfaces
 
 RADIUS = 0.006
 GRAVITY = (0.0, 0.0, -9.81)

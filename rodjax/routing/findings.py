@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.analysis.curvature import curvature_along, most_curved
+from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.model.along import Along
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import has_potential, slides
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
-from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
 from rodjax.solving.result import Equilibrium, describe
 

@@ -12,13 +12,12 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
 
-from rodjax.plot import ARROW_LENGTH, ELEVATION
+from rodjax.model.surfaces import Faces
+from rodjax.plot import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
 from rodjax.routing import words
 from rodjax.routing.findings import Cable
 from rodjax.routing.records import plain
 from rodjax.routing.sights import (
-    CLIP_COLOR,
-    PALETTE,
     Coloring,
     Sight,
     azimuth,
@@ -28,7 +27,6 @@ from rodjax.routing.sights import (
     seen_surfaces,
     thickness_note,
 )
-from rodjax.routing.surfaces import Faces
 
 TEMPLATE = "page.html"
 OPACITY = 0.3

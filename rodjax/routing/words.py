@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rodjax.analysis.reactions import Reaction
 from rodjax.routing.findings import Cable, Fact, Gradients
-from rodjax.routing.reactions import Reaction
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 

@@ -38,7 +38,8 @@ from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
-from rodjax.sweeps.result import Summary, merge
+from rodjax.sweeps.quantities import QUANTITIES
+from rodjax.sweeps.result import Summary, merge, write_csv
 from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX
 from rodjax.sweeps.sweep import sweep
 
@@ -147,6 +148,10 @@ def _add_sweep(commands: Any) -> None:
     )
     run.add_argument("--resume", action="store_true", help="go on where an earlier run was stopped")
     run.add_argument("--chunk", metavar="N", type=_chunk, help="cases solved, and written, at a time; 1024")
+    run.add_argument(
+        "--also", metavar="NAME,...", default="", help=f"further quantities to write: {', '.join(QUANTITIES)}"
+    )
+    run.add_argument("--csv", metavar="OUT.csv", type=Path, help="write all but the nodes as a table too")
     _add_scheduler(run)
     run.set_defaults(run=_sweep)
     join = commands.add_parser("merge", help="put the shards of a sweep together")
@@ -317,6 +322,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
+    _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
     with _connected(arguments.scheduler) as executor:
         summary = sweep(
             arguments.scene,
@@ -325,10 +331,13 @@ def _sweep(arguments: argparse.Namespace) -> int:
             shard=arguments.shard,
             chunk=arguments.chunk,
             resume=arguments.resume,
+            also=[name.strip() for name in arguments.also.split(",") if name.strip()],
             executor=executor,
             progress=sys.stderr.isatty(),
             say=lambda line: print(line, flush=True),
         )
+    if arguments.csv:
+        write_csv(arguments.output, arguments.csv)
     return _swept(arguments.output, summary)
 
 

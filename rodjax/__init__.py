@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from rodjax import problems
 from rodjax.analysis.clearance import Clearance, clearance
 from rodjax.analysis.curvature import most_curved
+from rodjax.analysis.discrete_energy import energy, residual
 from rodjax.analysis.sensitivity import end_stiffness, sensitivities
 from rodjax.io.cad import write_dxf
 from rodjax.io.files import load, save
@@ -32,7 +33,14 @@ from rodjax.solving.guess import Guess
 from rodjax.solving.line_search import LineSearch
 from rodjax.solving.newton import Newton
 from rodjax.solving.nonlinear_cg import NonlinearCG
-from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
+from rodjax.solving.result import (
+    Equilibrium,
+    MeshWarning,
+    NotConvergedWarning,
+    OverstretchedWarning,
+    PrecisionWarning,
+    describe,
+)
 from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
@@ -109,6 +117,7 @@ __all__ = [
     "Plane",
     "PointForce",
     "Potential",
+    "PrecisionWarning",
     "Reading",
     "Report",
     "Rod",
@@ -131,6 +140,7 @@ __all__ = [
     "describe",
     "enable_compilation_cache",
     "end_stiffness",
+    "energy",
     "fit",
     "fit_each",
     "follow",
@@ -146,6 +156,7 @@ __all__ = [
     "problems",
     "read_scene",
     "report",
+    "residual",
     "rotate",
     "route",
     "save",
@@ -204,7 +215,14 @@ _LATER = {
 }
 
 
+def __dir__() -> list[str]:
+    """The public names, those that are imported when they are first asked for too."""
+    return sorted([*__all__, "__version__", "plot"])
+
+
 def __getattr__(name: str):
     if name in _LATER:
         return getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+    if name == "plot":  # with matplotlib
+        return importlib.import_module("rodjax.plot")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

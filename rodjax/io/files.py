@@ -19,7 +19,6 @@ import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from rodjax.atomic_write import has_seal, replace_file, seal
 from rodjax.checks import file_path, instance, is_known, one_of, shown
@@ -33,9 +32,10 @@ from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane
 from rodjax.model.scene import has_node_places
 from rodjax.model.supports import Clamp, Free, Pin, Swivel
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.result import Equilibrium, PrecisionWarning
 from rodjax.solving.status import Status
 from rodjax.version import __version__
+from rodjax.warn import warn
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
@@ -222,8 +222,9 @@ def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) ->
 def load(path: str | os.PathLike[str]) -> Equilibrium:
     """Reads what `rodjax.save` wrote: the same `Equilibrium` to the last bit, which serves as a `guess` too.
 
+    Where the file holds float64 while JAX is set to float32 the numbers are rounded, and a `PrecisionWarning` says so.
     Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
-    rodjax, and where it holds float64 while JAX is set to float32, which would round it.
+    rodjax.
     """
     path = file_path(path, "path", SUFFIX)
     image = io.BytesIO(path.read_bytes())
@@ -250,7 +251,13 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
             "rodjax has no longer: solve its scene again"
         )
-    return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
+    if not jax.config.jax_enable_x64 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
+        warn(
+            f"{path} holds float64 numbers, which are rounded to float32: "
+            'call jax.config.update("jax_enable_x64", True) before anything else to keep them',
+            PrecisionWarning,
+        )
+    return jax.tree.map(jnp.asarray, equilibrium)
 
 
 def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
@@ -373,13 +380,3 @@ def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...])
             f"got {dataset.dtype.name} of shape {dataset.shape}"
         )
     return dataset[()]
-
-
-def _as_jax(values: Any, path: Path) -> Array:
-    array = jnp.asarray(values)
-    if array.dtype != values.dtype:
-        raise ValueError(
-            f"{path} holds {values.dtype} numbers, which JAX would make {array.dtype}: "
-            'call jax.config.update("jax_enable_x64", True) before anything else'
-        )
-    return array

@@ -9,7 +9,7 @@ from rodjax.analysis.clearance import clearance
 from rodjax.analysis.curvature import curvature_along
 from rodjax.checks import sequence, shown
 from rodjax.model.scene import Scene
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.result import Equilibrium, over_leading_axes
 from rodjax.sweeps.cases import SweepError
 
 
@@ -27,12 +27,17 @@ def _bend_radius(result: Equilibrium) -> np.ndarray:
         return 1 / np.max(np.asarray(curvature_along(result)[1]), axis=-1)
 
 
+@over_leading_axes
+def _clearance(result: Equilibrium):
+    return clearance(result, result.scene.obstacles).distance
+
+
 QUANTITIES = {
     "bend_radius": Quantity("m", "smallest bend radius of the centerline, infinite of a straight rod", _bend_radius),
     "clearance": Quantity(
         "m",
         "least distance of the surface of the rod from each obstacle",
-        lambda result: clearance(result, result.scene.obstacles).distance,
+        _clearance,
         ("obstacles", "rod.radius"),
     ),
     "clip_forces": Quantity("N", "force of each clip on the rod", lambda result: result.clip_forces, ("clips",)),

@@ -3,16 +3,6 @@
 import importlib
 from typing import TYPE_CHECKING
 
-from rodjax import problems
-from rodjax.analysis.clearance import Clearance, clearance
-from rodjax.analysis.curvature import most_curved
-from rodjax.analysis.discrete_energy import energy, residual
-from rodjax.analysis.sensitivity import end_stiffness, sensitivities
-from rodjax.io.cad import write_dxf
-from rodjax.io.files import load, save
-from rodjax.io.scene_file import SceneFileError, read_scene
-from rodjax.io.scene_writing import write_scene
-from rodjax.io.tables import centerline_table, write_table
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
@@ -20,11 +10,6 @@ from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.paths.batch import solve_batch
-from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
-from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
-from rodjax.paths.path import solve_path
-from rodjax.paths.tracing import BranchEnd
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
@@ -45,7 +30,12 @@ from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from rodjax import problems
+    from rodjax.analysis.clearance import Clearance, clearance
     from rodjax.analysis.continuum import solve_continuum
+    from rodjax.analysis.curvature import most_curved
+    from rodjax.analysis.discrete_energy import energy, residual
+    from rodjax.analysis.sensitivity import end_stiffness, sensitivities
     from rodjax.identification.each import Fits, fit_each
     from rodjax.identification.fit import fit
     from rodjax.identification.measurements import (
@@ -60,6 +50,16 @@ if TYPE_CHECKING:
     )
     from rodjax.identification.result import Fit, NotIdentifiableError
     from rodjax.identification.unknowns import Unknown
+    from rodjax.io.cad import write_dxf
+    from rodjax.io.files import load, save
+    from rodjax.io.scene_file import SceneFileError, read_scene
+    from rodjax.io.scene_writing import write_scene
+    from rodjax.io.tables import centerline_table, write_table
+    from rodjax.paths.batch import solve_batch
+    from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+    from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
+    from rodjax.paths.path import solve_path
+    from rodjax.paths.tracing import BranchEnd
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
     from rodjax.routing.objective import Objective
@@ -176,8 +176,26 @@ __all__ = [
 ]
 
 
-# diffrax, optimistix and scipy take a second to import, which a solve without them need not wait for.
+# What a single solve does not need is imported where it is first asked for: diffrax, optimistix and scipy alone take a
+# second, files, paths and the analysis of equilibria a third of what is left.
 _LATER = {
+    **dict.fromkeys(("Clearance", "clearance"), "analysis.clearance"),
+    "most_curved": "analysis.curvature",
+    **dict.fromkeys(("end_stiffness", "sensitivities"), "analysis.sensitivity"),
+    **dict.fromkeys(("load", "save"), "io.files"),
+    **dict.fromkeys(("SceneFileError", "read_scene"), "io.scene_file"),
+    "write_scene": "io.scene_writing",
+    "write_dxf": "io.cad",
+    **dict.fromkeys(("centerline_table", "write_table"), "io.tables"),
+    **dict.fromkeys(("energy", "residual"), "analysis.discrete_energy"),
+    "solve_batch": "paths.batch",
+    **dict.fromkeys(
+        ("Branch", "CriticalPoint", "critical_point", "critical_points", "follow", "switch_branch"),
+        "paths.continuation",
+    ),
+    **dict.fromkeys(("Mode", "lowest_mode", "squared_frequencies"), "paths.modes"),
+    "solve_path": "paths.path",
+    "BranchEnd": "paths.tracing",
     "solve_continuum": "analysis.continuum",
     "fit": "identification.fit",
     "Fit": "identification.result",
@@ -222,7 +240,9 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str):
     if name in _LATER:
-        return getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
-    if name == "plot":  # with matplotlib
-        return importlib.import_module("rodjax.plot")
+        value = getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+        globals()[name] = value  # found there from now on
+        return value
+    if name in ("plot", "problems"):
+        return importlib.import_module(f"rodjax.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -628,7 +628,7 @@ def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
 
 def test_quantities_are_chosen_by_name(files, capsys):
     """Those of single solves on the same mesh, to the solver's tolerance; and as a table."""
-    scene = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "segments = 8")
+    scene = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "segments = 16")
     scene = scene.replace("[rod]", '[rod]\nradius = "4 mm"')
     clip, floor = '\n[[clips]]\nat = "0.3 m"\nposition = "[0.25, 0, -0.02] m"\n', '\n[[obstacles]]\nkind = "plane"\n'
     Path("scene.toml").write_text(scene + clip + floor + 'point = "[0, 0, -0.15] m"\nnormal = [0, 0, 1]\n')
@@ -637,7 +637,7 @@ def test_quantities_are_chosen_by_name(files, capsys):
     assert main([*command, "--also", ",".join(QUANTITIES)]) == 0
     found = contents("out.h5")
     scenes = CaseReader(Path("scene.toml"), Path("grid.toml")).scenes(np.arange(2))
-    alone = rodjax.solve(scenes[1], segments=8)
+    alone = rodjax.solve(scenes[1], segments=16)
     assert found["clip_forces"].shape == (2, 1, 3)
     np.testing.assert_allclose(found["clip_forces"][1], alone.clip_forces, atol=1e-6)
     np.testing.assert_allclose(found["obstacle_forces"][1], np.sum(alone.obstacle_forces, axis=1), atol=1e-6)

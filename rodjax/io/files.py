@@ -251,7 +251,7 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
             "rodjax has no longer: solve its scene again"
         )
-    if not jax.config.jax_enable_x64 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
+    if jnp.zeros(()).dtype == np.float32 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
         warn(
             f"{path} holds float64 numbers, which are rounded to float32: "
             'call jax.config.update("jax_enable_x64", True) before anything else to keep them',

@@ -594,7 +594,8 @@ def describe(equilibrium: Equilibrium) -> str:
 
 def _stack_told(equilibrium: Equilibrium) -> str:
     shape, segments = equilibrium.s.shape[:-1], equilibrium.s.shape[-1] - 1
-    return f"{shape if len(shape) > 1 else shape[0]} scenes, {segments} segments" if shape else f"{segments} segments"
+    scenes = f"{' x '.join(map(str, shape))} scenes, " if shape else ""
+    return f"{scenes}{segments} segments"
 
 
 def _told(equilibrium: Equilibrium) -> list[tuple[str, str]]:
@@ -789,7 +790,7 @@ def warn_of_single_precision() -> None:
     """Once in a process; the errors are those of `experiments/float32.py`."""
     warn(
         "the numbers are float32, JAX's default: beside double precision the shape is off by 3e-8 to 2e-4 of the "
-        "length and the forces by 4e-6 to 5e-4, more on finer meshes; obstacles need float64. For double precision call "
+        "length and the forces by 4e-6 to 5e-4, more on finer meshes; obstacles need float64. For more call "
         'jax.config.update("jax_enable_x64", True) before anything else (this is said once)',
         PrecisionWarning,
     )

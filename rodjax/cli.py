@@ -34,7 +34,7 @@ from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
 from rodjax.programs import answers, kept
 from rodjax.programs.tasks import TaskError
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
@@ -439,6 +439,9 @@ def _report(arguments: argparse.Namespace) -> int:
             obstacles=file.obstacles,
             names=file.names,
             title=file.title or str(arguments.file),
+            source=_source(arguments.file, *file.cables.values())
+            if arguments.result is None
+            else str(arguments.result),
         )
     except ValueError as error:
         if all(np.all(cable.converged) for cable in cables.values()):
@@ -488,7 +491,13 @@ def _route(arguments: argparse.Namespace) -> int:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(
-        route.verified, limits=file.limits, obstacles=file.obstacles, names=file.names, gradients=route, title=title
+        route.verified,
+        limits=file.limits,
+        obstacles=file.obstacles,
+        names=file.names,
+        gradients=route,
+        title=title,
+        source=_source(arguments.file, scene),
     )
     print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
     written = [*report.save(arguments.out), *written_route(route, arguments.out)]
@@ -497,6 +506,15 @@ def _route(arguments: argparse.Namespace) -> int:
         return 0
     print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
     return 3
+
+
+def _source(path: Path, *scenes: SceneFile) -> str:
+    """What a report is made of, and how exactly."""
+    meshes = [
+        f"rtol = {scene.rtol or DEFAULT_RTOL:g}" if scene.segments is None else f"{scene.segments} segments"
+        for scene in scenes
+    ]
+    return ", ".join([str(path), *dict.fromkeys(meshes)])
 
 
 def _solved(file: SceneFile) -> Equilibrium:

@@ -38,6 +38,8 @@ STRIPS = ((0, (0.0, 0.0, 0.0)), (FACES_AROUND // 2, (1.0, 1.0, 1.0)))
 LEAST_RADIUS = 0.018
 ARROW_LENGTH = 0.22
 LEAST_DEPTH = 0.3
+# Width and height of what is written at an arrow, by the length of the longest one.
+LABEL_SIZE = (0.6, 0.2)
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
 # Of clips and of obstacles, one after another, and how much of what is behind an obstacle it hides.
@@ -277,7 +279,7 @@ def draw_arrows(
     """
     sizes = np.linalg.norm(loads, axis=1)
     right, up, _ = seen_axes(azimuth)
-    tips = []
+    tips, written = [], []
     for foot, load, size in zip(feet, loads, sizes, strict=True):
         if size < least:
             continue
@@ -286,8 +288,15 @@ def draw_arrows(
             (fx, fy, fz), (x, y, z) = foot, head * reach * along
             ratio = 0.2 * length / (head * reach)
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
-        x, y, z = foot + (reach + 0.05 * length) * along
-        ha, va = "left" if along @ right > 0 else "right", "bottom" if along @ up > 0 else "top"
+        # Beyond the tip, or where something is written there already before the foot.
+        for at, sign in ((foot + (reach + 0.05 * length) * along, 1), (foot - 0.1 * length * along, -1)):
+            side, rise = np.sign(sign * along @ right) or 1.0, np.sign(sign * along @ up) or 1.0
+            middle = np.array([at @ right, at @ up]) + np.array([side, rise]) * np.array(LABEL_SIZE) * length / 2
+            if not any(np.all(np.abs(middle - other) < np.array(LABEL_SIZE) * length) for other in written):
+                break
+        written.append(middle)
+        x, y, z = at
+        ha, va = "left" if side > 0 else "right", "bottom" if rise > 0 else "top"
         axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
         tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))

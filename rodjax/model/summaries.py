@@ -69,8 +69,9 @@ def part_text(part: Any, skipped: tuple[str, ...] = ()) -> str:
         value = getattr(part, name)
         if value is None or value is False or name in skipped:
             continue
-        if name == "frame":  # its third column says how the rod runs
-            told.append(f"tangent {value_text(value[:, 2]) if getattr(value, 'ndim', 0) == 2 else 'stacked'}")
+        if name == "frame":  # its third column; of a support that says how the rod runs
+            axis = "tangent" if hasattr(part, "position") else "third axis"
+            told.append(f"{axis} {value_text(value[:, 2]) if getattr(value, 'ndim', 0) == 2 else 'stacked'}")
         elif value is True:
             told.append(name)
         elif isinstance(value, eqx.Module) and not isinstance(value, Along):

@@ -511,7 +511,7 @@ def test_describe_margins_and_reactions(twisted):
     # The largest twist is that before the clip; tolerances as above.
     assert by_name["twist"] == pytest.approx(4.0, rel=1e-8)
     assert by_name["moment of clip 0"] == pytest.approx(GJ * (4.0 - 1.3 / 0.7), rel=1e-8)
-    from rodjax.routing.reactions import reactions
+    from rodjax.analysis.reactions import reactions
 
     of_clip = reactions(twisted)[1]
     assert (of_clip.name, of_clip.kind, of_clip.s) == ("clip 0", "clip with frame", 0.3)

@@ -26,6 +26,7 @@ from rodjax.checks import (
 )
 from rodjax.model.along import Along, Pair, Smooth, Steps, Value, scaled
 from rodjax.model.rest import RestShape, RestStrain, SpaceCurve, ends
+from rodjax.model.summaries import rod_text
 from rodjax.units import Units
 
 # Of St-Venant's series, which falls like k^-5: 13 digits.
@@ -120,6 +121,9 @@ class Rod(eqx.Module):
         self.rest_centerline = None
         self.law = None if law is None else _law(law)
         _check_arclengths(self)
+
+    def __str__(self) -> str:
+        return rod_text(self)
 
     @property
     def is_plain(self) -> bool:

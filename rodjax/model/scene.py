@@ -15,6 +15,7 @@ from rodjax.checks import instance, is_known, leaf, number_array, sequence, vect
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential, check_potential
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
+from rodjax.model.summaries import scene_text
 from rodjax.model.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
 from rodjax.units import Units
 
@@ -109,6 +110,9 @@ class Scene(eqx.Module):
         _check_supports(self)
         _check_obstacles(self)
         _check_numbers(self)
+
+    def __str__(self) -> str:
+        return scene_text(self)
 
 
 def _of_one_precision(parts: Any) -> Any:

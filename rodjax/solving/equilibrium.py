@@ -76,6 +76,7 @@ from rodjax.solving.result import (
     passage_to,
     warn_if_coarse,
     warn_of_outcome,
+    warn_of_single_precision,
     warn_of_unknown_mesh,
 )
 from rodjax.solving.sliding_search import INNER_TOLERANCE, slid_free
@@ -412,6 +413,8 @@ def checked_options(
     find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
+    if scene.rod.length.dtype == np.float32:
+        warn_of_single_precision()
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     if solver is None:

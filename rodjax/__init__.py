@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 from rodjax.model.along import Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
@@ -115,6 +115,7 @@ __all__ = [
     "Pin",
     "Pipe",
     "Plane",
+    "PointCouple",
     "PointForce",
     "Potential",
     "PrecisionWarning",

@@ -131,17 +131,19 @@ class Equilibrium(eqx.Module):
 
     - `s` [..., n+1] arclength of the nodes, m
     - `nodes` [..., n+1, 3] centerline, m
-    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
-    - `curvature` [..., n+1] |t x t'|, 1/m
+    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] phi'/|phi'|, their last
+      column but in rods with shear, where that is the normal d3 of the section
+    - `curvature` [..., n+1] |t x t'|, 1/m, with shear |d3 x d3'|
     - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
-    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1; with shear the components of force and phi' along d3
+    - `shear_strain` [..., n+1, 2] of rods with shear, else `None`: the components of phi' along d1 and d2
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
-      when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
-      just beyond it, and tension the mean of both sides
+      when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain at a clip are
+      those just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
@@ -197,10 +199,14 @@ class Equilibrium(eqx.Module):
     scene: Scene
     state: SolverState
     discretization: str = eqx.field(static=True)
+    shear_strain: Float[Array, "... n+1 2"] | None = None
 
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
-        return self.frames[..., 2]
+        if self.shear_strain is None:
+            return self.frames[..., 2]
+        slopes = _slopes(self)
+        return slopes / jnp.sqrt(jnp.sum(slopes**2, axis=-1, keepdims=True))
 
     def __str__(self) -> str:
         """How the solve ended, and the largest and last values along the rod with their units."""
@@ -349,6 +355,7 @@ def equilibrium(
         scene=scene,
         state=dataclasses.replace(found.state, units=units),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
+        shear_strain=results.shear_strain,
     )
 
 
@@ -518,6 +525,15 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     pushes, drags, states = form.exerted(point)
     gaps = (distances - form.radius[None]) * units.length
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
+
+
+@compiled
+def _slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
+    """phi' of a rod with shear."""
+    frames, shear = equilibrium.frames, equilibrium.shear_strain
+    assert shear is not None
+    along = 1 + equilibrium.axial_strain[..., None]
+    return jnp.sum(frames * jnp.concatenate([shear, along], axis=-1)[..., None, :], axis=-1)
 
 
 @over_leading_axes

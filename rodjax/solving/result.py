@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -76,6 +77,13 @@ class OverstretchedWarning(UserWarning):
 
 class MeshWarning(UserWarning):
     """A mesh on which nobody looked at the errors: one far too coarse, or of a size that nobody chose."""
+
+
+class Described(eqx.Module):
+    """A result that `describe` lets say in words what it is."""
+
+    @abstractmethod
+    def in_words(self) -> str: ...
 
 
 class SolverState(eqx.Module):
@@ -546,11 +554,14 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
-def describe(equilibrium: Equilibrium) -> str:
+def describe(equilibrium: Equilibrium | Described) -> str:
     """How a solve ended, in words, what is special about the equilibrium, and the estimated errors of its mesh.
 
-    Of several: each with its count, and the largest errors of those that converged.
+    Of several: each with its count, and the largest errors of those that converged. Of a harness: of the whole, then
+    of each rod.
     """
+    if isinstance(equilibrium, Described):
+        return equilibrium.in_words()
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
     converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)

@@ -11,11 +11,24 @@ from rodjax.io.files import load, save
 from rodjax.io.scene_file import SceneFileError, read_scene
 from rodjax.io.scene_writing import write_scene
 from rodjax.model.along import Smooth, Steps
+from rodjax.model.harness import Body, Harness
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
+from rodjax.model.supports import (
+    Clamp,
+    Clip,
+    Free,
+    Hinge,
+    Joint,
+    Pin,
+    Slider,
+    Spring,
+    Swivel,
+    frame,
+    rotate,
+)
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.paths.batch import solve_batch
 from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
@@ -25,12 +38,13 @@ from rodjax.paths.tracing import BranchEnd
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.line_search import LineSearch
 from rodjax.solving.newton import Newton
 from rodjax.solving.nonlinear_cg import NonlinearCG
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
+from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
@@ -62,6 +76,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Between",
+    "Body",
     "Box",
     "Branch",
     "BranchEnd",
@@ -85,6 +100,10 @@ __all__ = [
     "Fits",
     "Free",
     "Guess",
+    "Harness",
+    "HarnessEquilibrium",
+    "Hinge",
+    "Joint",
     "Law",
     "Limits",
     "LineSearch",
@@ -113,8 +132,10 @@ __all__ = [
     "Route",
     "Scene",
     "SceneFileError",
+    "Slider",
     "Smooth",
     "Sphere",
+    "Spring",
     "Status",
     "Steps",
     "Swivel",

@@ -66,7 +66,9 @@ class Harness(eqx.Module):
         joints = {} if joints is None else joints
         instance(joints, "joints", Mapping)
         if contact is not False:
-            raise ValueError(f"contact between the rods of a harness must be False, it is not computed; got {contact!r}")
+            raise ValueError(
+                f"contact between the rods of a harness must be False, it is not computed; got {contact!r}"
+            )
         for name, scene in cables.items():
             instance(name, "the name of a cable", str)
             instance(scene, f"cables[{name!r}]", Scene)
@@ -100,9 +102,7 @@ class Harness(eqx.Module):
     @property
     def has_potential(self) -> bool:
         """Whether all loads have one: a dead moment has none on a body that may turn about more than one axis."""
-        return all(
-            body.moment is None or _motions(body.support).rotations.shape[1] < 2 for body in self.bodies
-        )
+        return all(body.moment is None or _motions(body.support).rotations.shape[1] < 2 for body in self.bodies)
 
 
 def _check_scene(scene: Scene, name: str) -> None:
@@ -194,9 +194,7 @@ def _motions(support: Support | None) -> _Motions:
             translations = everything
         if support.rotation is not None and rotations.shape[1] == 0:
             rotations = everything
-        return _Motions(
-            inner.position, inner.frame, translations, rotations, support.translation, support.rotation
-        )
+        return _Motions(inner.position, inner.frame, translations, rotations, support.translation, support.rotation)
     if isinstance(support, Clamp):
         return _Motions(support.position, support.frame, none, none, None, None)
     if isinstance(support, Pin):
@@ -356,6 +354,11 @@ def clamped(scene: Scene, harness: Harness, positions: Any, frames: Any) -> Scen
             end = Clamp(positions[j] + frames[j] @ end.offset, frames[j] @ end.frame)
         ends.append(end)
     return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+
+def has_movable_ends(scene: Scene) -> bool:
+    """Whether the pose of an end is unknown."""
+    return isinstance(scene.start, Movable) or isinstance(scene.end, Movable)
 
 
 def of_one_rod(scene: Scene) -> Harness:

@@ -26,11 +26,11 @@ from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.shape import Shape
-from rodjax.geometry.vectors import components, dot
+from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
-from rodjax.model.scene import Scene, held_position, scene_axes
+from rodjax.model.scene import held_position, scene_axes
 from rodjax.model.supports import Clamp, rotate
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
@@ -319,8 +319,8 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         residuals.append(here.linearization.residual)
         residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
         floor = jnp.maximum(floor, jnp.max(here.floor))
-        tolerance = jnp.maximum(solver.tolerance, 0.0)
-        is_closed &= jnp.all(jax.vmap(lambda c, form=group.form: form.is_closed(c, tolerance))(here.linearization.closure))
+        closed = jax.vmap(lambda form, closure: form.is_closed(closure, solver.tolerance))
+        is_closed &= jnp.all(closed(group.form, here.linearization.closure))
     motions = assembly.bodies.motions
     gradient, scale = gradient[:count], scale[:count]
     out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
@@ -425,9 +425,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
 
         # The first turn of the loop is the whole step.
         first = part, jnp.full((), jnp.inf, dtype), jnp.full((), -1)
-        part, _, halvings = jax.lax.while_loop(
-            lambda trial: (trial[2] < 0) | goes_on(trial), shortened, first
-        )
+        part, _, halvings = jax.lax.while_loop(lambda trial: (trial[2] < 0) | goes_on(trial), shortened, first)
         is_better = halvings <= MAX_HALVINGS
     else:
         is_better, halvings = jnp.array(True), jnp.zeros((), int)

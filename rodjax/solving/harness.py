@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
-from rodjax.model.harness import Bodies, Harness, clamped, joint_ends, rotated
+from rodjax.model.harness import Bodies, Harness, clamped, joint_ends, of_one_rod, rotated
 from rodjax.model.scene import Scene, nondimensional
 from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
@@ -23,9 +23,9 @@ from rodjax.solving.equilibrium import (
     Options,
     Search,
     _finer,
-    _first_state,
     _fits,
     _is_finest,
+    check_single,
     checked_options,
     checked_strain_limit,
     first_state,
@@ -34,6 +34,7 @@ from rodjax.solving.equilibrium import (
     last_twist,
 )
 from rodjax.solving.first_poses import first_poses
+from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Newton
@@ -48,7 +49,7 @@ from rodjax.solving.result import (
     warn_if_coarse,
     warn_of_outcome,
 )
-from rodjax.solving.status import Outcome, Status, is_converged
+from rodjax.solving.status import Outcome, is_converged
 from rodjax.warn import warn
 
 Members = tuple[tuple[int, ...], ...]
@@ -65,14 +66,15 @@ def solve_harness(
     planar: bool = False,
     find: Any = "minimum",
     strain_limit: Any,
+    shape: Guess | None = None,
 ) -> HarnessEquilibrium:
-    """See `rodjax.solving.solve.solve`."""
+    """See `rodjax.solving.solve.solve`; `shape`: with which all rods begin where there is no guess."""
     if discretization not in (None, "hermite"):
-        raise ValueError(f"discretization must be 'hermite' for a harness, got {discretization!r}")
+        raise ValueError(f"discretization must be 'hermite' where poses of ends are unknown, got {discretization!r}")
     if solver is not None:
         instance(solver, "solver", Newton)
     if planar:
-        raise ValueError("planar must be False for a harness, whose bodies move in space")
+        raise ValueError("planar must be False where poses are unknown, in space")
     if guess is not None:
         instance(guess, "guess", HarnessEquilibrium)
         if guess.energy.ndim:
@@ -83,12 +85,12 @@ def solve_harness(
     strain_limit = checked_strain_limit(strain_limit)
     poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
     scenes = tuple(clamped(scene, fixed, poses.positions, poses.frames) for scene in fixed.scenes)
-    rods = [None] * len(scenes) if guess is None else guess.values()
+    rods = [shape] * len(scenes) if guess is None else guess.values()
     all_options = []
     for scene, rod in zip(scenes, rods, strict=True):
         options, tolerance = checked_options(scene, segments, rtol, "hermite", solver, rod, find=find)
         all_options.append(options)
-    result = _solved(fixed, scenes, poses, tuple(all_options), guess, strain_limit)
+    result = _solved(fixed, scenes, poses, tuple(all_options), guess, strain_limit, shape=shape)
     if is_known(result.status) and is_here(result.groups[0]):
         if segments is None:
             result = _refined(result, tuple(all_options), DEFAULT_RTOL if rtol is None else tolerance, strain_limit)
@@ -97,6 +99,54 @@ def solve_harness(
                 warn_if_coarse(group)
         _warn(result, strain_limit)
     return result if fixed is harness else differentiable_harness(harness, result)
+
+
+def solve_movable(scene: Scene, *, guess: Guess | Equilibrium | None = None, **options: Any) -> Equilibrium:
+    """The equilibrium of a scene with an end that is a `Hinge`, `Slider` or `Spring`."""
+    harness = of_one_rod(scene)
+    shape, earlier = None, None
+    if isinstance(guess, Guess):
+        shape = guess
+    elif guess is not None:
+        instance(guess, "guess", (Guess, Equilibrium))
+        check_single(guess)
+        earlier = _as_harness(harness, guess)
+    return _of_one_rod(solve_harness(harness, guess=earlier, shape=shape, **options))
+
+
+def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
+    """An equilibrium of its one rod, which ends where the bodies are."""
+    frames = {"start": guess.frames[0], "end": guess.frames[-1]}
+    nodes = {"start": guess.nodes[0], "end": guess.nodes[-1]}
+    return HarnessEquilibrium(
+        groups=(jax.tree.map(lambda leaf: leaf[None], guess),),
+        positions=jnp.stack([nodes[name] for name in harness.joint_names]),
+        frames=jnp.stack([frames[name] for name in harness.joint_names]),
+        energy=guess.energy,
+        converged=guess.converged,
+        stable=guess.stable,
+        index=jnp.zeros((), int),
+        status=guess.status,
+        iterations=guess.iterations,
+        evaluations=guess.evaluations,
+        residual=guess.residual,
+        harness=harness,
+        members=((0,),),
+    )
+
+
+def _of_one_rod(result: HarnessEquilibrium) -> Equilibrium:
+    return dataclasses.replace(
+        result.rod(0),
+        energy=result.energy,
+        converged=result.converged,
+        stable=result.stable,
+        status=result.status,
+        iterations=result.iterations,
+        evaluations=result.evaluations,
+        residual=result.residual,
+        free_index=result.index,
+    )
 
 
 def _warn(result: HarnessEquilibrium, strain_limit: Any) -> None:
@@ -138,6 +188,7 @@ def _solved(
     guess: HarnessEquilibrium | None,
     strain_limit: Any,
     finer: dict[int, SolverState] | None = None,
+    shape: Guess | None = None,
 ) -> HarnessEquilibrium:
     """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
     members = _members(scenes, all_options)
@@ -150,9 +201,9 @@ def _solved(
         if start is None:
             each = []
             for number in group:
-                rod = None if guess is None else guess.rod(number)
+                rod = shape if guess is None else guess.rod(number)
                 if finer is not None and number in finer:
-                    assert rod is not None
+                    assert isinstance(rod, Equilibrium)
                     each.append((finer[number], last_twist(rod)))
                 else:
                     each.append(first_state(scenes[number], rod, options))
@@ -241,9 +292,7 @@ def _ends(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Arr
     return bodies, frames, offsets
 
 
-def _equilibria(
-    scenes: Scene, rods: Rods, end: State, group: int, is_stable: Array, strain_limit: Any
-) -> Equilibrium:
+def _equilibria(scenes: Scene, rods: Rods, end: State, group: int, is_stable: Array, strain_limit: Any) -> Equilibrium:
     def one(scene: Scene, rod: Rods, point: Any, residual: Array) -> Equilibrium:
         scaled, units = nondimensional(scene)
         form = form_of(scaled, rod.shape)

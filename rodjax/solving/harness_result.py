@@ -73,8 +73,7 @@ class HarnessEquilibrium(Described):
         """By its place among the `names`."""
         for members, group in zip(self.members, self.groups, strict=True):
             if number in members:
-                place, axis = members.index(number), self.energy.ndim
-                return jax.tree.map(lambda stack: _taken(stack, place, axis), group)
+                return _taken(group, members.index(number), self.energy.ndim)
         raise IndexError(number)
 
     def __iter__(self) -> Iterator[str]:
@@ -105,7 +104,12 @@ class HarnessEquilibrium(Described):
         return "\n".join(lines + [f"{name}: {describe(rod)}" for name, rod in self.items()])
 
 
-def _taken(stack: Any, place: int, axis: int) -> Any:
-    if is_known(stack):
-        return leaf(np.asarray(stack)[(slice(None),) * axis + (place,)])
-    return jax.lax.index_in_dim(stack, place, axis, keepdims=False)
+def _taken(stacked: Equilibrium, place: int, axis: int) -> Equilibrium:
+    """One of equilibria stacked along an axis."""
+
+    def taken(stack: Array) -> Array:
+        if is_known(stack):
+            return leaf(np.asarray(stack)[(slice(None),) * axis + (place,)])
+        return jax.lax.index_in_dim(stack, place, axis, keepdims=False)
+
+    return jax.tree.map(taken, stacked)

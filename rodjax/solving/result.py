@@ -168,6 +168,8 @@ class Equilibrium(eqx.Module):
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
       examined, under loads without a potential and in the continuum. Computed when asked for
+    - `free_index` [...] int: the same where the pose of an end was unknown, this being free; else `None`. `index`,
+      `critical` and `neutral` are those of the rod between clamps at the poses that were found
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
     - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
@@ -199,6 +201,7 @@ class Equilibrium(eqx.Module):
     scene: Scene
     state: SolverState
     discretization: str = eqx.field(static=True)
+    free_index: Int[Array, "..."] | None = None
 
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
@@ -567,7 +570,7 @@ def describe(equilibrium: Equilibrium | Described) -> str:
     converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
-        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "a saddle: there are motions that lower the energy": _index(equilibrium, examination) > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
@@ -583,6 +586,10 @@ def describe(equilibrium: Equilibrium | Described) -> str:
         return "; ".join([_outcome(equilibrium), *strain, *special, *_contacts_told(equilibrium), *told])
     special = [f"{count} {remark}" for remark, count in counts.items() if count]
     return "\n".join([_outcome(equilibrium), *strain, *special, *told])
+
+
+def _index(equilibrium: Equilibrium, examination: _Examination) -> Int[np.ndarray, "..."]:
+    return np.asarray(examination.index if equilibrium.free_index is None else equilibrium.free_index)
 
 
 def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:

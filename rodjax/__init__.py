@@ -8,7 +8,8 @@ from rodjax.analysis.clearance import Clearance, clearance
 from rodjax.analysis.curvature import most_curved
 from rodjax.analysis.sensitivity import end_stiffness, sensitivities
 from rodjax.io.files import load, save
-from rodjax.io.scene_file import SceneFileError, read_scene
+from rodjax.io.harness_file import read_scene
+from rodjax.io.quantities import SceneFileError
 from rodjax.io.scene_writing import write_scene
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.harness import Body, Harness

@@ -17,6 +17,8 @@ from rodjax.solving.assembly import Poses
 FRAME_WEIGHT = 0.05
 # A chord shorter than this part of the rod has no direction.
 LEAST_CHORD = 1e-6
+# How far rods longer than their chords let a body down, as a part of how far they would reach taut.
+SAG = 0.7
 
 
 class _Reach(NamedTuple):
@@ -37,8 +39,9 @@ class _Reach(NamedTuple):
 
 @compiled
 def first_poses(harness: Harness) -> Poses:
-    """Each body where springs along the rods, as soft as these are long, would hold it; what hangs on a single fixed
-    place straight on from there. Axes so that the ends point along the chords of their rods.
+    """Each body where springs along the rods, as soft as these are long, would hold it, let down as far as the rods are
+    longer; what hangs on a single fixed place straight on from there. Axes so that the ends point along the chords of
+    their rods.
     """
     bodies = Bodies.of(harness)
     reaches = [reach for scene in harness.scenes for reach in _reaches(scene, harness)]
@@ -48,6 +51,7 @@ def first_poses(harness: Harness) -> Poses:
     positions: list[Any] = [bodies.position[j] if is_fixed[j] else None for j in range(count)]
     frames: list[Any] = [bodies.frame[j] if bodies.has_frame[j] else None for j in range(count)]
 
+    gravity = next((scene.gravity for scene in harness.scenes if scene.gravity is not None), None)
     free = [j for j in range(count) if not is_fixed[j] and j not in hangs]
     if free:
         place = {j: k for k, j in enumerate(free)}
@@ -69,6 +73,9 @@ def first_poses(harness: Harness) -> Poses:
         found = jnp.linalg.solve(matrix, right)
         for j, k in place.items():
             positions[j] = found[k]
+        lowered = {j: _lowered(j, positions, reaches, gravity) for j in free} if gravity is not None else {}
+        for j, position in lowered.items():
+            positions[j] = position
     for j in range(count):
         if positions[j] is not None and frames[j] is None:
             frames[j] = _frame_at(j, positions, reaches)
@@ -155,6 +162,21 @@ def _end_beyond(reach: _Reach, positions: list[Any], frames: list[Any]) -> tuple
     assert reach.other_joint is not None
     frame = frames[reach.other]
     return positions[reach.other] + frame @ reach.other_joint.offset, frame @ reach.other_joint.frame
+
+
+def _lowered(body: int, positions: list[Any], reaches: list[_Reach], gravity: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The position of a body as far down as the rods between it and fixed places, else all of its rods, let it."""
+    beside = [reach for reach in reaches if reach.body == body]
+    fixed = [reach for reach in beside if reach.place is not None]
+    falls = []
+    for reach in fixed or beside:
+        place = reach.place if reach.other is None else positions[reach.other]
+        if place is not None:
+            falls.append(reach.length**2 - jnp.sum((place - positions[body]) ** 2))
+    size = jnp.sqrt(jnp.sum(gravity**2))
+    down = gravity / jnp.where(size > 0, size, 1.0)
+    fall = jnp.min(jnp.stack(falls)) if falls else jnp.zeros_like(size)
+    return positions[body] + SAG * jnp.sqrt(jnp.maximum(fall, 0.0)) * down
 
 
 def _frame_at(body: int, positions: list[Any], reaches: list[_Reach]) -> Float[Array, "3 3"]:

@@ -1,7 +1,6 @@
 """What a solve of a harness gives: the equilibria of its rods, and the poses of its bodies."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import equinox as eqx
 import jax

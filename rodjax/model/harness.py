@@ -351,9 +351,14 @@ def clamped(scene: Scene, harness: Harness, positions: Any, frames: Any) -> Scen
     for end in (scene.start, scene.end):
         if isinstance(end, Joint):
             j = harness.joint_names.index(end.name)
-            end = Clamp(positions[j] + frames[j] @ end.offset, frames[j] @ end.frame)
+            end = clamp_at(end, positions[j], frames[j])
         ends.append(end)
     return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+
+def clamp_at(end: Joint, position: Float[Array, "3"], frame: Float[Array, "3 3"]) -> Clamp:
+    """What holds the end of a rod where its body is at a pose."""
+    return Clamp(position + frame @ end.offset, frame @ end.frame)
 
 
 def has_movable_ends(scene: Scene) -> bool:

@@ -130,13 +130,15 @@ class RodStep(NamedTuple):
 
     def value(
         self, rod: Rod, motions: Float[Array, "2 6"], part: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, "c"]]:
-        """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans."""
+    ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
+        """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans; the
+        point there.
+        """
         form = rod.moved(motions)
-        there = form.moved(self.point, self.bases, part * self.rotation, self.force_change)
-        value, closure = form.lagrangian(form.holding(there))
+        there = form.holding(form.moved(self.point, self.bases, part * self.rotation, self.force_change))
+        value, closure = form.lagrangian(there)
         scene = form.scene
-        return value + dead_load_energy(total_force(scene), held_position(scene)), closure
+        return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
 
 
 class Coupling(NamedTuple):
@@ -392,43 +394,38 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     all_steps = [step._replace(force_change=part * step.force_change) for step in all_steps]
     is_finite = jnp.isfinite(residual) & jnp.isfinite(largest)
 
-    def values_at(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The energy, with L of the rods, and half of the squared closures."""
+    def moved_by(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""], tuple[Any, ...]]:
+        """The energy, with L of the rods, half of the squared closures, and the points of the rods."""
         energy = jnp.sum(assembly.body_energies(poses, part * body_motions))
-        lacking = jnp.zeros((), dtype)
+        lacking, points = jnp.zeros((), dtype), []
         for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
             shares = assembly.shares(group)
-            value, closure = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
+            value, closure, point = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
                 step, here.rods, of_ends
             )
             energy += jnp.sum(shares * value)
             lacking += jnp.sum(shares[:, None] * closure**2) / 2
-        return energy, lacking
+            points.append(point)
+        return energy, lacking, tuple(points)
 
-    if seeks_minimum:
-        nothing = jnp.zeros((), dtype)
-        (energy, lacking), (slope, rate) = jax.jvp(values_at, (nothing,), (jnp.ones((), dtype),))
-        weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
-        merit, slope = energy + weight * lacking, slope + weight * rate
-        slack = ENERGY_ROUNDING * (1 + jnp.abs(merit))
+    slope, rate = _slopes(assembly, all_here, all_steps, all_motions, gradient, body_motions)
+    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
+    slope += weight * rate
 
-        def goes_on(trial: tuple[Array, Array, Array]) -> Bool[Array, ""]:
-            part, found, halvings = trial
-            bound = merit + SUFFICIENT_DECREASE * part * jnp.minimum(slope, 0.0) + slack
-            return ~(is_pushed | (found <= bound)) & (halvings <= MAX_HALVINGS)
+    def tried(trial: _Trial) -> _Trial:
+        """First where the step begins, under the new forces; then all of it, and ever shorter parts."""
+        tries = trial.tries + 1
+        next_part = jnp.where(tries == 1, part, trial.part / 2)
+        energy, lacking, points = moved_by(jnp.where(tries == 0, 0.0, next_part))
+        merit = energy + weight * lacking
+        bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
+        bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
+        is_better = (tries > 0) & (is_pushed | (merit <= bound) | (not seeks_minimum))
+        return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
 
-        def shortened(trial: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            part, _, halvings = trial
-            part = jnp.where(halvings < 0, part, part / 2)
-            energy, lacking = values_at(part)
-            return part, energy + weight * lacking, halvings + 1
-
-        # The first turn of the loop is the whole step.
-        first = part, jnp.full((), jnp.inf, dtype), jnp.full((), -1)
-        part, _, halvings = jax.lax.while_loop(lambda trial: (trial[2] < 0) | goes_on(trial), shortened, first)
-        is_better = halvings <= MAX_HALVINGS
-    else:
-        is_better, halvings = jnp.array(True), jnp.zeros((), int)
+    start = _Trial(part, jnp.full((), -1), jnp.zeros((), dtype), jnp.array(False), tuple(x.points for x in all_here))
+    trial = jax.lax.while_loop(lambda trial: ~trial.is_better & (trial.tries <= MAX_HALVINGS), tried, start)
+    part, is_better = trial.part, trial.is_better
 
     # --- what follows ---
     is_sought = is_definite if seeks_minimum else jnp.array(True)
@@ -445,14 +442,13 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     taken = jnp.where(goes, part, 0.0)
     there = poses.moved(taken * body_motions, assembly.length)
     there = jax.tree.map(lambda new, old: jnp.where(goes, new, old), there, poses)
-    all_points = []
-    for here, step, of_ends in zip(all_here, all_steps, all_motions, strict=True):
-        moved = jax.vmap(lambda step, rod, of_ends: _moved(step, rod, of_ends, taken))(step, here.rods, of_ends)
-        all_points.append(jax.tree.map(lambda new, old: jnp.where(goes, new, old), moved, here.points))
+    points = jax.tree.map(
+        lambda new, old: jnp.where(goes, new, old), trial.points, tuple(here.points for here in all_here)
+    )
     damping = jnp.where(is_better, state.damping / SHIFT_GROWTH**2, SHIFT_GROWTH * state.damping)
     damping = jnp.where(is_better, jnp.where(damping < FIRST_SHIFT, 0.0, damping), jnp.maximum(damping, FIRST_SHIFT))
     return State(
-        points=tuple(all_points),
+        points=points,
         poses=there,
         shifts=tuple(shifts),
         damping=damping,
@@ -460,15 +456,56 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         residuals=tuple(residuals),
         pushes=state.pushes + jnp.where(goes & is_pushed, 1, 0),
         iterations=state.iterations + jnp.where(goes, 1, 0),
-        evaluations=state.evaluations + 1 + halvings,
+        evaluations=state.evaluations + trial.tries,
         status=status.astype(int),
         index=(negative + below).astype(int),
     )
 
 
-def _moved(step: RodStep, rod: Rod, motions: Float[Array, "2 6"], part: Float[Array, ""]) -> Any:
-    form = rod.moved(part * motions)
-    return form.holding(form.moved(step.point, step.bases, part * step.rotation, step.force_change))
+class _Trial(NamedTuple):
+    """A part of a step, how many were tried before it, the merit where the step begins, whether this one is better,
+    and the points of the rods.
+    """
+
+    part: Float[Array, ""]
+    tries: Int[Array, ""]
+    first: Float[Array, ""]
+    is_better: Bool[Array, ""]
+    points: tuple[Any, ...]
+
+
+def _slopes(
+    assembly: Assembly,
+    all_here: list[_Here],
+    all_steps: list[RodStep],
+    all_motions: list[Array],
+    gradient: Float[Array, "j 6"],
+    body_motions: Float[Array, "j 6"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How fast L, and half of the squared closures, change as a step begins under the new forces, which L has to first
+    order.
+    """
+    slope, rate = jnp.sum(gradient * body_motions), jnp.zeros((), gradient.dtype)
+    for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
+
+        def of_rod(form: Form, here: Linearization, coupling: Coupling, step: RodStep, motions: Array):
+            nothing = jnp.zeros_like(here.gradient)
+            change = jnp.zeros_like(here.closure)
+            count = len(change)
+            change = change.at[count - form.layout.size :].set(form.layout.components(step.force_change))
+            by_force, lost = here.system.times(nothing, change)
+            _, closing = here.system.times(step.rotation, jnp.zeros_like(change))
+            closing += coupling.of_closure @ motions
+            along = jnp.sum((here.gradient + by_force) * step.rotation) + jnp.sum(
+                change * (coupling.of_closure @ motions)
+            )
+            return along, jnp.sum(form.closure(here.closure + lost) * form.closure(closing))
+
+        along, closing = jax.vmap(of_rod)(group.form, here.linearization, here.coupling, step, of_ends.reshape(-1, 12))
+        shares = assembly.shares(group)
+        slope += jnp.sum(shares * along)
+        rate += jnp.sum(shares * closing)
+    return slope, rate
 
 
 def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:

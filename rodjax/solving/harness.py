@@ -13,8 +13,9 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
-from rodjax.model.harness import Bodies, Harness, clamped, joint_ends, of_one_rod, rotated
+from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, joint_ends, of_one_rod, rotated
 from rodjax.model.scene import Scene, nondimensional
+from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
 from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
@@ -84,16 +85,20 @@ def solve_harness(
     fixed, guess = not_differentiated(harness, guess)
     strain_limit = checked_strain_limit(strain_limit)
     poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
-    scenes = tuple(clamped(scene, fixed, poses.positions, poses.frames) for scene in fixed.scenes)
-    rods = [shape] * len(scenes) if guess is None else guess.values()
-    all_options = []
-    for scene, rod in zip(scenes, rods, strict=True):
-        options, tolerance = checked_options(scene, segments, rtol, "hermite", solver, rod, find=find)
+    counts = [None] * len(fixed) if guess is None else guess.segments
+    all_options, tolerance = [], rtol
+    for scene, count in zip(_structures(fixed), counts, strict=True):
+        wanted = segments if count is None or rtol is not None else segments or count
+        options, tolerance = checked_options(scene, wanted, rtol, "hermite", solver, find=find)
+        if segments is None and count is not None:
+            options = dataclasses.replace(options, segments=count)
         all_options.append(options)
-    result = _solved(fixed, scenes, poses, tuple(all_options), guess, strain_limit, shape=shape)
+    result = _solved(fixed, poses, tuple(all_options), guess, strain_limit, shape=shape)
     if is_known(result.status) and is_here(result.groups[0]):
         if segments is None:
-            result = _refined(result, tuple(all_options), DEFAULT_RTOL if rtol is None else tolerance, strain_limit)
+            result = _refined(
+                result, tuple(all_options), DEFAULT_RTOL if tolerance is None else tolerance, strain_limit
+            )
         else:
             for group in result.groups:
                 warn_if_coarse(group)
@@ -166,10 +171,26 @@ def _followed(harness: Harness, guess: HarnessEquilibrium) -> Poses:
     return Poses(*Bodies.of(harness).followed(Bodies.of(guess.harness), guess.positions, guess.frames))
 
 
-def _members(scenes: tuple[Scene, ...], all_options: tuple[Options, ...]) -> Members:
+def _structures(harness: Harness) -> list[Scene]:
+    """The scenes of the rods with clamps, at no place in particular, where their ends are joints."""
+    clamp = _clamp(harness.scenes[0].rod.length.dtype)
+
+    def structure(scene: Scene) -> Scene:
+        ends = [clamp if isinstance(end, Joint) else end for end in (scene.start, scene.end)]
+        return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+    return [structure(scene) for scene in harness.scenes]
+
+
+@functools.cache
+def _clamp(dtype: Any) -> Clamp:
+    return Clamp(np.zeros(3, dtype), np.eye(3, dtype=dtype))
+
+
+def _members(harness: Harness, all_options: tuple[Options, ...]) -> Members:
     """The numbers of the rods of one structure and mesh."""
     found: dict[Any, list[int]] = {}
-    for number, (scene, options) in enumerate(zip(scenes, all_options, strict=True)):
+    for number, (scene, options) in enumerate(zip(_structures(harness), all_options, strict=True)):
         leaves, tree = jax.tree.flatten(scene)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), options.segments
         found.setdefault(key, []).append(number)
@@ -182,7 +203,6 @@ def _stack(parts: list[Any]) -> Any:
 
 def _solved(
     harness: Harness,
-    scenes: tuple[Scene, ...],
     poses: Poses,
     all_options: tuple[Options, ...],
     guess: HarnessEquilibrium | None,
@@ -191,13 +211,13 @@ def _solved(
     shape: Guess | None = None,
 ) -> HarnessEquilibrium:
     """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
-    members = _members(scenes, all_options)
+    members, structures = _members(harness, all_options), _structures(harness)
     starts = []
     for group in members:
         options = all_options[group[0]]
         start = None
         if guess is not None and group in guess.members:
-            start = _as_it_was([scenes[number] for number in group], guess.groups[guess.members.index(group)], options)
+            start = _as_it_was(structures[group[0]], guess.groups[guess.members.index(group)], options)
         if start is None:
             each = []
             for number in group:
@@ -206,11 +226,12 @@ def _solved(
                     assert isinstance(rod, Equilibrium)
                     each.append((finer[number], last_twist(rod)))
                 else:
-                    each.append(first_state(scenes[number], rod, options))
+                    scene = _at(harness.scenes[number], _bodies_of(harness, number), poses)
+                    each.append(first_state(scene, rod, options))
             start = _stacked_starts(tuple(each))
         starts.append(start)
     options = tuple(all_options[group[0]] for group in members)
-    return _solve(harness, scenes, poses, tuple(starts), strain_limit, options, members=members)
+    return _solve(harness, poses, tuple(starts), strain_limit, options, members=members)
 
 
 @compiled
@@ -218,12 +239,25 @@ def _stacked_starts(each: tuple[tuple[SolverState, FirstTwist], ...]) -> tuple[S
     return _stack(list(each))
 
 
-def _as_it_was(scenes: list[Scene], group: Equilibrium, options: Options) -> tuple[SolverState, FirstTwist] | None:
+def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[SolverState, FirstTwist] | None:
     """The state of stacked equilibria, where it has the unknowns and the mesh of their scenes."""
-    if group.s.shape[-1] - 1 != options.segments or jax.tree.structure(group.scene) != jax.tree.structure(scenes[0]):
+    if group.s.shape[-1] - 1 != options.segments or jax.tree.structure(group.scene) != jax.tree.structure(scene):
         return None
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), group)
-    return (group.state, last_twist(group)) if _fits(scenes[0], one, options) else None
+    return (group.state, last_twist(group)) if _fits(scene, one, options) else None
+
+
+def _bodies_of(harness: Harness, number: int) -> tuple[int, int]:
+    return joint_ends(harness.scenes[number], harness.joint_names)[0]
+
+
+@compiled
+def _at(scene: Scene, bodies: tuple[int, int], poses: Poses) -> Scene:
+    """With clamps in the place of joints, which the rod has with these bodies."""
+    ends = []
+    for end, body in zip((scene.start, scene.end), bodies, strict=True):
+        ends.append(clamp_at(end, poses.positions[body], poses.frames[body]) if isinstance(end, Joint) else end)
+    return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
 
 
 # --- the solve -------------------------------------------------------------------------------------------------------
@@ -232,7 +266,6 @@ def _as_it_was(scenes: list[Scene], group: Equilibrium, options: Options) -> tup
 @functools.partial(compiled, static_argnames=("members",))
 def _solve(
     harness: Harness,
-    scenes: tuple[Scene, ...],
     poses: Poses,
     starts: tuple[tuple[SolverState, FirstTwist], ...],
     strain_limit: Float[Array, ""] | float,
@@ -241,7 +274,7 @@ def _solve(
 ) -> HarnessEquilibrium:
     groups, points = [], []
     for numbers, (states, firsts), option in zip(members, starts, options, strict=True):
-        stacked = _stack([scenes[number] for number in numbers])
+        stacked = _stack([clamped(harness.scenes[number], harness, *poses) for number in numbers])
 
         def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
             return Search.of(*in_units_of(scene, state), first, option)
@@ -339,10 +372,8 @@ def _refined(
                 )
             break
         all_options = tuple(options)
-        harness = result.harness
         poses = Poses(result.positions, result.frames)
-        scenes = tuple(clamped(scene, harness, *poses) for scene in harness.scenes)
-        result = _solved(harness, scenes, poses, all_options, result, strain_limit, finer)
+        result = _solved(result.harness, poses, all_options, result, strain_limit, finer)
         iterations, evaluations = iterations + int(result.iterations), evaluations + int(result.evaluations)
     counts = jnp.asarray(iterations), jnp.asarray(evaluations)
     return eqx.tree_at(lambda result: (result.iterations, result.evaluations), result, counts)

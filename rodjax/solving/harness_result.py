@@ -62,6 +62,16 @@ class HarnessEquilibrium(Described):
             for j, name in enumerate(self.harness.joint_names)
         }
 
+    @property
+    def segments(self) -> list[int]:
+        """Of the mesh of each rod."""
+        found = {
+            number: group.s.shape[-1] - 1
+            for members, group in zip(self.members, self.groups, strict=True)
+            for number in members
+        }
+        return [found[number] for number in range(len(self))]
+
     def __getitem__(self, name: str) -> Equilibrium:
         if name not in self.names:
             known = ", ".join(map(repr, self.names))

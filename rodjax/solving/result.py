@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from html import escape
 from typing import Any
@@ -82,6 +83,13 @@ class MeshWarning(UserWarning):
 
 class PrecisionWarning(UserWarning):
     """Numbers of single precision, and what they cost."""
+
+
+class Described(eqx.Module):
+    """A result that `describe` lets say in words what it is."""
+
+    @abstractmethod
+    def in_words(self) -> str: ...
 
 
 class SolverState(eqx.Module):
@@ -168,6 +176,8 @@ class Equilibrium(eqx.Module):
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
       examined, under loads without a potential and in the continuum. Computed when asked for
+    - `free_index` [...] int: the same where the pose of an end was unknown, this being free; else `None`. `index`,
+      `critical` and `neutral` are those of the rod between clamps at the poses that were found
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
     - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
@@ -200,6 +210,7 @@ class Equilibrium(eqx.Module):
     state: SolverState
     discretization: str = eqx.field(static=True)
     shear_strain: Float[Array, "... n+1 2"] | None = None
+    free_index: Int[Array, "..."] | None = None
 
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
@@ -580,17 +591,20 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
-def describe(equilibrium: Equilibrium) -> str:
+def describe(equilibrium: Equilibrium | Described) -> str:
     """How a solve ended, in words, what is special about the equilibrium, and the estimated errors of its mesh.
 
-    Of several: each with its count, and the largest errors of those that converged.
+    Of several: each with its count, and the largest errors of those that converged. Of a harness: of the whole, then
+    of each rod.
     """
+    if isinstance(equilibrium, Described):
+        return equilibrium.in_words()
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
     converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
-        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "a saddle: there are motions that lower the energy": _index(equilibrium, examination) > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
@@ -654,6 +668,10 @@ def _told(equilibrium: Equilibrium) -> list[tuple[str, str]]:
         for kind, unit in (("force", "N"), ("moment", "N m"))
     ]
     return [(name, line.strip()) for name, line in told]
+
+
+def _index(equilibrium: Equilibrium, examination: _Examination) -> Int[np.ndarray, "..."]:
+    return np.asarray(examination.index if equilibrium.free_index is None else equilibrium.free_index)
 
 
 def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:

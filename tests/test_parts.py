@@ -75,6 +75,7 @@ def test_elements_converge_to_the_continuum():
     continuum = rj.solve_continuum(scene, guess=found[32])
     np.testing.assert_allclose(found[32].nodes, continuum.nodes, atol=2e-7)
     np.testing.assert_allclose(found[32].start_moment, continuum.start_moment, atol=1e-5)
+    np.testing.assert_allclose(found[32].energy, continuum.energy, rtol=1e-5)
     for n in (8, 16):
         # The meshes have nodes at A and B, each at other places besides.
         error = np.max(np.linalg.norm(found[n].nodes - continuum.position_at(found[n].s), axis=1))

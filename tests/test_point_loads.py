@@ -2,6 +2,7 @@
 
 import math
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,6 +115,19 @@ def test_files_keep_point_loads(tmp_path):
         assert [load.follower for load in (*read.point_couples, *read.point_forces)] == [False, True, True, False]
         for value, expected in zip(jax.tree.leaves(read), jax.tree.leaves(given), strict=True):
             np.testing.assert_array_equal(value, expected)
+
+
+def test_point_forces_of_older_files_are_dead(tmp_path):
+    """Files until format 12 say nothing of it."""
+    path = tmp_path / "old.vtkhdf"
+    given = scene(point_forces=[rj.PointForce(0.7, (0, 0, 0.1))])
+    rj.save(rj.solve(given, segments=10), path)
+    with h5py.File(path, "r+") as file:
+        file["rodjax"].attrs["format"] = 12
+        del file["rodjax/scene/point_forces/0"].attrs["follower"]
+    (force,) = rj.load(path).scene.point_forces
+    assert not force.follower
+    np.testing.assert_array_equal(force.force, given.point_forces[0].force)
 
 
 def test_wrong_point_loads_are_named():

@@ -449,10 +449,7 @@ def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
     count, gap = int(np.max(needed[0])), float(np.min(needed[1]))
     if count <= (SIZES["hermite"][-1] if segments is None else segments):
         return max(least, count)
-    where = (
-        "jumps of Steps, parts of loads and loads at a point must have an element each, "
-        f"at least {LEAST_ELEMENT:g} of a segment long"
-    )
+    where = f"jumps of Steps and of loads must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
     given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
     raise ValueError(
         f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "

@@ -409,6 +409,15 @@ class FrameForm(Form):
             residual=self._residual(gradient),
         )
 
+    def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        layout = self.layout
+        assert isinstance(layout, SpanForces)
+        value, ways = self.in_cells(self._kinematics(self.field.of_cells(point.quaternions)), point.end_force)
+        if not layout.size:
+            return value, jnp.zeros(0, value.dtype)
+        closure = layout.components(self.spans - layout.sums(ways))
+        return value + jnp.sum(point.end_force * self.spans), closure
+
     def _residual(self, gradient: Float[Array, "3 m"]) -> Float[Array, ""]:
         """Largest component of the moment left at a frame, per length of rod."""
         return jnp.max(jnp.abs(gradient) / self.field.weights[None])

@@ -138,12 +138,12 @@ def strains_beside_nodes(
     form: FrameForm, point: FramePoint
 ) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
     """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
-    strains, axial = _strains_at_ends(form, point, _end_moments(form, point))
+    strains, axial = _strains_at_ends(form, point, end_moments(form, point))
     s = form.field.strain_places[::2]
     return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
 
 
-def _end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
+def end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
     """The section moments at both ends of each element, on its side of the node."""
     own = own_moments(form, point)
     return jnp.stack([-own[:, 0], own[:, 2]], axis=1)
@@ -283,7 +283,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point, axis)
-    ends = _end_moments(form, point)
+    ends = end_moments(form, point)
     moments = ends[:, 0]
     if not (form.scene.clips or form.scene.point_couples):
         moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
@@ -328,7 +328,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     # A difference, as a derivative of these would be a third one of the energy.
     there = form.moved(point, here.bases, motion.rotation, change)
     before = section_forces(form, point), ends, _strains_at_ends(form, point, ends)[0][:2]
-    moments = _end_moments(lacking(1.0), there).at[:, 1].add(couple)
+    moments = end_moments(lacking(1.0), there).at[:, 1].add(couple)
     after = section_forces(form, there), moments, _strains_at_ends(form, there, moments)[0][:2]
     changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
@@ -414,7 +414,7 @@ def _errors_of_joints(form: FrameForm, point: FramePoint, axis: Float[Array, "3"
         after - before for after, before in zip(elements.end_forces(end), form.end_forces(point), strict=True)
     ]
     error = Sizes(longest(jnp.stack(end_changes, axis=1)), longest(jnp.stack(moments, axis=1)), curvature)
-    scale = Sizes(longest(forces), longest(_end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
+    scale = Sizes(longest(forces), longest(end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
     return Errors(
         elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)),
         *error.relative_to(scale),

@@ -84,6 +84,15 @@ def _by_ends(
     return with_fields_by_tangent(form.fields_on_elements(point), by_ends)
 
 
+def element_end_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "3 2 n"]:
+    """The section moments at both ends of each element, on its side of the node."""
+    tangents, torque = point.tangents, torque_at(form.scene.rod, point.total_twist)
+    assert isinstance(form.field, HermiteElements)
+    by_start, by_end = _by_ends(form, form.field, point, torque)
+    start, end = tangents[:, 0:-1:2], tangents[:, 2::2]
+    return jnp.stack([torque * start - cross(start, by_start), torque * end + cross(end, by_end)], axis=1)
+
+
 def with_fields_by_tangent(
     fields: OnElements | None, by_ends: tuple[Float[Array, "3 n"], Float[Array, "3 n"]]
 ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:

@@ -55,6 +55,11 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "force": ("N", (3,), '"[0, 0, -0.2] N"'),
     "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
     "couple": ("N m/m", (3,), '"[0, 0, 0.01] N m/m"'),
+    "axis": ("", (3,), "[0, 1, 0]"),
+    "offset": ("m", (3,), '"[0, 5, 0] mm"'),
+    "mass": ("kg", (), '"0.05 kg"'),
+    "translation": ("N/m", (), '"1e4 N/m"'),
+    "rotation": ("N m/rad", (), '"0.5 N m/rad"'),
     "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
     "at": ("m", (), '"0.5 m"'),
     "segments": ("", (), "50"),
@@ -113,11 +118,12 @@ LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
     "poisson_ratios": ("", (None,), "[0.5, 0.4]"),
     "densities": ("kg/m^3", (None,), '"[1100, 1200] kg/m^3"'),
     "points": ("m", (None, 3), '"[[0, 0, 0], [1, 0, 0], [2, 0.5, 0], [3, 1, 0]] cm"'),
+    "directions": ("", (None, 3), "[[1, 0, 0]]"),
     "jumps": ("m", (None,), '"[0.5] m"'),
     "s": ("m", (None,), '"[0, 0.5, 1] m"'),
 }
 # Keys whose vectors get the length 1.
-DIRECTIONS = ("tangent", "d2", "normal")
+DIRECTIONS = ("tangent", "d2", "normal", "axis")
 NUMBER = r"[-+]?(?:nan|inf|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?)"
 NUMBER_AND_UNIT = re.compile(rf"\s*(\[.*\]|{NUMBER})\s*(.*?)\s*", re.I | re.S)
 # A unit has names, exponents of them, signs of products and quotients, and the 1 of "1/m". Other numbers, signs and

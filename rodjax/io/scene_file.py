@@ -13,7 +13,9 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 
     [start]
     support = "clamp"              # also "swivel": position, tangent; "pin": position; "free": optional force, moment
-                                   # and follower = true where these turn with the end
+                                   # and follower = true where these turn with the end; "hinge": position, frame or
+                                   # tangent and d2, axis = [0, 1, 0]; "slider": position, directions = [[1, 0, 0]],
+                                   # optionally a frame; "joint", of a harness: see `rodjax.io.harness_file`
     position = "[0, 0, 0] m"
     tangent = [1, 0, 0]            # with d2 a 3x3 frame, its columns d1, d2, t; or frame = [[0, 0, 1], [0, 1, 0], ...]
     d2 = [0, 1, 0]                 # optional: the clocking, see below
@@ -24,6 +26,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     tangent = [1, 0, 0]
     d2 = [0, 1, 0]
     spin = "0 deg"                 # optional: turns the frame of a clamp with a clocking about its own tangent
+    # translation = "1e4 N/m"      # optional, of a clamp, pin, hinge or slider: springs about the support
+    # rotation = "0.5 N m/rad"     # the same of all but a pin
     # turns = 1                    # optional: whole extra turns of the end frame, for two clamps and no path
 
     [loads]                        # optional
@@ -135,7 +139,20 @@ from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple,
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import LEAST_ACROSS, Clamp, Clip, Free, Pin, Support, Swivel, frame
+from rodjax.model.supports import (
+    LEAST_ACROSS,
+    Clamp,
+    Clip,
+    Free,
+    Hinge,
+    Joint,
+    Pin,
+    Slider,
+    Spring,
+    Support,
+    Swivel,
+    frame,
+)
 from rodjax.solving.equilibrium import (
     MAX_SEGMENTS,
     Discretization,
@@ -172,13 +189,20 @@ _SHEARING = ("circular", "tube", "rectangular")
 _VARYING = (*_BENDING, *_SHEAR, "GJ", "EA", "mass_per_length", "radius", *_REST, "rest_strain")
 PAIRS = {"EI": ("EI1", "EI2"), "GA": ("GA1", "GA2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
 DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
+_FRAME = ("frame", "tangent", "d2", "spin")
+_SPRINGS = ("translation", "rotation")
 # The keys that a support must have, may have, and may change along a path.
 _SUPPORTS = {
-    "clamp": (("position",), ("frame", "tangent", "d2", "spin"), ("position", "tangent", "d2", "spin")),
+    "clamp": (("position",), (*_FRAME, *_SPRINGS), ("position", "tangent", "d2", "spin")),
     "swivel": (("position", "tangent"), (), ("position", "tangent")),
-    "pin": (("position",), (), ("position",)),
+    "pin": (("position",), ("translation",), ("position",)),
     "free": ((), ("force", "moment"), ("force", "moment")),
+    "hinge": (("position", "axis"), (*_FRAME, *_SPRINGS), ()),
+    "slider": (("position", "directions"), (*_FRAME, *_SPRINGS), ()),
+    "joint": ((), (*_FRAME, "offset"), ()),
 }
+# Keys of a support that are no numbers.
+_OTHER = {"free": ("support", "follower"), "joint": ("support", "joint")}
 # How the scene's own error messages begin, and the keys that they are about.
 _SCENE_KEYS = {
     "turns": "end.turns",
@@ -222,17 +246,8 @@ class SceneFile(NamedTuple):
         return {name: getattr(self, name) for name in names}
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
-    """The scene in a TOML file, or the list of scenes where the file has a `[[path]]`.
-
-    Raises `SceneFileError` where the file cannot be read or says what makes no sense. See this module for the format.
-    """
-    file = read_scene_file(path)
-    return file.scenes if file.is_path else file.scenes[0]
-
-
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
-    """As `read_scene`, with the settings of the solve."""
+    """The scenes of a TOML file that is not one of a harness, with the settings of the solve."""
     path = file_path(path, "path")
     with in_file(path):
         return SceneReader().read(toml_tables(read_text(path)))
@@ -333,6 +348,10 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
         raise SceneFileError("solve.rtol is not allowed together with solve.segments: it chooses the segments")
     turns = values["end"].pop("turns", None)
     unclocked = tuple(name for name, kind in kinds.items() if kind == "clamp" and is_unclocked(values[name]))
+    movable = next((name for name, kind in kinds.items() if kind in (*_MOVABLE, "joint")), None)
+    movable = next((name for name in kinds if any(key in values[name] for key in _SPRINGS)), movable)
+    if movable and "path" in content:
+        raise SceneFileError(f"path is not allowed where the pose of an end is unknown, as that of the {movable} is")
     changes = _changes(content["path"], kinds, values, unclocked) if "path" in content else []
     if changes and turns is not None:
         raise SceneFileError("end.turns is not allowed together with path: turn the end along the path by end.spin")
@@ -347,7 +366,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     def scene(values: Values, where: str = "") -> Scene:
         gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
         start, end = (
-            part(_support, kind, values[name], f"{where}{name}", followers[name], resists)
+            part(_support, kind, values[name], f"{where}{name}", followers[name], resists, content[name].get("joint"))
             for name, kind in kinds.items()
         )
         try:
@@ -456,8 +475,9 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     required, optional, _ = _SUPPORTS[kind]
     if kind == "clamp" and where == "end":
         optional = (*optional, "turns")
-    other = ("support", "follower") if kind == "free" else ("support",)
-    values = reader.si_values(table, where, required, optional, other=other)
+    values = reader.si_values(table, where, required, optional, other=_OTHER.get(kind, ("support",)))
+    if kind in ("hinge", "slider", "joint"):
+        return _framed_values(values, table, where, kind)
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
@@ -473,6 +493,21 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
                 f"{where}.spin must lie in -180 deg to 180 deg in the first scene, got {table['spin']!r}; "
                 "turn further along a [[path]], or by whole turns with end.turns"
             )
+    return values
+
+
+def _framed_values(
+    values: dict[str, np.ndarray], table: dict[str, Any], where: str, kind: str
+) -> dict[str, np.ndarray]:
+    """Of a support that holds a frame, or may hold one."""
+    if kind == "hinge" or any(key in values for key in _FRAME):
+        if ("frame" in values) == ("tangent" in values):
+            raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a {kind}, exactly one of them")
+        if is_unclocked(values):
+            raise SceneFileError(f"{where}.d2 or {where}.frame is needed for a {kind}, whose clocking counts")
+        values = _frame_values(values, where)
+    if kind == "joint" and not (isinstance(table.get("joint"), str) and table["joint"]):
+        raise SceneFileError(f'{where}.joint is missing: the name of a joint, such as joint = "y"')
     return values
 
 
@@ -545,8 +580,7 @@ def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: s
         raise SceneFileError(
             f"{where}.spin must lie in -180 deg to 180 deg, got {math.degrees(float(values['spin'])):g} deg"
         )
-    placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-    return {"frame": _spun(placed, values["spin"])}
+    return {"frame": _placed(reader, values)}
 
 
 def _changes(
@@ -581,20 +615,57 @@ def _changes(
 
 
 def _support(
-    reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str, follower: bool, resists: bool
+    reader: SceneReader,
+    kind: str,
+    values: dict[str, np.ndarray],
+    where: str,
+    follower: bool = False,
+    resists: bool = False,
+    joint: str | None = None,
 ) -> Support:
+    springs = {key: values[key] for key in _SPRINGS if key in values}
+    if springs:
+        if kind == "clamp" and is_unclocked(values):
+            raise SceneFileError(f"{where}.d2 or {where}.frame is needed for a clamp with springs")
+        rigid = {key: value for key, value in values.items() if key not in springs}
+        with named(where):
+            return Spring(_support(reader, kind, rigid, where), **springs)
     with named(where):
+        if kind in ("hinge", "slider", "joint"):
+            numbers = {key: value for key, value in values.items() if key not in _FRAME}
+            if "spin" in values:
+                numbers["frame"] = _placed(reader, values)
+            return Joint(joint or "", **numbers) if kind == "joint" else _MOVABLE[kind](**numbers)
         if kind == "clamp" and is_unclocked(values):
             if resists:  # any clocking gives the same
                 across = np.eye(3)[np.argmin(np.abs(values["tangent"]))]
                 return Clamp(values["position"], reader.part(_frame, values["tangent"], across))
             return with_direction(Swivel(values["position"], values["tangent"]), "tangent", values)
         if kind == "clamp":
-            placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-            return Clamp(values["position"], _spun(placed, values["spin"]))
+            return Clamp(values["position"], _placed(reader, values))
         if kind == "swivel":
             return with_direction(Swivel(**values), "tangent", values)
         return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
+
+
+def body_support(reader: SceneReader, table: dict[str, Any], where: str) -> Support:
+    """The support of a body of a harness, of the keys that an end has."""
+    kind = choice(table, where, "support", ["clamp", "pin", "hinge", "slider"])
+    if kind is None:
+        raise SceneFileError(f"{where}.support is missing; allowed are clamp, pin, hinge, slider")
+    values = _end_values(reader, table, where, kind)
+    if kind == "clamp" and is_unclocked(values):
+        raise SceneFileError(f"{where}.d2 or {where}.frame is needed for the clamp of a joint")
+    return _support(reader, kind, values, where)
+
+
+_MOVABLE = {"hinge": Hinge, "slider": Slider}
+
+
+def _placed(reader: SceneReader, values: dict[str, np.ndarray]) -> Any:
+    """The frame that a table states."""
+    placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
+    return _spun(placed, values["spin"])
 
 
 def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[Numbers, "3 3"]:

@@ -26,6 +26,7 @@ from rodjax.checks import (
 )
 from rodjax.model.along import Along, Pair, Smooth, Steps, Value, scaled
 from rodjax.model.rest import RestShape, RestStrain, SpaceCurve, ends
+from rodjax.model.summaries import rod_text
 from rodjax.units import Units
 
 # Of St-Venant's series, which falls like k^-5: 13 digits.
@@ -132,6 +133,9 @@ class Rod(eqx.Module):
         self.GA = None if GA is None else _pair(GA, "GA", positive) if _is_pair(GA) else _value(GA, "GA", positive)
         self.rest_strain = None if rest_strain is None else _value(rest_strain, "rest_strain", _above_minus_one)
         _check_arclengths(self)
+
+    def __str__(self) -> str:
+        return rod_text(self)
 
     @property
     def is_plain(self) -> bool:

@@ -15,7 +15,8 @@ from rodjax.checks import instance, is_known, leaf, number_array, sequence, vect
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential, check_potential
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
-from rodjax.model.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
+from rodjax.model.summaries import scene_text
+from rodjax.model.supports import Clamp, Clip, Free, Held, Movable, Pin, Support, Swivel
 from rodjax.units import Units
 
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
@@ -33,7 +34,8 @@ class Scene(eqx.Module):
     **Arguments:**
 
     - `rod`: `Rod`.
-    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
+    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`; `Hinge`, `Slider` or `Spring`,
+        whose pose `rodjax.solve` finds; `Joint` in a scene of a `Harness`.
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an
@@ -116,6 +118,9 @@ class Scene(eqx.Module):
         _check_obstacles(self)
         _check_numbers(self)
 
+    def __str__(self) -> str:
+        return scene_text(self)
+
 
 def _of_one_precision(parts: Any) -> Any:
     """With all numbers of the highest precision among them: a compiled program takes no mixture."""
@@ -128,7 +133,7 @@ def _of_one_precision(parts: Any) -> Any:
 def _check_supports(scene: Scene) -> None:
     ends = (scene.start, scene.end)
     pair = f"{type(scene.start).__name__} at the start and {type(scene.end).__name__} at the end"
-    if not any(isinstance(end, Held) for end in ends):
+    if not any(isinstance(end, Held | Movable) for end in ends):
         raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
     for end, other in (ends, ends[::-1]):
         if not isinstance(end, Free):
@@ -137,7 +142,7 @@ def _check_supports(scene: Scene) -> None:
         loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
         if isinstance(other, Pin) and not loaded and not scene.clips:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
-        if end.moment is not None and not isinstance(other, Clamp):
+        if end.moment is not None and not isinstance(other, Clamp | Movable):
             raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
@@ -196,7 +201,7 @@ def _check_numbers(scene: Scene) -> None:
 
 def _check_turning(scene: Scene, length: float) -> None:
     """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
-    if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
+    if any(isinstance(end, Clamp | Swivel | Movable) for end in (scene.start, scene.end)):
         return
     loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
     loaded |= bool(scene.potentials or scene.point_couples)

@@ -49,7 +49,7 @@ def test_couples_on_a_part_bend_it_to_arcs():
     np.testing.assert_allclose(result.curvature, couple * np.clip(B - at, 0, B - A), atol=1e-8)
 
 
-@pytest.mark.parametrize("discretization", ["hermite", "finite_difference"])
+@pytest.mark.parametrize("discretization", ["hermite", pytest.param("finite_difference", marks=pytest.mark.slow)])
 def test_parts_add_up(discretization):
     """Three parts with one force are the whole, and the supports carry what there is."""
     force = (1.0, -2.0, 3.0)

@@ -1,6 +1,7 @@
 """Couples and forces that follow the rod, at points inside it."""
 
 import math
+from typing import Any
 
 import h5py
 import jax
@@ -21,7 +22,7 @@ def scene(end=None, **loads) -> rj.Scene:
     return rj.Scene(ROD, CLAMP, rj.Free() if end is None else end, **loads)
 
 
-@pytest.mark.parametrize("follower", [False, True])
+@pytest.mark.parametrize("follower", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_couple_bends_the_rod_before_it_to_an_arc(follower):
     """By an angle of 0.8 rad; beyond it the rod is straight. About d2, which stays."""
     couple = rj.PointCouple(AT, (0, -2.0, 0), follower=follower)
@@ -50,6 +51,7 @@ def test_a_force_inside_is_that_on_the_end_of_a_shorter_rod():
     np.testing.assert_allclose(inside.nodes[-1], beyond, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_supports_carry_a_couple():
     """The moments of the ends about the origin, with the forces there, balance it; a clip takes its part."""
     couple = np.array([0.5, -1.0, 0.7])
@@ -111,7 +113,8 @@ def test_files_keep_point_loads(tmp_path):
     )
     rj.save(rj.solve(given, segments=10), tmp_path / "loads.vtkhdf")
     rj.write_scene(given, tmp_path / "loads.toml")
-    for read in (rj.load(tmp_path / "loads.vtkhdf").scene, rj.read_scene(tmp_path / "loads.toml")):
+    reads: Any = rj.load(tmp_path / "loads.vtkhdf").scene, rj.read_scene(tmp_path / "loads.toml")
+    for read in reads:
         assert [load.follower for load in (*read.point_couples, *read.point_forces)] == [False, True, True, False]
         for value, expected in zip(jax.tree.leaves(read), jax.tree.leaves(given), strict=True):
             np.testing.assert_array_equal(value, expected)
@@ -143,7 +146,8 @@ def test_wrong_point_loads_are_named():
             scene(**loads)
     with pytest.raises(TypeError, match=r"point_couples\[0\] must be a PointCouple"):
         scene(point_couples=[rj.PointForce(0.5, (0, 0, 1))])
+    follower: Any = 1
     with pytest.raises(TypeError, match="follower must be a bool"):
-        rj.PointForce(0.5, (0, 0, 1), follower=1)
+        rj.PointForce(0.5, (0, 0, 1), follower=follower)
     with pytest.raises(ValueError, match="discretization must be 'hermite' under couples"):
         rj.solve(scene(point_couples=[rj.PointCouple(0.5, (0, 0, 1))]), discretization="finite_difference")

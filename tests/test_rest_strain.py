@@ -1,6 +1,7 @@
 """Rods whose axis has another length without stress, as of a heated or shrunk part."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ def rod(strain, **more) -> rj.Rod:
     return rj.Rod(1.0, (1.0, 2.0), 0.8, EA, rest_strain=strain, mass_per_length=1.0, radius=0.01, **more)
 
 
-@pytest.mark.parametrize("discretization", ["hermite", "finite_difference"])
+@pytest.mark.parametrize("discretization", ["hermite", pytest.param("finite_difference", marks=pytest.mark.slow)])
 def test_a_free_rod_is_longer_and_a_held_one_pressed(discretization):
     """By the mean of the strain; the force is that of EA."""
     free = rj.solve(rj.Scene(rod(PART), CLAMP, rj.Free()), segments=10, discretization=discretization)
@@ -32,7 +33,14 @@ def test_a_free_rod_is_longer_and_a_held_one_pressed(discretization):
     np.testing.assert_allclose(held.elastic_energy, EA / 2 * 0.012**2, rtol=1e-10)
 
 
-@pytest.mark.parametrize("strain", [0.03, SMOOTH, PART], ids=["constant", "smooth", "part"])
+@pytest.mark.parametrize(
+    "strain",
+    [
+        pytest.param(0.03, marks=pytest.mark.slow, id="constant"),
+        pytest.param(SMOOTH, id="smooth"),
+        pytest.param(PART, marks=pytest.mark.slow, id="part"),
+    ],
+)
 def test_a_curved_rod_is_free_of_stress_at_its_rest_ends(strain):
     """On any mesh, to rounding."""
     curved = rod(strain, rest_curvature=(1.0, 0.5), rest_twist=0.7)
@@ -72,12 +80,17 @@ def test_elements_converge_to_the_continuum():
 
 
 def test_gradients_by_the_strain():
-    """Against the closed form of a held rod, and differences of a hanging one."""
+    """Against the closed form of a held rod."""
 
     def tension(strain):
         return rj.solve(rj.Scene(rod(strain), CLAMP, rj.Clamp((1, 0, 0), LEVEL)), segments=4).tension[0]
 
     np.testing.assert_allclose(jax.grad(tension)(jnp.array(0.01)), -EA, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_hanging_rod():
+    """Against central differences."""
 
     def middle(strain):
         end = rj.Clamp((0.8, 0.1, 0.05), LEVEL)
@@ -91,7 +104,8 @@ def test_gradients_by_the_strain():
 def test_files_keep_the_strain(tmp_path):
     result = rj.solve(rj.Scene(rod(PART), CLAMP, rj.Free()), segments=10)
     rj.save(result, tmp_path / "heated.vtkhdf")
-    np.testing.assert_array_equal(rj.load(tmp_path / "heated.vtkhdf").scene.rod.rest_strain.values, PART.values)
+    loaded: Any = rj.load(tmp_path / "heated.vtkhdf").scene.rod.rest_strain
+    np.testing.assert_array_equal(loaded.values, PART.values)
     for strain in (0.002, SMOOTH, PART):
         scene = rj.Scene(rod(strain), CLAMP, rj.Free())
         rj.write_scene(scene, tmp_path / "heated.toml")

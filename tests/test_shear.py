@@ -1,6 +1,7 @@
 """Rods whose sections shear: closed forms, integrated and published references, limits, and what goes with them."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +31,7 @@ def hung(rod: rj.Rod, **more) -> rj.Scene:
 
 
 @pytest.fixture(scope="module")
-def fine() -> rj.Equilibrium:
+def fine() -> Any:
     return rj.solve(hung(thick(rest_curvature=(0.5, 0.2))), segments=32)
 
 
@@ -40,7 +41,7 @@ def fine() -> rj.Equilibrium:
 def test_the_thick_cantilever_in_its_linear_limit():
     """Timoshenko: w = F L^3/(3 EI) + F L/GA, the derivative by the force at none, exact on any mesh of elements."""
     E, nu, L, width, height = 1e7, 0.3, 1.0, 0.2, 0.3
-    rod = rj.Rod.rectangular(L, width, height, E, poisson_ratio=nu, shear=True)
+    rod: Any = rj.Rod.rectangular(L, width, height, E, poisson_ratio=nu, shear=True)
     factor, G, area = 10 * (1 + nu) / (12 + 11 * nu), E / (2 * (1 + nu)), width * height
     np.testing.assert_allclose(rod.GA, factor * G * area, rtol=1e-14)
 
@@ -59,7 +60,7 @@ def test_shear_factors_are_those_of_cowper():
     E = 2.6e6
     for nu, circle, tube, rectangle in ((0.3, 0.886, 0.531, 0.850), (0.0, 6 / 7, 0.5, 5 / 6)):
         G = E / (2 * (1 + nu))
-        rods = (
+        rods: Any = (
             rj.Rod.circular(1.0, 0.1, E, poisson_ratio=nu, shear=True),
             rj.Rod.tube(1.0, 0.1, 0.0999, E, shear_modulus=G, shear=True),
             rj.Rod.rectangular(1.0, 0.1, 0.3, E, poisson_ratio=nu, shear=True),
@@ -87,11 +88,12 @@ def reissner(force, EI, EA, GA):
     return found.y[:3, -1]
 
 
-@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("planar", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_elastica_of_reissner(planar):
     """In its plane, bent by a radian and sheared by 0.09; fourth order."""
     force, EI, EA, GA = (-1.0, 4.0), 1.0, 200.0, 40.0
     x, y, angle = reissner(force, EI, EA, GA)
+    result: Any = None
     errors = []
     for n in (8, 16, 32):
         rod = rj.Rod(1.0, EI, 0.7, EA, GA=GA)
@@ -141,11 +143,12 @@ def test_the_45_degree_bend_with_shear():
         450: ((52.32, 18.62, 48.39), (52.2386, 18.5082, 48.5029)),
         600: ((47.23, 15.79, 53.37), (47.1504, 15.6848, 53.4749)),
     }
+    result: Any = None
     for load, (published, converged) in cases.items():
         result = rj.solve(rj.Scene(rod, clamp, rj.Free((0, 0, load))), segments=32)
         np.testing.assert_allclose(result.nodes[-1], published, rtol=0, atol=0.12)
         np.testing.assert_allclose(result.nodes[-1], converged, rtol=0, atol=1e-3)
-    continuum = rj.solve_continuum(result.scene, guess=result)
+    continuum: Any = rj.solve_continuum(result.scene, guess=result)
     # The elements of 32 are off by 1e-7 of the radius.
     np.testing.assert_allclose(result.nodes, continuum.nodes, rtol=0, atol=5e-5)
     np.testing.assert_allclose(result.shear_strain, continuum.shear_strain, rtol=0, atol=1e-9)
@@ -156,6 +159,7 @@ def test_the_45_degree_bend_with_shear():
 # --- meshes ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_error_of_the_mesh_is_estimated(fine):
     for n in (8, 16):
         result = rj.solve(fine.scene, segments=n)
@@ -201,6 +205,7 @@ def test_gradients_by_the_shear_stiffness():
     np.testing.assert_allclose(found, jnp.stack(differences, axis=1), rtol=1e-6, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_sensitivities_of_shear():
     """Of the force through a cantilever by its stiffness: gamma = F/GA."""
     rod = rj.Rod(1.0, 1.0, 0.8, 500.0, GA=40.0)
@@ -216,7 +221,7 @@ def test_a_scene_that_is_turned_has_the_turned_equilibrium(fine):
     turn = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix()
     start, end = (rj.Clamp(turn @ clamp.position, turn @ clamp.frame) for clamp in held())
     rod = fine.scene.rod
-    other = rj.solve(rj.Scene(rod, start, end, gravity=turn @ np.array([0, 0, -5.0])), segments=32)
+    other: Any = rj.solve(rj.Scene(rod, start, end, gravity=turn @ np.array([0, 0, -5.0])), segments=32)
     np.testing.assert_allclose(other.nodes, fine.nodes @ turn.T, atol=1e-11)
     np.testing.assert_allclose(other.shear_strain, fine.shear_strain, atol=1e-11)
     np.testing.assert_allclose(other.energy, fine.energy, rtol=1e-11)
@@ -260,6 +265,7 @@ def test_a_clip_slides_to_where_the_energy_is_least():
     assert abs((after - before) / (2 * h)) / stiffness < 1e-6
 
 
+@pytest.mark.slow
 def test_a_law_of_ones_own_shears_too():
     """The quadratic one again, beside what shears."""
 
@@ -295,12 +301,13 @@ def test_scene_files_take_shear(tmp_path):
     of_material += 'youngs_modulus = "10 MPa"\npoisson_ratio = 0.3\n'
     of_numbers = 'length = "1 m"\nEI = "1 N m^2"\nGJ = "1 N m^2"\nEA = "1 kN"\n'
 
-    def read(rod, d2="d2 = [0, 1, 0]\n"):
+    def read(rod, d2="d2 = [0, 1, 0]\n") -> Any:
         path = tmp_path / "scene.toml"
         path.write_text("[rod]\n" + rod + ends.format(d2=d2))
-        return rj.read_scene(path).rod.GA
+        scene: Any = rj.read_scene(path)
+        return scene.rod.GA
 
-    expected = rj.Rod.tube(1.0, 0.05, 0.04, 1e7, poisson_ratio=0.3, shear=True).GA
+    expected: Any = rj.Rod.tube(1.0, 0.05, 0.04, 1e7, poisson_ratio=0.3, shear=True).GA
     np.testing.assert_allclose(read(of_material + "shear = true\n"), expected, rtol=1e-15)
     assert read(of_material + "shear = false\n") is None
     np.testing.assert_allclose(read(of_numbers + 'GA = "0.3 kN"\n'), 300.0)
@@ -332,5 +339,6 @@ def test_scene_files_take_shear(tmp_path):
 def test_a_wrong_stiffness_is_named(given, message):
     with pytest.raises(ValueError, match=message):
         rj.Rod(1.0, 1.0, 1.0, 1.0, **given)
+    shear: Any = 1
     with pytest.raises(TypeError, match="shear must be a bool"):
-        rj.Rod.circular(1.0, 0.1, 1e6, poisson_ratio=0.3, shear=1)
+        rj.Rod.circular(1.0, 0.1, 1e6, poisson_ratio=0.3, shear=shear)

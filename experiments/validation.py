@@ -577,8 +577,9 @@ SCORES = (
     SCORES_HEADING
     + """
 Two experiments of [cosseratbench](https://github.com/jakeryderv/cosseratbench) {version}, an outside benchmark of rod
-solvers, by its own runner, meshes and metrics; rodjax takes part by `rodjax.cosseratbench`. Its other experiments need
-dynamics, contact or several rods.
+solvers, by its own runner, meshes and metrics; rodjax takes part by `rodjax.cosseratbench`. Of its other experiments
+*pendulum* is dynamic and *twist* measures how fast six rods buckle in time; in *crossing* and *pile* rods touch rods;
+in *capstan* friction alone holds a rope of two free ends, and a `Scene` asks for an end that is held.
 
 - what must hold, of the last line of each metric: {bound:.0e}; beyond it, marked (!): {beyond}
 - *Cantilever*: the reference, F L³/(3 EI), is linear. The exact elastica (elliptic integrals, as above) differs from it

@@ -4,17 +4,30 @@ import importlib
 from typing import TYPE_CHECKING
 
 from rodjax.model.along import Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
+from rodjax.model.harness import Body, Harness
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
+from rodjax.model.supports import (
+    Clamp,
+    Clip,
+    Free,
+    Hinge,
+    Joint,
+    Pin,
+    Slider,
+    Spring,
+    Swivel,
+    frame,
+    rotate,
+)
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.line_search import LineSearch
 from rodjax.solving.newton import Newton
 from rodjax.solving.nonlinear_cg import NonlinearCG
@@ -26,6 +39,7 @@ from rodjax.solving.result import (
     PrecisionWarning,
     describe,
 )
+from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
@@ -52,7 +66,8 @@ if TYPE_CHECKING:
     from rodjax.identification.unknowns import Unknown
     from rodjax.io.cad import write_dxf
     from rodjax.io.files import load, save
-    from rodjax.io.scene_file import SceneFileError, read_scene
+    from rodjax.io.harness_file import read_scene
+    from rodjax.io.quantities import SceneFileError
     from rodjax.io.scene_writing import write_scene
     from rodjax.io.tables import centerline_table, write_table
     from rodjax.paths.batch import solve_batch
@@ -72,6 +87,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Between",
+    "Body",
     "Box",
     "Branch",
     "BranchEnd",
@@ -95,6 +111,10 @@ __all__ = [
     "Fits",
     "Free",
     "Guess",
+    "Harness",
+    "HarnessEquilibrium",
+    "Hinge",
+    "Joint",
     "Law",
     "Limits",
     "LineSearch",
@@ -115,6 +135,7 @@ __all__ = [
     "Pin",
     "Pipe",
     "Plane",
+    "PointCouple",
     "PointForce",
     "Potential",
     "PrecisionWarning",
@@ -124,8 +145,10 @@ __all__ = [
     "Route",
     "Scene",
     "SceneFileError",
+    "Slider",
     "Smooth",
     "Sphere",
+    "Spring",
     "Status",
     "Steps",
     "Swivel",
@@ -183,7 +206,8 @@ _LATER = {
     "most_curved": "analysis.curvature",
     **dict.fromkeys(("end_stiffness", "sensitivities"), "analysis.sensitivity"),
     **dict.fromkeys(("load", "save"), "io.files"),
-    **dict.fromkeys(("SceneFileError", "read_scene"), "io.scene_file"),
+    "SceneFileError": "io.quantities",
+    "read_scene": "io.harness_file",
     "write_scene": "io.scene_writing",
     "write_dxf": "io.cad",
     **dict.fromkeys(("centerline_table", "write_table"), "io.tables"),

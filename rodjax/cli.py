@@ -29,6 +29,7 @@ from rodjax.cluster import ClusterError, connected
 from rodjax.io.cad import SUFFIX as CAD_SUFFIX
 from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, load, save
+from rodjax.io.harness_file import is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
@@ -275,6 +276,8 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
     _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
     note(f"reading {arguments.scene}")
+    if is_harness_file(arguments.scene):
+        return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
@@ -303,6 +306,49 @@ def _solve(arguments: argparse.Namespace) -> int:
     outcome = rodjax.describe(result).replace("\n", ", ")
     print(f"rodjax: {arguments.scene}: {steps}{outcome}", file=sys.stderr)
     return 3
+
+
+def _solve_harness(arguments: argparse.Namespace) -> int:
+    for option in ("csv", "dxf"):
+        if getattr(arguments, option):
+            raise SceneFileError(f"{arguments.scene}: --{option} is for one cable: the file has several")
+    file = read_harness_file(arguments.scene)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("ignore", MeshWarning)
+        warnings.simplefilter("always", OverstretchedWarning)
+        result = rodjax.solve(file.harness, **file.settings)
+    print("\n".join([f"{arguments.scene}: {len(result)} cables, {len(result.joints)} joints", *_cables(result)]))
+    if arguments.output:
+        save(result, arguments.output)
+    if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
+        from rodjax.plot import plot_harness
+
+        _save_figure(plot_harness(result), arguments.plot)
+    for warning in caught:
+        print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
+    if np.all(result.converged):
+        return 0
+    print(f"rodjax: {arguments.scene}: {rodjax.describe(result).splitlines()[0]}", file=sys.stderr)
+    return 3
+
+
+def _cables(result: rodjax.HarnessEquilibrium) -> list[str]:
+    """One row for each cable and each joint."""
+    wide = max(map(len, (*result, *result.joints, "cable")))
+    rows = [f"{'cable':{wide}}  length [m]  segments  bend radius [m]  |f| s=0 [N]  |f| s=L [N]  |m| s=0, s=L [N m]"]
+    for name, rod in result.items():
+        bend = 1 / max(float(np.max(curvature_along(rod)[1])), 1e-300)
+        forces = [float(np.linalg.norm(force)) for force in (rod.start_force, rod.end_force)]
+        moments = [float(np.linalg.norm(moment)) for moment in (rod.start_moment, rod.end_moment)]
+        rows.append(
+            f"{name:{wide}}{float(rod.s[-1]):12.4g}{rod.s.shape[-1] - 1:10}{bend:17.4g}"
+            f"{forces[0]:13.4g}{forces[1]:13.4g}{moments[0]:12.4g}{moments[1]:10.4g}"
+        )
+    rows.append(f"{'joint':{wide}}  position [m]")
+    for name, body in result.joints.items():
+        rows.append(f"{name:{wide}}" + "".join(f"{float(value) + 0.0:12.4g}" for value in body.position))
+    return [rodjax.describe(result), f"energy       {float(result.energy):.6g} J", *rows]
 
 
 def _view(arguments: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ from rodjax.checks import instance, leaf, positive
 from rodjax.model.along import Along, Value, value_at
 from rodjax.model.surfaces import Faces, collar, quads, surfaces
 from rodjax.programs.compilation import compiled
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 Field = Literal["curvature", "twist", "tension"]
@@ -83,6 +84,37 @@ def plot_rod(
     points = [_draw_tube(axes, equilibrium, radius, color_by, norm, _surroundings(equilibrium, radius))]
     if loads:
         points.append(_draw_loads(axes, equilibrium))
+    set_view(axes, np.concatenate(points))
+    axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
+    figure = cast(Figure, axes.get_figure(root=True))
+    figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)
+    return figure
+
+
+def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", radius: float | None = None) -> Figure:
+    """All rods of one equilibrium of a harness in one picture, with one scale of length and colour, and their names.
+
+    `color_by` as for `plot_rod`; `radius` [m]: of the thickest. Raises `ValueError` or `TypeError` for arguments that
+    make no sense.
+    """
+    instance(result, "result", HarnessEquilibrium)
+    if result.energy.ndim:
+        raise ValueError(f"result must be a single equilibrium, got a stack of shape {result.energy.shape}")
+    rods = result.values()
+    for name, rod in result.items():
+        _check(rod, f"result[{name!r}]", color_by)
+    axes = Figure(figsize=(8, 6), layout="constrained").add_subplot(projection="3d")
+    assert isinstance(axes, Axes3D)
+    true = [0.0 if rod.scene.rod.radius is None else largest_radius(rod.scene.rod.radius) for rod in rods]
+    first = int(np.argmax(true))
+    by_size = [rods[first], *rods]
+    thick, note = thickness(by_size, None if radius is None else float(positive(radius, "radius")))
+    norm = Normalize(*_limits(np.concatenate([getattr(rod, color_by) for rod in rods])))
+    points = []
+    for (name, rod), own in zip(result.items(), true, strict=True):
+        points.append(_draw_tube(axes, rod, thick * own / true[first] if own else thick, color_by, norm))
+        middle = np.asarray(rod.nodes)[len(rod.s) // 2]
+        axes.text(*middle, name, fontsize=8, path_effects=[HALO], zorder=10)
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     figure = cast(Figure, axes.get_figure(root=True))

@@ -31,6 +31,7 @@ from rodjax import (
     Free,
     Law,
     Pin,
+    PointCouple,
     PointForce,
     Rod,
     Scene,
@@ -79,7 +80,7 @@ def smooth(value: float) -> Smooth:
     return Smooth((0.0, 0.3, 0.7, 1.0), value * np.array([1.0, 1 / 3, 0.7, 1.2]))
 
 
-GENERAL = ("numbers", "steps", "smooth", "both", "curve", "one stiffness")
+GENERAL = ("numbers", "steps", "smooth", "both", "curve", "one stiffness", *(f"shear {k}" for k in range(5)))
 
 
 @functools.cache
@@ -89,6 +90,22 @@ def general_scene(name: str) -> Scene:
     arc = np.stack([np.sin(angles), 0 * angles, 1 - np.cos(angles)], axis=1)
     follower, dead = DistributedForce((0, 0.001, 1 / 300), follower=True), DistributedForce((0, 0.001, 0.0))
     couple = DistributedCouple((0, 1e-5, 0), follower=True)
+    if name.startswith("shear"):
+        GA, strain = [
+            (300.0, 0.01),
+            (steps(300.0), steps(0.01)),
+            (smooth(300.0), smooth(0.01)),
+            ((300.0, 200.0), None),
+            ((steps(300.0), smooth(300.0)), 0.01),
+        ][int(name[-1])]
+        loads = {
+            "point_couples": [PointCouple(0.4, (0, 1e-5, 0)), PointCouple(0.5, (0, 1e-5, 0), follower=True)],
+            "point_forces": [PointForce(0.6, (0, 1e-5, 0), follower=True)],
+            "distributed": [
+                dataclasses.replace(load, part=jnp.array([0.2, 1 / 3])) for load in (follower, dead, couple)
+            ],
+        }
+        return Scene(Rod(1.0, 4e-3, 3e-3, 500.0, GA=GA, rest_strain=strain), CLAMP, Free(), **loads)
     rod, end, distributed = {
         "numbers": (Rod(1.0, (4e-3, 1 / 300), 3e-3, 500.0, 0.1, None, (0.1, 1 / 3), 1 / 7), Free(), ()),
         "steps": (Rod(1.0, steps(4e-3), steps(3e-3), steps(1e3), steps(0.1), steps(0.01)), Free(), [follower]),
@@ -329,6 +346,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1], before=before)
     state = dataclasses.replace(state, pressures=single.s[None], friction=Friction.from_rest(1, single.nodes))
     results.append(dataclasses.replace(single, state=state))
+    results.append(dataclasses.replace(single, shear_strain=single.nodes[:, :2]))
     for result in results:
         save(result, tmp_path / "rod.vtkhdf")
         with h5py.File(tmp_path / "rod.vtkhdf", "r") as file:

@@ -14,9 +14,9 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium
+from rodjax.solving.solve import solve
 
 FIELDS = (
     "s",

@@ -31,6 +31,7 @@ class Resultants(eqx.Module):
     start_moment: Float[Array, "3"]
     end_force: Float[Array, "3"]
     end_moment: Float[Array, "3"]
+    shear_strain: Float[Array, "n+1 2"] | None = None
 
 
 def resultants(form: MixedForm, point: MixedPoint) -> Resultants:

@@ -40,7 +40,7 @@ from rodjax.warn import warn
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 12
+FORMAT = 13
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -52,7 +52,8 @@ FIELDS = {
     "twist": ("rad/m", "twist Omega at the nodes"),
     "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
     "tension": ("N", "tension at the nodes"),
-    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes"),
+    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes, with shear along d3"),
+    "shear_strain": ("1", "with shear: components of phi' along d1 and d2 at the nodes"),
     "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
     "elastic_energy": ("J", "elastic energy"),
     "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
@@ -94,10 +95,13 @@ FIELDS = {
             ("EI/*", "N m^2", "bending stiffness about d1 and d2"),
             ("GJ", "N m^2", "torsional stiffness"),
             ("EA", "N", "axial stiffness"),
+            ("GA", "N", "shear stiffness"),
+            ("GA/*", "N", "shear stiffness along d1 and d2"),
             ("mass_per_length", "kg/m", "mass per length"),
             ("radius", "m", "radius of the rod, for pictures"),
             ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
             ("rest_twist", "rad/m", "twist without stress"),
+            ("rest_strain", "1", "axial strain without stress"),
         )
         for leaf, leaf_unit, what in (
             ("", "", ""),
@@ -109,8 +113,10 @@ FIELDS = {
     "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
     "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
     "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
-    "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
-    "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/point_forces/*/at": ("m", "arclength at which a force acts"),
+    "scene/point_forces/*/force": ("N", "force on the rod, global axes or, of a follower, the frame there"),
+    "scene/point_couples/*/at": ("m", "arclength at which a couple acts"),
+    "scene/point_couples/*/couple": ("N m", "couple on the rod, global axes or, of a follower, the frame there"),
     "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
     "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
@@ -134,6 +140,7 @@ FIELDS = {
     },
     **{f"{where}/obstacles/*/friction": ("1", "coefficient of friction") for where in ("scene", "state/before")},
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
+    "scene/distributed/*/part": ("m", "arclengths between which a load acts"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
         f"scene/{end}/{name}": (unit, f"{description} at s = {place}, {axes}")
@@ -330,7 +337,9 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
 
 
 def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
-    value = group.attrs[field.name]
+    # Files until format 12 have no `follower` of a point force.
+    has_default = field.default is not dataclasses.MISSING
+    value = group.attrs.get(field.name, np.bool_(field.default)) if has_default else group.attrs[field.name]
     if field.type is not bool:
         one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
         return value

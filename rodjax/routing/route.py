@@ -32,9 +32,10 @@ from rodjax.routing.problem import (
 )
 from rodjax.routing.search import KEPT, REGION, Outcome
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
-from rodjax.solving.equilibrium import Solver, checked_options, solve
+from rodjax.solving.equilibrium import Solver, checked_options
 from rodjax.solving.newton import Newton
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.solving.solve import solve
 from rodjax.warn import silenced
 
 SEGMENTS = 48

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from html import escape
 from typing import Any
@@ -84,6 +85,13 @@ class PrecisionWarning(UserWarning):
     """Numbers of single precision, and what they cost."""
 
 
+class Described(eqx.Module):
+    """A result that `describe` lets say in words what it is."""
+
+    @abstractmethod
+    def in_words(self) -> str: ...
+
+
 class SolverState(eqx.Module):
     """What a warm start begins from: the nondimensional unknowns, to the last bit, with their units.
 
@@ -131,17 +139,19 @@ class Equilibrium(eqx.Module):
 
     - `s` [..., n+1] arclength of the nodes, m
     - `nodes` [..., n+1, 3] centerline, m
-    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
-    - `curvature` [..., n+1] |t x t'|, 1/m
+    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] phi'/|phi'|, their last
+      column but in rods with shear, where that is the normal d3 of the section
+    - `curvature` [..., n+1] |t x t'|, 1/m, with shear |d3 x d3'|
     - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
-    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1; with shear the components of force and phi' along d3
+    - `shear_strain` [..., n+1, 2] of rods with shear, else `None`: the components of phi' along d1 and d2
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
-      when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
-      just beyond it, and tension the mean of both sides
+      when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain at a clip are
+      those just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
@@ -166,6 +176,8 @@ class Equilibrium(eqx.Module):
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
       examined, under loads without a potential and in the continuum. Computed when asked for
+    - `free_index` [...] int: the same where the pose of an end was unknown, this being free; else `None`. `index`,
+      `critical` and `neutral` are those of the rod between clamps at the poses that were found
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
     - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
@@ -197,10 +209,15 @@ class Equilibrium(eqx.Module):
     scene: Scene
     state: SolverState
     discretization: str = eqx.field(static=True)
+    shear_strain: Float[Array, "... n+1 2"] | None = None
+    free_index: Int[Array, "..."] | None = None
 
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
-        return self.frames[..., 2]
+        if self.shear_strain is None:
+            return self.frames[..., 2]
+        slopes = _slopes(self)
+        return slopes / jnp.sqrt(jnp.sum(slopes**2, axis=-1, keepdims=True))
 
     def __str__(self) -> str:
         """How the solve ended, and the largest and last values along the rod with their units."""
@@ -349,6 +366,7 @@ def equilibrium(
         scene=scene,
         state=dataclasses.replace(found.state, units=units),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
+        shear_strain=results.shear_strain,
     )
 
 
@@ -520,6 +538,15 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
 
+@compiled
+def _slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
+    """phi' of a rod with shear."""
+    frames, shear = equilibrium.frames, equilibrium.shear_strain
+    assert shear is not None
+    along = 1 + equilibrium.axial_strain[..., None]
+    return jnp.sum(frames * jnp.concatenate([shear, along], axis=-1)[..., None, :], axis=-1)
+
+
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
@@ -564,17 +591,20 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
-def describe(equilibrium: Equilibrium) -> str:
+def describe(equilibrium: Equilibrium | Described) -> str:
     """How a solve ended, in words, what is special about the equilibrium, and the estimated errors of its mesh.
 
-    Of several: each with its count, and the largest errors of those that converged.
+    Of several: each with its count, and the largest errors of those that converged. Of a harness: of the whole, then
+    of each rod.
     """
+    if isinstance(equilibrium, Described):
+        return equilibrium.in_words()
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
     converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
-        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "a saddle: there are motions that lower the energy": _index(equilibrium, examination) > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
@@ -638,6 +668,10 @@ def _told(equilibrium: Equilibrium) -> list[tuple[str, str]]:
         for kind, unit in (("force", "N"), ("moment", "N m"))
     ]
     return [(name, line.strip()) for name, line in told]
+
+
+def _index(equilibrium: Equilibrium, examination: _Examination) -> Int[np.ndarray, "..."]:
+    return np.asarray(examination.index if equilibrium.free_index is None else equilibrium.free_index)
 
 
 def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:

@@ -22,8 +22,9 @@ from rodjax.file_lock import LockedError, locked
 from rodjax.io.scene_file import SceneFile
 from rodjax.model.scene import check_without_friction
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
-from rodjax.solving.equilibrium import DEFAULT_RTOL, solve
+from rodjax.solving.equilibrium import DEFAULT_RTOL
 from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.solve import solve
 from rodjax.sweeps.cases import MAX_CASES, CaseReader, SweepError
 from rodjax.sweeps.chunk import Arrays, Chunk, solved_chunk
 from rodjax.sweeps.manifest import FORMAT, Manifest, differences, is_sealed, manifest_of, sha256

@@ -173,3 +173,23 @@ def test_derivatives_of_a_star_are_those_of_finite_differences():
     slope = sum(jnp.sum(g * d) for g, d in zip(gradient, generic, strict=True))
     # Of central differences: the third derivative times 1e-10 / 6, and rounding.
     assert abs(slope - (ahead - behind) / (2 * step)) < 1e-6 * abs(slope)
+
+
+def test_a_path_carries_turns_and_leaves_no_step_coarse():
+    """The end of a joined rod turned by 1.5 turns in steps of 54 degrees: the twist of both parts follows."""
+
+    def turned(angle: float) -> Harness:
+        end = Clamp((0.9, 0, 0), rodjax.rotate(rodjax.frame((1, 0, 0)), (angle, 0, 0)))
+        straight = Joint("cut", rodjax.frame((1, 0, 0)))
+        first = Scene(plain(0.5), Clamp((0, 0, 0), rodjax.frame((1, 0, 0))), straight, gravity=GRAVITY)
+        return Harness({"a": first, "b": Scene(plain(0.5), straight, end, gravity=GRAVITY)})
+
+    path = rodjax.solve_path([turned(0.3 * k * math.pi) for k in range(11)], rtol=1e-3)
+    assert path.energy.shape == (11,)
+    assert jnp.all(path.converged)
+    twist = path["a"].total_twist + path["b"].total_twist
+    # The curved rod writhes a little too.
+    assert jnp.all(jnp.diff(twist) > 0.5)
+    assert abs(twist[-1] - 3 * math.pi) < 1.5
+    assert max(jnp.max(rod.error_estimate) for rod in path.values()) < 1e-3
+    assert path.joints["cut"].position.shape == (11, 3)

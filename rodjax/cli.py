@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -26,16 +26,21 @@ import rodjax
 from rodjax.analysis.curvature import curvature_along
 from rodjax.atomic_write import replace_file
 from rodjax.cluster import ClusterError, connected
+from rodjax.io.cad import SUFFIX as CAD_SUFFIX
+from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, load, save
 from rodjax.io.harness_file import is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
+from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
+from rodjax.io.tables import write_table
 from rodjax.programs import answers, kept
 from rodjax.programs.tasks import TaskError
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
-from rodjax.sweeps.result import Summary, merge
+from rodjax.sweeps.quantities import QUANTITIES
+from rodjax.sweeps.result import Summary, merge, write_csv
 from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX
 from rodjax.sweeps.sweep import sweep
 
@@ -93,6 +98,10 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
+    solve.add_argument(
+        "--csv", metavar="OUT.csv", type=Path, help="write the centerline, curvature, force and moment along it"
+    )
+    solve.add_argument("--dxf", metavar="OUT.dxf", type=Path, help="write the centerline as a spline, for CAD")
     solve.set_defaults(run=_solve)
     _add_view(commands)
     _add_sweep(commands)
@@ -140,6 +149,10 @@ def _add_sweep(commands: Any) -> None:
     )
     run.add_argument("--resume", action="store_true", help="go on where an earlier run was stopped")
     run.add_argument("--chunk", metavar="N", type=_chunk, help="cases solved, and written, at a time; 1024")
+    run.add_argument(
+        "--also", metavar="NAME,...", default="", help=f"further quantities to write: {', '.join(QUANTITIES)}"
+    )
+    run.add_argument("--csv", metavar="OUT.csv", type=Path, help="write all but the nodes as a table too")
     _add_scheduler(run)
     run.set_defaults(run=_sweep)
     join = commands.add_parser("merge", help="put the shards of a sweep together")
@@ -256,6 +269,8 @@ def _demo(arguments: argparse.Namespace) -> int:
 def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SUFFIX,))
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
+    _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
+    _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
     if is_harness_file(arguments.scene):
         return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
@@ -271,8 +286,13 @@ def _solve(arguments: argparse.Namespace) -> int:
     print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
     if arguments.output:
         save(result, arguments.output)
+    last = jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result
     if arguments.plot:
-        _plot(jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result, arguments.plot)
+        _draw(arguments.plot, last, _plot)
+    if arguments.csv:
+        _draw(arguments.csv, last, lambda _, path: write_table(result, path))
+    if arguments.dxf:
+        _draw(arguments.dxf, last, _write_dxf)
     for warning in caught:
         print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
@@ -284,6 +304,9 @@ def _solve(arguments: argparse.Namespace) -> int:
 
 
 def _solve_harness(arguments: argparse.Namespace) -> int:
+    for option in ("csv", "dxf"):
+        if getattr(arguments, option):
+            raise SceneFileError(f"{arguments.scene}: --{option} is for one cable: the file has several")
     file = read_harness_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", NotConvergedWarning)
@@ -345,6 +368,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
+    _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
     with _connected(arguments.scheduler) as executor:
         summary = sweep(
             arguments.scene,
@@ -353,10 +377,13 @@ def _sweep(arguments: argparse.Namespace) -> int:
             shard=arguments.shard,
             chunk=arguments.chunk,
             resume=arguments.resume,
+            also=[name.strip() for name in arguments.also.split(",") if name.strip()],
             executor=executor,
             progress=sys.stderr.isatty(),
             say=lambda line: print(line, flush=True),
         )
+    if arguments.csv:
+        write_csv(arguments.output, arguments.csv)
     return _swept(arguments.output, summary)
 
 
@@ -458,6 +485,9 @@ def _report(arguments: argparse.Namespace) -> int:
             obstacles=file.obstacles,
             names=file.names,
             title=file.title or str(arguments.file),
+            source=_source(arguments.file, *file.cables.values())
+            if arguments.result is None
+            else str(arguments.result),
         )
     except ValueError as error:
         if all(np.all(cable.converged) for cable in cables.values()):
@@ -507,7 +537,13 @@ def _route(arguments: argparse.Namespace) -> int:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(
-        route.verified, limits=file.limits, obstacles=file.obstacles, names=file.names, gradients=route, title=title
+        route.verified,
+        limits=file.limits,
+        obstacles=file.obstacles,
+        names=file.names,
+        gradients=route,
+        title=title,
+        source=_source(arguments.file, scene),
     )
     print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
     written = [*report.save(arguments.out), *written_route(route, arguments.out)]
@@ -516,6 +552,15 @@ def _route(arguments: argparse.Namespace) -> int:
         return 0
     print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
     return 3
+
+
+def _source(path: Path, *scenes: SceneFile) -> str:
+    """What a report is made of, and how exactly."""
+    meshes = [
+        f"rtol = {scene.rtol or DEFAULT_RTOL:g}" if scene.segments is None else f"{scene.segments} segments"
+        for scene in scenes
+    ]
+    return ", ".join([str(path), *dict.fromkeys(meshes)])
 
 
 def _solved(file: SceneFile) -> Equilibrium:
@@ -554,13 +599,25 @@ def _check_folder(path: Path, option: str) -> None:
         raise CommandError(f"{option} must be a folder that can be written, got {str(path)!r}")
 
 
-def _plot(equilibrium: Equilibrium, path: Path) -> None:
+def _draw(path: Path, equilibrium: Equilibrium, write: Callable[[Equilibrium, Path], None]) -> None:
+    """Writes a file of a shape, which must be finite."""
     if not np.all(np.isfinite(equilibrium.nodes)):
-        print(f"rodjax: {path} is not drawn: the shape is not finite", file=sys.stderr)
+        print(f"rodjax: {path} is not written: the shape is not finite", file=sys.stderr)
         return
+    write(equilibrium, path)
+
+
+def _plot(equilibrium: Equilibrium, path: Path) -> None:
     from rodjax.plot import plot_rod
 
     _save_figure(plot_rod(equilibrium), path)
+
+
+def _write_dxf(equilibrium: Equilibrium, path: Path) -> None:
+    try:
+        write_dxf(equilibrium, path)
+    except ImportError as error:
+        raise CommandError(str(error)) from None
 
 
 def _save_figure(figure: "Figure", path: Path, **options: Any) -> None:

@@ -33,10 +33,14 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "EI2": ("N m^2", (), '"2.5e-3 N m^2"'),
     "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
     "EA": ("N", (), '"785 N"'),
+    "GA": ("N", (), '"260 N"'),
+    "GA1": ("N", (), '"260 N"'),
+    "GA2": ("N", (), '"260 N"'),
     "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
     "rest_curvature_1": ("1/m", (), '"2 1/m"'),
     "rest_curvature_2": ("1/m", (), '"0 1/m"'),
     "rest_twist": ("rad/m", (), '"0.5 rad/m"'),
+    "rest_strain": ("", (), "0.002"),
     "width": ("m", (), '"10 mm"'),
     "height": ("m", (), '"1 mm"'),
     "wires": ("", (), "7"),
@@ -64,7 +68,9 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
 }
 # The same of keys that mean something else in one table, by the name of that table.
 OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
-    "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"')},
+    "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"'), "part": ("m", (2,), '"[0.2, 0.5] m"')},
+    "point_couple": {"couple": ("N m", (3,), '"[0, 0, 0.01] N m"')},
+    "distributed_couple": {"part": ("m", (2,), '"[0.2, 0.5] m"')},
     "obstacles": {
         "point": ("m", (3,), '"[0, 0, -0.1] m"'),
         "normal": ("", (3,), "[0, 0, 1]"),

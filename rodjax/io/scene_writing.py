@@ -58,12 +58,15 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
     if scene.gravity is not None:
         lines += ["", "[loads]", *_written(scene, ("gravity",))]
     for force in scene.point_forces:
-        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
+        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force")), *_written_follower(force)]
+    for couple in scene.point_couples:
+        where = "point_couple"
+        lines += ["", f"[[loads.{where}]]", *_written(couple, ("at", "couple"), where), *_written_follower(couple)]
     for kind in dict.fromkeys(type(load) for load in scene.distributed):
         name, key = next((name, key) for name, (of_name, key) in DISTRIBUTED.items() if of_name is kind)
         for load in scene.distributed:
             if isinstance(load, kind):
-                lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
+                lines += ["", f"[[loads.{name}]]", *_written(load, (key, "part"), name), *_written_follower(load)]
     for clip in scene.clips:
         lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
         lines += ["sliding = true"] if clip.sliding else []
@@ -82,7 +85,7 @@ def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[s
 
 def _written_rod(rod: Rod) -> list[str]:
     lines = _written(rod, ("length",))
-    for name in ("radius", "EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
+    for name in ("radius", "EI", "GJ", "EA", "GA", "mass_per_length", "rest_curvature", "rest_twist", "rest_strain"):
         value = getattr(rod, name)
         values = zip(PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
         lines += [_written_value(key, value) for key, value in values if value is not None]

@@ -190,6 +190,7 @@ def _structure(scene: Scene) -> str:
     parts = [f"{type(scene.start).__name__}-{type(scene.end).__name__}"]
     parts += [name for name in ("gravity", "turns") if getattr(scene, name) is not None]
     parts.append(f"{len(scene.point_forces)} point forces")
+    parts += [f"{len(scene.point_couples)} point couples"] if scene.point_couples else []
     parts += [f"{len(scene.clips)} clips"] if scene.clips else []
     parts += [", ".join(type(obstacle).__name__ for obstacle in scene.obstacles)] if scene.obstacles else []
     return ", ".join(parts)

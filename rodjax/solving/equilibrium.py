@@ -75,6 +75,7 @@ from rodjax.solving.result import (
     passage_to,
     warn_if_coarse,
     warn_of_outcome,
+    warn_of_single_precision,
     warn_of_unknown_mesh,
 )
 from rodjax.solving.sliding_search import INNER_TOLERANCE, slid_free
@@ -373,6 +374,8 @@ def checked_options(
     find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
+    if scene.rod.length.dtype == np.float32:
+        warn_of_single_precision()
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     if solver is None:
@@ -446,7 +449,7 @@ def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
     count, gap = int(np.max(needed[0])), float(np.min(needed[1]))
     if count <= (SIZES["hermite"][-1] if segments is None else segments):
         return max(least, count)
-    where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
+    where = f"jumps of Steps and of loads must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
     given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
     raise ValueError(
         f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "

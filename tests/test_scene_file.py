@@ -35,7 +35,8 @@ from rodjax import (
     problems,
 )
 from rodjax.io import scene_file
-from rodjax.io.scene_file import SceneFileError, read_scene, read_scene_file
+from rodjax.io.harness_file import read_scene
+from rodjax.io.scene_file import SceneFileError, read_scene_file
 from rodjax.io.scene_writing import write_scene
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"

@@ -21,7 +21,7 @@ from test_tasks import Unreliable
 import rodjax
 from rodjax.analysis.curvature import curvature_along
 from rodjax.cli import main
-from rodjax.io.scene_file import read_scene
+from rodjax.io.harness_file import read_scene
 from rodjax.solving.refinement import SIZES
 from rodjax.sweeps.cases import CaseReader, SweepError, read_cases
 from rodjax.sweeps.quantities import QUANTITIES

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax.cli import main
-from rodjax.io.scene_file import read_scene
+from rodjax.io.harness_file import read_scene
 from rodjax.window import tube
 from rodjax.window.bounds import out_of_reach, reaches
 from rodjax.window.controls import Pose, SceneMaker, controls_of, handles_of, moved, sliders_of

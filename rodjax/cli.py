@@ -277,6 +277,8 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
     note(f"reading {arguments.scene}")
     if is_harness_file(arguments.scene):
+        if arguments.output:
+            raise CommandError("-o is not allowed for a harness, which no file holds yet; --plot draws it")
         return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
@@ -319,8 +321,6 @@ def _solve_harness(arguments: argparse.Namespace) -> int:
         warnings.simplefilter("always", OverstretchedWarning)
         result = rodjax.solve(file.harness, **file.settings)
     print("\n".join([f"{arguments.scene}: {len(result)} cables, {len(result.joints)} joints", *_cables(result)]))
-    if arguments.output:
-        save(result, arguments.output)
     if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
         from rodjax.plot import plot_harness
 

@@ -1,6 +1,7 @@
 """Harnesses: rods that meet in rigid bodies, against the uncut rod, an independent code and finite differences."""
 
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 from planar_frames import PlanarRod, solve_frame
 
 import rodjax
-from rodjax import Body, Clamp, Harness, Joint, Newton, Rod, Scene
+from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring
 
 GRAVITY = (0.0, 3.0, -9.81)
 START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
@@ -173,3 +174,54 @@ def test_derivatives_of_a_star_are_those_of_finite_differences():
     slope = sum(jnp.sum(g * d) for g, d in zip(gradient, generic, strict=True))
     # Of central differences: the third derivative times 1e-10 / 6, and rounding.
     assert abs(slope - (ahead - behind) / (2 * step)) < 1e-6 * abs(slope)
+
+
+def test_a_path_carries_turns_and_leaves_no_step_coarse():
+    """The end of a joined rod turned by 1.5 turns in steps of 54 degrees: the twist of both parts follows."""
+
+    def turned(angle: float) -> Harness:
+        end = Clamp((0.9, 0, 0), rodjax.rotate(rodjax.frame((1, 0, 0)), (angle, 0, 0)))
+        straight = Joint("cut", rodjax.frame((1, 0, 0)))
+        first = Scene(plain(0.5), Clamp((0, 0, 0), rodjax.frame((1, 0, 0))), straight, gravity=GRAVITY)
+        return Harness({"a": first, "b": Scene(plain(0.5), straight, end, gravity=GRAVITY)})
+
+    path = rodjax.solve_path([turned(0.3 * k * math.pi) for k in range(11)], rtol=1e-3)
+    assert path.energy.shape == (11,)
+    assert jnp.all(path.converged)
+    twist = path["a"].total_twist + path["b"].total_twist
+    # The curved rod writhes a little too.
+    assert jnp.all(jnp.diff(twist) > 0.5)
+    assert abs(twist[-1] - 3 * math.pi) < 1.5
+    assert max(jnp.max(rod.error_estimate) for rod in path.values()) < 1e-3
+    assert path.joints["cut"].position.shape == (11, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Harness({"a": PART}, {"other": Body()}), "joints['other'] has no rod: the ends of the cables name"),
+        (lambda: Harness({"a": PART}, contact=True), "contact must be False"),
+        (lambda: Harness({"a": Scene(plain(1.0), START, END)}), "a harness must have an end that is a Joint"),
+        (lambda: Harness({"a": HANGING}), "nothing holds the rods at the joint 'j'"),
+        (lambda: Harness({"a": PART}, {"cut": Body(mass=1.0)}), "joints['cut'].mass needs a rod with gravity"),
+        (lambda: Harness({"a": NEAR}), "cables['a'].obstacles must be () where ends have unknown poses"),
+        (lambda: rodjax.solve(PART), "scene.end is a Joint: make a Harness of the scene"),
+        (lambda: rodjax.solve(Harness({"a": PART}), planar=True), "planar must be False"),
+        (lambda: rodjax.solve(Harness({"a": PART}), discretization="finite_difference"), "must be 'hermite'"),
+        (lambda: rodjax.solve_path([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
+        (lambda: rodjax.solve_batch([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
+        (lambda: rodjax.write_scene(SOFT, "soft.toml"), "scene.end must be a Clamp, Swivel, Pin or Free"),
+        (lambda: Spring(Pin((0, 0, 0)), rotation=1.0), "rotation must be None on a Pin without a frame"),
+        (lambda: Slider((0, 0, 0), [(1, 0, 0), (2, 0, 0)]), "directions must not be parallel"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+PART = Scene(plain(0.5), START, Joint("cut"))
+HANGING = Scene(plain(0.5), Free(), Joint("j"), gravity=GRAVITY)
+NEAR = Scene(plain(0.5), START, Joint("j"), obstacles=[rodjax.Plane((0, 0, -9), (0, 0, 1))])
+SOFT = Scene(plain(1.0), START, Spring(END, rotation=1.0), gravity=GRAVITY)

@@ -14,7 +14,7 @@ from rodjax.io.scene_file import DISTRIBUTED, PAIRS
 from rodjax.model.along import Along, Steps
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp
+from rodjax.model.supports import Clamp, Movable
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 
 
@@ -49,6 +49,10 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
             "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
             "its rest_centerline; save writes them with a result"
         )
+    for name in ("start", "end"):
+        if isinstance(getattr(scene, name), Movable):
+            kind = type(getattr(scene, name)).__name__
+            raise ValueError(f"scene.{name} must be a Clamp, Swivel, Pin or Free to be written, got a {kind}")
     lines = ["[rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']

@@ -67,7 +67,7 @@ class Harness(eqx.Module):
         instance(joints, "joints", Mapping)
         if contact is not False:
             raise ValueError(
-                f"contact between the rods of a harness must be False, it is not computed; got {contact!r}"
+                f"contact must be False: that between the rods of a harness is not computed, got {contact!r}"
             )
         for name, scene in cables.items():
             instance(name, "the name of a cable", str)

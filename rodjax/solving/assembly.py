@@ -394,6 +394,9 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     all_steps = [step._replace(force_change=part * step.force_change) for step in all_steps]
     is_finite = jnp.isfinite(residual) & jnp.isfinite(largest)
 
+    is_sought = is_definite if seeks_minimum else jnp.array(True)
+    is_done = is_balanced & is_sought
+
     def moved_by(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""], tuple[Any, ...]]:
         """The energy, with L of the rods, half of the squared closures, and the points of the rods."""
         energy = jnp.sum(assembly.body_energies(poses, part * body_motions))
@@ -423,12 +426,12 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         is_better = (tries > 0) & (is_pushed | (merit <= bound) | (not seeks_minimum))
         return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
 
-    start = _Trial(part, jnp.full((), -1), jnp.zeros((), dtype), jnp.array(False), tuple(x.points for x in all_here))
+    # At the end no step is tried.
+    start = _Trial(part, jnp.full((), -1), jnp.zeros((), dtype), is_done, tuple(here.points for here in all_here))
     trial = jax.lax.while_loop(lambda trial: ~trial.is_better & (trial.tries <= MAX_HALVINGS), tried, start)
     part, is_better = trial.part, trial.is_better
 
     # --- what follows ---
-    is_sought = is_definite if seeks_minimum else jnp.array(True)
     status = jnp.where(state.iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
     fails = ~is_better & (residual <= STAGNATION * floor)
     status = jnp.where(fails, Status.ROUNDING_FLOOR, status)
@@ -436,7 +439,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     status = jnp.where(fails & (status == Status.RUNNING), Status.LINE_SEARCH_FAILED, status)
     has_saddle = is_balanced & ~is_sought & (state.pushes >= MAX_PUSHES)
     status = jnp.where(has_saddle, Status.SADDLE, status)
-    status = jnp.where(is_balanced & is_sought, balanced, status)
+    status = jnp.where(is_done, balanced, status)
     status = jnp.where(is_finite | is_balanced, status, Status.NOT_FINITE)
     goes = (status == Status.RUNNING) & is_better
     taken = jnp.where(goes, part, 0.0)
@@ -456,7 +459,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         residuals=tuple(residuals),
         pushes=state.pushes + jnp.where(goes & is_pushed, 1, 0),
         iterations=state.iterations + jnp.where(goes, 1, 0),
-        evaluations=state.evaluations + trial.tries,
+        evaluations=state.evaluations + jnp.maximum(trial.tries, 1),
         status=status.astype(int),
         index=(negative + below).astype(int),
     )

@@ -25,7 +25,6 @@ from rodjax.solving.equilibrium import (
     Search,
     _finer,
     _fits,
-    _is_finest,
     check_single,
     checked_options,
     checked_strain_limit,
@@ -39,8 +38,9 @@ from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Newton
-from rodjax.solving.refinement import SAFETY, error_by_rtol, next_size
+from rodjax.solving.refinement import SAFETY, SIZES, error_by_rtol, next_size
 from rodjax.solving.result import (
+    DEFAULT_STRAIN_LIMIT,
     Equilibrium,
     Found,
     NotConvergedWarning,
@@ -59,17 +59,19 @@ Members = tuple[tuple[int, ...], ...]
 def solve_harness(
     harness: Harness,
     *,
-    segments: int | None = None,
+    segments: int | list[int] | None = None,
     rtol: float | None = None,
     discretization: str | None = None,
     solver: Any = None,
     guess: HarnessEquilibrium | None = None,
     planar: bool = False,
     find: Any = "minimum",
-    strain_limit: Any,
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     shape: Guess | None = None,
 ) -> HarnessEquilibrium:
-    """See `rodjax.solving.solve.solve`; `shape`: with which all rods begin where there is no guess."""
+    """See `rodjax.solving.solve.solve`; `segments` may be those of each rod; `shape`: with which all rods begin where
+    there is no guess.
+    """
     if discretization not in (None, "hermite"):
         raise ValueError(f"discretization must be 'hermite' where poses of ends are unknown, got {discretization!r}")
     if solver is not None:
@@ -85,13 +87,15 @@ def solve_harness(
     fixed, guess = not_differentiated(harness, guess)
     strain_limit = checked_strain_limit(strain_limit)
     poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
-    counts = [None] * len(fixed) if guess is None else guess.segments
+    kept = [None] * len(fixed) if guess is None else guess.segments
+    counts = segments if isinstance(segments, list) else [segments] * len(fixed)
     all_options, tolerance = [], rtol
-    for scene, count in zip(_structures(fixed), counts, strict=True):
-        wanted = segments if count is None or rtol is not None else segments or count
+    for scene, count, before in zip(_structures(fixed), counts, kept, strict=True):
+        # The mesh of a guess comes first, as of one rod.
+        wanted = before if count is None and rtol is None else count
         options, tolerance = checked_options(scene, wanted, rtol, "hermite", solver, find=find)
-        if segments is None and count is not None:
-            options = dataclasses.replace(options, segments=count)
+        if count is None and before is not None:
+            options = dataclasses.replace(options, segments=before)
         all_options.append(options)
     result = _solved(fixed, poses, tuple(all_options), guess, strain_limit, shape=shape)
     if is_known(result.status) and is_here(result.groups[0]):
@@ -176,8 +180,12 @@ def _structures(harness: Harness) -> list[Scene]:
     clamp = _clamp(harness.scenes[0].rod.length.dtype)
 
     def structure(scene: Scene) -> Scene:
-        ends = [clamp if isinstance(end, Joint) else end for end in (scene.start, scene.end)]
-        return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+        # `eqx.tree_at` would take longer than the solve.
+        new = object.__new__(Scene)
+        for field in dataclasses.fields(Scene):
+            value = getattr(scene, field.name)
+            object.__setattr__(new, field.name, clamp if isinstance(value, Joint) else value)
+        return new
 
     return [structure(scene) for scene in harness.scenes]
 
@@ -187,10 +195,10 @@ def _clamp(dtype: Any) -> Clamp:
     return Clamp(np.zeros(3, dtype), np.eye(3, dtype=dtype))
 
 
-def _members(harness: Harness, all_options: tuple[Options, ...]) -> Members:
+def _members(structures: list[Scene], all_options: tuple[Options, ...]) -> Members:
     """The numbers of the rods of one structure and mesh."""
     found: dict[Any, list[int]] = {}
-    for number, (scene, options) in enumerate(zip(_structures(harness), all_options, strict=True)):
+    for number, (scene, options) in enumerate(zip(structures, all_options, strict=True)):
         leaves, tree = jax.tree.flatten(scene)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), options.segments
         found.setdefault(key, []).append(number)
@@ -211,7 +219,8 @@ def _solved(
     shape: Guess | None = None,
 ) -> HarnessEquilibrium:
     """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
-    members, structures = _members(harness, all_options), _structures(harness)
+    structures = _structures(harness)
+    members = _members(structures, all_options)
     starts = []
     for group in members:
         options = all_options[group[0]]
@@ -348,21 +357,18 @@ def _energy(rods: list[Equilibrium], bodies: Bodies, poses: Poses) -> Float[Arra
 def _refined(
     result: HarnessEquilibrium, all_options: tuple[Options, ...], rtol: float, strain_limit: Any
 ) -> HarnessEquilibrium:
-    """Solved again with more elements in the rods whose estimated errors are too large, until none are."""
+    """Solved again with more elements in rods of a structure of which one's estimated error is too large, until none
+    is.
+    """
     iterations, evaluations = int(result.iterations), int(result.evaluations)
     while bool(result.converged):
-        finer, options, worst = {}, list(all_options), 0.0
-        for numbers, group in zip(result.members, result.groups, strict=True):
-            errors = estimated_errors(group)
-            sizes = np.asarray(error_by_rtol(errors))
-            worst = max(worst, float(np.max(sizes)))
-            for place, number in enumerate(numbers):
-                if SAFETY * sizes[place] <= rtol or _is_finest(all_options[number]):
-                    continue
-                segments = next_size(all_options[number].segments, float(sizes[place]), rtol, "hermite")
-                options[number] = dataclasses.replace(all_options[number], segments=segments)
-                defects = None if errors.defects is None else errors.defects[place]
-                finer[number] = _finer(result.rod(number), defects, options[number])
+        counts, worst, all_defects = finer_meshes(result, rtol)
+        options = [dataclasses.replace(old, segments=count) for old, count in zip(all_options, counts, strict=True)]
+        finer = {
+            number: _finer(result.rod(number), all_defects[number], new)
+            for number, (new, old) in enumerate(zip(options, all_options, strict=True))
+            if new.segments != old.segments
+        }
         if not finer:
             if worst > rtol:
                 warn(
@@ -377,6 +383,26 @@ def _refined(
         iterations, evaluations = iterations + int(result.iterations), evaluations + int(result.evaluations)
     counts = jnp.asarray(iterations), jnp.asarray(evaluations)
     return eqx.tree_at(lambda result: (result.iterations, result.evaluations), result, counts)
+
+
+def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], float, dict[int, Any]]:
+    """How many elements rods of one structure need, at least as many as they have; the largest estimated error, of
+    several equilibria of those that converged; the defects of each rod.
+    """
+    counts, worst, all_defects = result.segments, 0.0, {}
+    axis = result.energy.ndim
+    for numbers, group in zip(result.members, result.groups, strict=True):
+        errors = estimated_errors(group)
+        sizes = np.moveaxis(np.asarray(error_by_rtol(errors)), axis, 0)
+        converged = np.moveaxis(np.asarray(group.converged), axis, 0)
+        error = float(np.max(sizes[converged], initial=0.0))
+        worst = max(worst, error)
+        for place, number in enumerate(numbers):
+            all_defects[number] = None if errors.defects is None or axis else errors.defects[place]
+            # As many as the neediest: each size of mesh would be a larger program.
+            if SAFETY * error > rtol and counts[number] < SIZES["hermite"][-1]:
+                counts[number] = next_size(counts[number], error, rtol, "hermite")
+    return counts, worst, all_defects
 
 
 # --- derivatives -----------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
 from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene, loads_at_nodes
-from rodjax.model.supports import Clamp, Free
+from rodjax.model.supports import Clamp, Clip, Held
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
@@ -190,7 +190,7 @@ def _is_misplaced(scenes: Scene) -> Bool[np.ndarray, "..."]:
     """
     length = scenes.rod.length
     ends = [(np.zeros_like(length), scenes.start), *((clip.at, clip) for clip in scenes.clips), (length, scenes.end)]
-    held = [(s, end.position) for s, end in ends if not isinstance(end, Free)]
+    held = [(s, end.position) for s, end in ends if isinstance(end, Held | Clip)]
     found = np.full(length.shape, len(held) > 1)
     for _, position in held[1:]:
         found &= np.max(np.abs(position - held[0][1]), axis=-1) <= ONE_PLACE * length

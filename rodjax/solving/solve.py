@@ -42,7 +42,7 @@ def solve(
     **Arguments:**
 
     - `scene`: `Scene`; or `Harness`, on elements, by `Newton` and not `planar`: `segments` are those of each rod, and
-        for `rtol` each rod gets as many as its own estimated error needs, the ends of the rod held.
+        for `rtol` rods of one structure get as many as their estimated errors need, with their ends held.
     - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs. The
         errors on a given mesh are not estimated unless asked for (`error_estimate`, `describe`); outside `jit` a
         `MeshWarning` is given where a segment turns by so much that it is far too long.

@@ -49,6 +49,15 @@ def two_planes() -> rj.Equilibrium:
     return found
 
 
+@pytest.fixture(scope="module")
+def sheared() -> rj.Equilibrium:
+    """Of a short thick rod, whose sections lean by up to some degrees."""
+    rod = rj.Rod(1.0, 4e-3, 3e-3, 500.0, radius=4e-3, GA=0.5)
+    found = rj.solve(rj.Scene(rod, START, rj.Clamp((0.7, 0.2, 0.1), rj.frame((1, 0.3, 0)))), segments=16)
+    assert bool(found.converged)
+    return found
+
+
 def parts_at(path, step: int = 0) -> dict:
     """What VTK reads of a step, `vtkPolyData` by the names of the parts."""
     reader = vtkHDFReader()
@@ -166,7 +175,7 @@ def test_a_path_has_its_parts_at_every_step(touching, tmp_path):
 # --- tables ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["touching", "two_planes"])
+@pytest.mark.parametrize("name", ["touching", "two_planes", pytest.param("sheared", marks=pytest.mark.slow)])
 def test_force_and_moment_along_the_rod_balance(name, request):
     """Between a place and the end, where nothing but the support acts on the rod: M = M_end + (r_end - r) x F_end and
     F = F_end, less the weight. Sixteen elements of fourth order leave 1e-3 of the largest moment.
@@ -191,6 +200,7 @@ def test_force_and_moment_along_the_rod_balance(name, request):
     np.testing.assert_allclose(moments, expected, atol=2e-3 * largest)
 
 
+@pytest.mark.slow
 def test_the_moment_between_nodes_is_that_of_the_curvature():
     """EI kappa of a cable that hangs without twist; on 8 elements as near to 32 as fourth order comes."""
     coarse, fine = (rj.solve(problems.hanging_cable(), segments=n) for n in (8, 32))
@@ -203,15 +213,17 @@ def test_the_moment_between_nodes_is_that_of_the_curvature():
     np.testing.assert_allclose(tables[1]["bend_radius [m]"] * tables[1]["curvature [1/m]"], 1.0, rtol=1e-12)
 
 
-def test_a_table_has_the_nodes_and_orthonormal_frames_between_them(two_planes):
-    table = rj.centerline_table(two_planes)
-    assert set(np.asarray(two_planes.s)) <= set(table["s [m]"])
+@pytest.mark.parametrize("name", ["two_planes", pytest.param("sheared", marks=pytest.mark.slow)])
+def test_a_table_has_the_nodes_and_orthonormal_frames_between_them(name, request):
+    result = request.getfixturevalue(name)
+    table = rj.centerline_table(result)
+    assert set(np.asarray(result.s)) <= set(table["s [m]"])
     frames = np.stack([[table[f"{d}_{axis} [1]"] for axis in "xyz"] for d in ("d1", "d2", "t")], axis=-1)
     frames = np.moveaxis(frames, 1, 0)
     np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-9)
-    at = np.isin(table["s [m]"], np.asarray(two_planes.s))
-    np.testing.assert_allclose(frames[at], two_planes.frames, atol=2e-4)
-    assert len(rj.centerline_table(two_planes, 7)["s [m]"]) == 7
+    at = np.isin(table["s [m]"], np.asarray(result.s))
+    np.testing.assert_allclose(frames[at], result.frames, atol=2e-4)
+    assert len(rj.centerline_table(result, 7)["s [m]"]) == 7
 
 
 def test_tables_of_finite_differences_have_no_forces():

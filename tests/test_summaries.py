@@ -62,7 +62,10 @@ def test_dir_and_pydoc_are_complete():
 # --- the energy -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", [problems.hanging_cable(), problems.omega(1.0, 0.7)], ids=["hanging", "twisted"])
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(problems.hanging_cable(), marks=pytest.mark.slow, id="hanging"), problems.omega(1.0, 0.7)],
+)
 def test_energy_and_residual_are_those_of_the_solve(scene):
     """Where the rod is in equilibrium; and the residual is the gradient there and elsewhere."""
     found = rj.solve(scene, segments=12, discretization="finite_difference")

@@ -626,6 +626,7 @@ def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
         rodjax.solve_batch(scenes, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_quantities_are_chosen_by_name(files, capsys):
     """Those of single solves on the same mesh, to the solver's tolerance; and as a table."""
     scene = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "segments = 16")

@@ -24,7 +24,7 @@ class Samples(NamedTuple):
     """A rod at rest at k arclengths, or several of them along a leading axis `...`; SI units, global axes.
 
     - `s` [..., k], `is_node` (k,): whether there is a node of the mesh
-    - `positions` [..., k, 3]; `frames` [..., k, 3, 3], columns d1, d2, t
+    - `positions` [..., k, 3]; `frames` [..., k, 3, 3], columns d1, d2, t, of a rod that shears d1, d2, d3
     - `curvature` [..., k] of the centerline, `twist`, `tension`
     - `force`, `moment` [..., k, 3]: what the part beyond s exerts on the part before it; `None` of finite differences
       and of the continuum, which do not keep them
@@ -130,6 +130,8 @@ def _along(equilibrium: Equilibrium, cell: Int[Array, "k"], fraction: Float[Arra
         return s, centerline, frames, radius, None, None
     units = equilibrium.state.units
     slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
+    if rod.GA is not None:
+        slopes = jax.jvp(equilibrium.position_at, (nodes,), (jnp.ones_like(nodes),))[1]
     places = (equilibrium.nodes - units.origin[None]) / units.length
     loads = section_loads(form, point)
     force, moment = loads_between(loads, places, slopes, nodes / units.length, cell, fraction)
@@ -139,10 +141,21 @@ def _along(equilibrium: Equilibrium, cell: Int[Array, "k"], fraction: Float[Arra
 def framed_at(
     equilibrium: Equilibrium, s: Float[Array, "k"]
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"], Float[Array, "k 3"]]:
-    """Centerline, tangents and d1 of one equilibrium between its nodes."""
+    """Centerline, section normals d3 (its tangents, unless the rod shears) and d1 of one equilibrium at arclengths."""
     centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
     tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
+    if equilibrium.scene.rod.GA is not None:
+        tangents = _section_normals(equilibrium, s, tangents)
     return centerline, tangents, _directors(equilibrium, s, tangents)
+
+
+def _section_normals(
+    equilibrium: Equilibrium, s: Float[Array, "k"], tangents: Float[Array, "k 3"]
+) -> Float[Array, "k 3"]:
+    """Of a rod that shears, d3 between the nodes: it departs from the centerline's tangent as it does beside it."""
+    away = equilibrium.frames[..., 2] - equilibrium.tangents
+    normals = tangents + jnp.stack([jnp.interp(s, equilibrium.s, part) for part in away.T], axis=1)
+    return normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _directors(equilibrium: Equilibrium, s: Float[Array, "k"], tangents: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
@@ -150,9 +163,9 @@ def _directors(equilibrium: Equilibrium, s: Float[Array, "k"], tangents: Float[A
     nodes = equilibrium.s
     cell = jnp.clip(jnp.sum(nodes[None] <= s[:, None], axis=1) - 1, 0, len(nodes) - 2)
     length = nodes[cell + 1] - nodes[cell]
-    d1 = equilibrium.frames[:, :, 0]
-    from_before = jax.vmap(transport)(d1[cell], equilibrium.tangents[cell], tangents)
-    from_after = jax.vmap(transport)(d1[cell + 1], equilibrium.tangents[cell + 1], tangents)
+    d1, normals = equilibrium.frames[:, :, 0], equilibrium.frames[:, :, 2]
+    from_before = jax.vmap(transport)(d1[cell], normals[cell], tangents)
+    from_after = jax.vmap(transport)(d1[cell + 1], normals[cell + 1], tangents)
     # Frames give the angle up to turns: take the one nearest to the twist rate.
     expected = length * (equilibrium.twist[cell] + equilibrium.twist[cell + 1]) / 2
     angle = jax.vmap(angle_about)(tangents, from_before, from_after)

@@ -62,6 +62,7 @@ FIELDS = {
     "end_moment": ("N m", "moment of the support at s = L on the rod, about the centerline, global axes"),
     "converged": ("1", "whether the solve converged"),
     "stable": ("1", "whether the energy has no negative curvature there"),
+    "free_index": ("1", "motions along which the energy falls, where the pose of an end was unknown and is free"),
     "status": ("1", "how the solve ended: " + ", ".join(f"{status.value} {status.name}" for status in Status)),
     "iterations": ("1", "iterations of the solver"),
     "evaluations": ("1", "evaluations of the energy and its gradient"),

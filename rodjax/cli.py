@@ -33,6 +33,7 @@ from rodjax.io.harness_file import is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
+from rodjax.notes import Narrator, note
 from rodjax.programs import answers, kept
 from rodjax.programs.tasks import TaskError
 from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS
@@ -65,7 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
-        code = arguments.run(arguments)
+        # Commands with a bar of their own, or that ask again and again, need no other words.
+        is_told = sys.stderr.isatty() and arguments.run in (_solve, _report, _fit)
+        with Narrator() if is_told else contextlib.nullcontext():
+            code = arguments.run(arguments)
         sys.stdout.flush()
         return code
     except (CommandError, ClusterError, SceneFileError, SweepError) as error:
@@ -109,9 +113,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_report(commands)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
-    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
+    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; 10, as in the paper")
     demo.set_defaults(run=_demo)
-    warm = commands.add_parser("warm", help="compile what will be needed, so that first answers come at once")
+    warm = commands.add_parser("warm", help="compile programs ahead of time, so that first answers come at once")
     warm.add_argument(
         "file", metavar="FILE.toml", type=Path, nargs="?", help="of a scene, fit, report or route; the usual scenes"
     )
@@ -121,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_view(commands: Any) -> None:
-    view = commands.add_parser("view", help="take the rod of a scene in the hand, in a window in the browser")
+    view = commands.add_parser("view", help="move the rod of a scene by the mouse, in a window of the browser")
     view.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     view.add_argument(
         "--port", metavar="N", type=_port, default=8080, help="of the window; 0 for any that is free; 8080"
@@ -130,7 +134,7 @@ def _add_view(commands: Any) -> None:
         "--host",
         metavar="ADDRESS",
         default="127.0.0.1",
-        help="at which it can be reached: by default from this machine only; whoever reaches it can move the rod",
+        help="address to listen on: by default this machine only; whoever reaches it can move the rod",
     )
     view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
     view.set_defaults(run=_view)
@@ -155,24 +159,24 @@ def _add_sweep(commands: Any) -> None:
     run.add_argument("--csv", metavar="OUT.csv", type=Path, help="write all but the nodes as a table too")
     _add_scheduler(run)
     run.set_defaults(run=_sweep)
-    join = commands.add_parser("merge", help="put the shards of a sweep together")
+    join = commands.add_parser("merge", help="merge the shards of a sweep")
     join.add_argument("shards", metavar=f"SHARD{SWEEP_SUFFIX}", type=Path, nargs="+")
     join.add_argument("-o", "--output", **output)
     join.set_defaults(run=_merge)
 
 
 def _add_fit(commands: Any) -> None:
-    fit = commands.add_parser("fit", help="find numbers of a scene from measured centerlines and end forces")
-    fit.add_argument("fit", metavar="FIT.toml", type=Path, help="what is sought: pydoc rodjax.identification.files")
-    fit.add_argument("data", metavar="DATA.csv", type=Path, help="what was measured: the same")
+    fit = commands.add_parser("fit", help="identify parameters of a scene from measured centerlines and end forces")
+    fit.add_argument("fit", metavar="FIT.toml", type=Path, help="the unknowns: pydoc rodjax.identification.files")
+    fit.add_argument("data", metavar="DATA.csv", type=Path, help="the measurements, same place")
     fit.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-fit"), help="folder for the results")
-    fit.add_argument("--profiles", action="store_true", help="draw likelihoods too, which takes as long again")
+    fit.add_argument("--profiles", action="store_true", help="draw profile likelihoods too, which doubles the time")
     fit.set_defaults(run=_fit)
 
 
 def _add_report(commands: Any) -> None:
     report = commands.add_parser(
-        "report", help="tell whether a cable keeps to limits, with pictures and a web page; exits with 3 where not"
+        "report", help="check a cable against limits, with pictures and a web page; exit code 3 where one is not kept"
     )
     report.add_argument("file", metavar="FILE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     report.add_argument(
@@ -183,10 +187,10 @@ def _add_report(commands: Any) -> None:
     )
     report.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-report"), help="folder for the report")
     report.set_defaults(run=_report)
-    route = commands.add_parser("route", help="find the best place of clips, ends and cable within limits")
+    route = commands.add_parser("route", help="find the best clip positions, ends and cable length within limits")
     route.add_argument("file", metavar="ROUTE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
-    route.add_argument("--starts", metavar="N", type=_chunk, help="designs from which the search begins; 16")
+    route.add_argument("--starts", metavar="N", type=_chunk, help="starting points of the search; 16")
     _add_scheduler(route)
     route.set_defaults(run=_route)
 
@@ -271,6 +275,7 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
     _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
     _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
+    note(f"reading {arguments.scene}")
     if is_harness_file(arguments.scene):
         if arguments.output:
             raise CommandError("-o is not allowed for a harness, which no file holds yet; --plot draws it")

@@ -74,7 +74,7 @@ FEATURES = {
         "follower force along": {"distributed": [DistributedForce((0.5, 0.0, 0.0), follower=True)]},
         "field": {"potentials": [Potential(bedding)]},
         "couple along": {"distributed": [DistributedCouple((0.0, 0.5, 0.0))]},
-        "force on a part": {"distributed": [DistributedForce((0.0, 0.0, 2.0), part=(0.3, 0.6))]},
+        "force on a part": {"distributed": [DistributedForce((0.0, 0.0, 4.0), part=(0.3, 0.6))]},
         "point couple": {"point_couples": [rj.PointCouple(0.55, (0.0, 0.5, 0.0))]},
         "follower point force": {"point_forces": [PointForce(0.55, (0.5, 0.0, 0.0), follower=True)]},
         "end force": {"end": {"force": (0.0, 0.0, 2.0)}},

@@ -124,9 +124,10 @@ def test_point_forces_of_older_files_are_dead(tmp_path):
     rj.save(rj.solve(given, segments=10), path)
     with h5py.File(path, "r+") as file:
         file["rodjax"].attrs["format"] = 12
-        del file["rodjax/scene/point_forces/0"].attrs["follower"]
+        del file["rodjax/scene/point_forces/0"].attrs["follower"], file["rodjax/scene/point_couples"]
     (force,) = rj.load(path).scene.point_forces
     assert not force.follower
+    assert rj.load(path).scene.point_couples == ()
     np.testing.assert_array_equal(force.force, given.point_forces[0].force)
 
 

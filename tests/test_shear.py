@@ -201,6 +201,17 @@ def test_gradients_by_the_shear_stiffness():
     np.testing.assert_allclose(found, jnp.stack(differences, axis=1), rtol=1e-6, atol=1e-11)
 
 
+def test_sensitivities_of_shear():
+    """Of the force through a cantilever by its stiffness: gamma = F/GA."""
+    rod = rj.Rod(1.0, 1.0, 0.8, 500.0, GA=40.0)
+    scene = rj.Scene(rod, rj.Clamp(ORIGIN, LEVEL), rj.Free((0, 1.0, 0)))
+    found = rj.sensitivities(scene, of=["shear_strain"], wrt=["rod.GA"], segments=4)["shear_strain"]["rod.GA"]
+    np.testing.assert_allclose(found[0], [0, -1 / 40.0**2], atol=1e-10)
+    kirchhoff = eqx.tree_at(lambda scene: scene.rod, scene, rj.Rod(1.0, (1.0, 1.0), 0.8, 500.0))
+    with pytest.raises(ValueError, match="of must not have 'shear_strain' of a rod without GA"):
+        rj.sensitivities(kirchhoff, of=["shear_strain"], wrt=["rod.EA"])
+
+
 def test_a_scene_that_is_turned_has_the_turned_equilibrium(fine):
     turn = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix()
     start, end = (rj.Clamp(turn @ clamp.position, turn @ clamp.frame) for clamp in held())

@@ -101,8 +101,8 @@ class Material(eqx.Module):
 
     def loaded(self, scene: Scene, s: Float[Array, ""]) -> "Material":
         """With the loads that follow it at an arclength."""
-        loads = (sum_of_loads(scene, kind, True, s) for kind in (DistributedForce, DistributedCouple))
-        return dataclasses.replace(self, **dict(zip(("force", "couple"), loads, strict=True)))
+        force, couple = (sum_of_loads(scene, kind, True, s) for kind in (DistributedForce, DistributedCouple))
+        return dataclasses.replace(self, force=force, couple=couple)
 
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
         EI1, EI2, GJ, EA = (_at(value, s, interval) for value in self.stiffnesses)

@@ -244,17 +244,16 @@ class JointCells(eqx.Module):
         joints = [stiffness_at(value, (a + b) / 2, a, b) for value in of_joints]
         # The strain of an edge is one, in both of its joints.
         a, b = self.s[:-1], self.s[1:]
-        edges = stiffness_at(of_edges, (a + b) / 2, a, b)
-        EA = jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
+        middles = (a + b) / 2
+
+        def of_both(edges: Float[Array, "n"]) -> Float[Array, "2 n+1"]:
+            return jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
+
+        EA = of_both(stiffness_at(of_edges, middles, a, b))
         EI1, EI2, GJ = (jnp.stack([joint, joint]) for joint in joints)
-        GA = None
-        if rod.shear_pair is not None:
-            edges = jnp.stack([stiffness_at(value, (a + b) / 2, a, b) for value in rod.shear_pair])
-            GA = jnp.stack([jnp.append(edges[:, :1], edges, axis=1), jnp.append(edges, edges[:, -1:], axis=1)], axis=1)
-        rest_axial = None
-        if rod.rest_strain is not None:
-            edges = value_at(rod.rest_strain, (a + b) / 2, a, b)
-            rest_axial = jnp.stack([jnp.append(edges[:1], edges), jnp.append(edges, edges[-1:])])
+        pair, strain = rod.shear_pair, rod.rest_strain
+        GA = None if pair is None else jnp.stack([of_both(stiffness_at(value, middles, a, b)) for value in pair])
+        rest_axial = None if strain is None else of_both(value_at(strain, middles, a, b))
         return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:

@@ -4,7 +4,7 @@ Bending lives at the nodes, stretch on the edges between them. Where an end hold
 the end node, whose tangent is prescribed, and the middle of the first edge has a bending energy of its own: second
 order in the spacing, as measured in `docs/design.md`.
 
-Here the unknowns are the nodes, as in the report; `mixed.MixedForm` is the same discretization in other unknowns.
+Here the unknowns are the nodes, as in the paper; `mixed.MixedForm` is the same discretization in other unknowns.
 """
 
 from typing import Any

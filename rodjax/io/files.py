@@ -156,6 +156,8 @@ FIELDS = {
 }
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
+# Loads of which files of older formats have none.
+LATER = ("potentials", "point_couples")
 # How deep unions may lie in one another in a file.
 MOST_UNIONS = 2
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
@@ -330,6 +332,8 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
     for field in dataclasses.fields(kind):
         if field.metadata.get("static"):
             value = _static(group, field, path)
+        elif field.name in LATER and field.name not in group:
+            value = ()
         else:
             value = _read_value(group, field.name, field.type, path, shape)
         object.__setattr__(module, field.name, value)

@@ -208,6 +208,7 @@ _SCENE_KEYS = {
     "turns": "end.turns",
     "point_forces": "loads.point_force",
     "point_couples": "loads.point_couple",
+    "distributed": "loads: distributed",
     "clips": "clips",
     "obstacles": "obstacles",
     "rod": "rod",

@@ -6,7 +6,8 @@
 - `obstacle_0`, ...: their surfaces, near the rod
 
 of which those that the scene lacks are left out; along a path all of them over time steps. The names of the point data
-end with their SI units, as powers: HDF5 has no names with a slash. https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/
+end with their SI units, as powers: HDF5 has no names with a slash. The format is that of
+https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/
 """
 
 from collections.abc import Sequence

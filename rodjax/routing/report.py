@@ -15,6 +15,7 @@ import numpy as np
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
 from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.notes import note
 from rodjax.programs.answers import one_answer
 from rodjax.routing import records, words
 from rodjax.routing.findings import Cable, Gradients, cable
@@ -100,6 +101,7 @@ class Report:
         The folder is made where it is not there. Raises `OSError` where they cannot be written.
         """
         folder = file_path(folder, "folder")
+        note("drawing")
         image, diagrams = io.BytesIO(), io.BytesIO()
         self.figure().savefig(image, format="png", dpi=DPI)
         self.along().savefig(diagrams, format="png", dpi=DPI)
@@ -169,6 +171,7 @@ def report(
     for name, text in (("title", title), ("source", source)):
         if text is not None:
             instance(text, name, str)
+    note("checking limits, supports and stability")
     found = tuple(
         cable(name, one, limit, obstacles, names, Gradients.of(gradient) if isinstance(gradient, Route) else gradient)
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)

@@ -46,6 +46,7 @@ from rodjax.model.scene import (
     with_plain_rod,
 )
 from rodjax.model.supports import Clamp
+from rodjax.notes import note
 from rodjax.programs.compilation import compiled
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import differentiable, not_differentiated
@@ -152,6 +153,7 @@ def solve_scene(
     check_single(guess)
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
+    note(f"solving on {options.segments} segments")
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if is_known(result.status):
         result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
@@ -190,6 +192,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
+        note(f"solving on {options.segments} segments, as the estimated error is {error:.1e} for rtol = {rtol:g}")
         finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
@@ -233,6 +236,7 @@ def refined_together(
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
+        note(f"solving all on {options.segments} segments, as the largest estimated error is {error:.1e}")
         result = solve(options, result)
     return result
 

@@ -114,7 +114,8 @@ def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", r
     for (name, rod), own in zip(result.items(), true, strict=True):
         points.append(_draw_tube(axes, rod, thick * own / true[first] if own else thick, color_by, norm))
         middle = np.asarray(rod.nodes)[len(rod.s) // 2]
-        axes.text(*middle, name, fontsize=8, path_effects=[HALO], zorder=10)
+        x, y, z = map(float, middle)
+        axes.text(x, y, z, name, fontsize=8, path_effects=[HALO], zorder=10)
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     figure = cast(Figure, axes.get_figure(root=True))

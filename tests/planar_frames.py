@@ -33,7 +33,7 @@ def _shot(rod: PlanarRod, start: np.ndarray) -> np.ndarray:
 
 
 def solve_frame(
-    rods: Sequence[PlanarRod], loads: dict[str, tuple[float, float, float]], guess: Sequence, places: dict
+    rods: Sequence[PlanarRod], loads: dict[str, tuple[float, float, float]], guess: np.ndarray, places: dict
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Poses of the joints, and states at the starts of the rods. `guess`: (nx, ny, m) of each rod at its start."""
     names = list(loads)

@@ -35,7 +35,7 @@ def frame_of(corners: dict, members: list, EI: float, EA: float, held: dict, loa
         supports = {"clamp": Clamp(place, np.eye(3)), "hinge": Hinge(place, np.eye(3), (0, 1, 0))}
         force = loads.get(name)
         dead = None if force is None else (force[0], 0.0, force[1])
-        joints[name] = Body(dead, support=supports.get(held.get(name)))
+        joints[name] = Body(dead, support=supports.get(held.get(name, "")))
     return Harness(cables, joints)
 
 

@@ -73,15 +73,15 @@ def test_a_warm_start_of_the_same_harness_takes_no_step(both):
 
 
 def test_derivatives_of_a_cut_rod_are_those_of_the_rod():
-    options = {"solver": Newton(tolerance=1e-11)}
+    solver = Newton(tolerance=1e-11)
 
     def of_whole(y):
         end = Clamp(jnp.stack([0.5 + 0 * y, y, 0 * y]), END.frame)
-        return rodjax.solve(Scene(plain(1.0), START, end, gravity=GRAVITY), segments=8, **options).end_force
+        return rodjax.solve(Scene(plain(1.0), START, end, gravity=GRAVITY), segments=8, solver=solver).end_force
 
     def of_parts(y):
         end = Clamp(jnp.stack([0.5 + 0 * y, y, 0 * y]), END.frame)
-        return rodjax.solve(cut(plain, end), segments=4, **options)["b"].end_force
+        return rodjax.solve(cut(plain, end), segments=4, solver=solver)["b"].end_force
 
     at = jnp.array(0.2)
     expected, found = jax.jacfwd(of_whole)(at), jax.jacfwd(of_parts)(at)
@@ -97,7 +97,7 @@ LENGTHS = (0.505, 0.544, 0.457)  # a little taut, so that they stay in their pla
 LOAD = (0.02, -0.05, 0.001)
 
 
-def planar(angle) -> np.ndarray:
+def planar(angle):
     """The frame of this tangent in the plane of x and z, d2 along -y, about which angles from x to z are positive."""
     return rodjax.frame((math.cos(angle), 0.0, math.sin(angle)), (0.0, -1.0, 0.0))
 

@@ -22,6 +22,7 @@ TIGHT = Newton(tolerance=1e-13)
 def buckling_load(stiffness: float) -> float:
     """Of a column on a rotational spring [EI/L], its top pinned: u cot u - 1 = u^2/c, P = u^2."""
     u = brentq(lambda u: u / math.tan(u) - 1 - u**2 / stiffness, math.pi + 1e-9, 4.4934094579, xtol=1e-15)
+    assert isinstance(u, float)
     return u**2
 
 

@@ -48,8 +48,9 @@ import os
 from typing import Any, NamedTuple
 
 from rodjax.checks import file_path, shown, whole_number
+from rodjax.io import scene_file
 from rodjax.io.quantities import SceneFileError, check_keys, in_file, named, si_values
-from rodjax.io.scene_file import SceneReader, body_support, read_scene_file, read_text, toml_tables
+from rodjax.io.scene_file import SceneReader, body_support, read_text, toml_tables
 from rodjax.model.harness import Body, Harness
 from rodjax.model.scene import Scene
 from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strain_limit
@@ -79,8 +80,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene] | Harness:
     """
     if is_harness_file(path):
         return read_harness_file(path).harness
-    file = read_scene_file(path)
-    return file.scenes if file.is_path else file.scenes[0]
+    return scene_file.read_scene(path)
 
 
 def is_harness_file(path: str | os.PathLike[str]) -> bool:

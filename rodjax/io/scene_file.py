@@ -246,6 +246,12 @@ class SceneFile(NamedTuple):
         return {name: getattr(self, name) for name in names}
 
 
+def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
+    """As `rodjax.read_scene`, of a file that is not one of a harness."""
+    file = read_scene_file(path)
+    return file.scenes if file.is_path else file.scenes[0]
+
+
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     """The scenes of a TOML file that is not one of a harness, with the settings of the solve."""
     path = file_path(path, "path")

@@ -5,7 +5,7 @@ import functools
 import math
 import typing
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -35,7 +35,6 @@ from rodjax.solving.equilibrium import (
     solve_from,
 )
 from rodjax.solving.guess import Guess
-from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find
 from rodjax.solving.ranges import check_ranges, with_ranges
@@ -67,7 +66,7 @@ def solve_path(
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | HarnessEquilibrium | None = None,
+    guess: Any = None,
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
@@ -103,8 +102,12 @@ def solve_path(
     if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
         if at_critical != "jump":
             raise ValueError(f"at_critical must be 'jump' for harnesses, got {at_critical!r}")
-        options: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
-        return harness_path(scenes, segments=segments, rtol=rtol, guess=guess, strain_limit=strain_limit, **options)
+        numbers: dict[str, Any] = {"segments": segments, "rtol": rtol, "guess": guess, "strain_limit": strain_limit}
+        how: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
+        return harness_path(cast(Sequence[Harness], scenes), **numbers, **how)
+    scenes = cast(Sequence[Scene] | Scene, scenes)
+    if guess is not None:
+        instance(guess, "guess", (Guess, Equilibrium))
     stacked = stack_scenes(scenes)
     instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)

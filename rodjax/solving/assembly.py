@@ -207,7 +207,7 @@ class State(NamedTuple):
     iterations: Int[Array, ""]
     evaluations: Int[Array, ""]
     status: Int[Array, ""]
-    index: Int[Array, ""]
+    negative: Int[Array, ""]
 
 
 class Assembly(eqx.Module):
@@ -287,7 +287,7 @@ class _Here(NamedTuple):
     aside: Float[Array, "k b m"]
 
 
-def _linearized(rod: Rod, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array, Array]:
+def _linearized(rod: Rod, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
     form = rod.moved()
     point = form.holding(point)
     here = form.linearized(point)
@@ -461,7 +461,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         iterations=state.iterations + jnp.where(goes, 1, 0),
         evaluations=state.evaluations + jnp.maximum(trial.tries, 1),
         status=status.astype(int),
-        index=(negative + below).astype(int),
+        negative=(negative + below).astype(int),
     )
 
 

@@ -297,7 +297,7 @@ def _solve(
     solver = options[0].solver
     assert isinstance(solver, Newton)
     end = find_assembly(assembly, tuple(points), poses, solver, options[0].find)
-    is_stable = is_converged(end.status) & (end.index == 0) & harness.has_potential
+    is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
     for number, (rod, numbers) in enumerate(zip(groups, members, strict=True)):
         now = tuple(clamped(harness.scenes[k], harness, *end.poses) for k in numbers)
@@ -314,7 +314,7 @@ def _solve(
         energy=_energy(rods, bodies, end.poses),
         converged=is_converged(status),
         stable=is_stable,
-        index=end.index,
+        index=end.negative,
         status=status,
         iterations=end.iterations,
         evaluations=end.evaluations,

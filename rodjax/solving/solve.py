@@ -15,11 +15,33 @@ from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 
 
 @overload
-def solve(scene: Scene, **options: Any) -> Equilibrium: ...
+def solve(
+    scene: Scene,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: Guess | Equilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+) -> Equilibrium: ...
 
 
 @overload
-def solve(scene: Harness, **options: Any) -> HarnessEquilibrium: ...
+def solve(
+    scene: Harness,
+    *,
+    segments: int | None = None,
+    rtol: float | None = None,
+    discretization: Discretization | None = None,
+    solver: Solver | None = None,
+    guess: HarnessEquilibrium | None = None,
+    planar: bool = False,
+    find: Find = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+) -> HarnessEquilibrium: ...
 
 
 @one_answer

@@ -116,10 +116,12 @@ def test_floor_and_supports_carry_the_weight(lying):
     assert float(jnp.sum(lying.contact_forces[middle, 2])) == pytest.approx(weight, rel=1e-3)
 
 
-def test_the_estimate_knows_how_coarse_contacts_are(lying):
+def test_the_estimate_knows_how_coarse_contacts_are():
+    """On 32 elements, where the lift-off lies between two contact points; on 64 it hits one, and the error is 1e-7."""
     _, end = heavy_elastica(0.3)
-    error = abs(float(lying.nodes[-1, 2]) - RADIUS - end[2])
-    estimate = float(lying.error_estimate)
+    result = solved(lifted(0.3), segments=32)
+    error = abs(float(result.nodes[-1, 2]) - RADIUS - end[2])
+    estimate = float(result.error_estimate)
     assert error < estimate < 10 * error
 
 
@@ -248,7 +250,7 @@ def touching() -> rj.Equilibrium:
 
 def test_clips_and_obstacles_share_the_weight(touching):
     forces = np.asarray(touching.contact_forces)
-    touched = rj.clearance(touching, touching.scene.obstacles, points=0).distance < 1e-12  # at the nodes to rounding
+    touched = np.any(np.asarray(touching.obstacle_forces) != 0, axis=(1, 2))
     np.testing.assert_array_equal(touched, [True, True, False])
     carried = forces.sum(0) + np.asarray(touching.end_force - touching.start_force + touching.clip_forces[0])
     np.testing.assert_allclose(carried, [0, 0, DENSITY * 10.0], rtol=0, atol=1e-9)
@@ -257,19 +259,29 @@ def test_clips_and_obstacles_share_the_weight(touching):
 
 
 def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):
-    """A gap or a force is zero at each node that no support holds; the box is not touched."""
+    """A gap or a pressure is zero at each node that no support holds; the box is not touched. Of what pushes in the
+    middle of an element both of its nodes have half.
+    """
     of_each, gaps = np.asarray(touching.obstacle_forces), np.asarray(touching.gaps)
     # The residual of 1e-8 EI/L^2.
     np.testing.assert_allclose(of_each.sum(0), touching.contact_forces, rtol=0, atol=1e-9)
     pushes = np.linalg.norm(of_each, axis=-1) > 0
     np.testing.assert_array_equal(pushes.any(1), [True, True, False])
-    np.testing.assert_allclose(gaps[pushes], 0.0, atol=1e-12)  # roundings
+    pressures = np.asarray(touching.state.pressures)
+    np.testing.assert_allclose(gaps[pressures[:3] > 0], 0.0, atol=1e-12)  # roundings
+    within = np.pad(pressures[3:, :-1], ((0, 0), (1, 1)))
+    shared = pressures[:3] + (within[:, :-1] + within[:, 1:]) / 2
+    force = touching.state.units.force
+    sums, alone = np.linalg.norm(of_each.sum(1), axis=-1), shared.sum(1) * force
+    # Each obstacle pushes in one element, where its normal turns by little.
+    np.testing.assert_allclose(sums, alone, rtol=1e-9)
     nearest = np.asarray(rj.clearance(touching, touching.scene.obstacles, points=0).distance)
     np.testing.assert_allclose(np.min(gaps, axis=1), nearest, rtol=0, atol=1e-12)
     sizes, s, told = np.linalg.norm(of_each.sum(1), axis=-1), np.asarray(touching.s), rj.describe(touching)
     for k, kind in enumerate(("Cylinder", "Plane")):
-        (place,) = s[pushes[k]]
-        assert f"obstacles[{k}] ({kind}) pushes with {sizes[k]:.4g} N at s = {place:.4g} m" in told
+        first, *_, last = s[pushes[k]][[0, -1]]
+        where = f"at s = {first:.4g} m" if first == last else f"between s = {first:.4g} and {last:.4g} m"
+        assert f"obstacles[{k}] ({kind}) pushes with {sizes[k]:.4g} N {where}" in told
     assert "(Box)" not in told
     forces = np.linalg.norm(lying.contact_forces, axis=-1)
     first, *_, last = np.asarray(lying.s)[forces > 0]
@@ -395,8 +407,8 @@ def test_a_flat_cable_lies_as_a_plain_one(tmp_path):
 
     plain = rj.solve(scene(cable()), segments=32)
     by_frames = solved(scene(flat(EI, 3 * EI)), segments=32)
-    # Two discretizations of fourth order; a contact that is off by 1e-6 N bends the rod by 1e-6/(3 EI).
-    np.testing.assert_allclose(by_frames.nodes, plain.nodes, rtol=0, atol=1e-6)
+    # Two discretizations: at the lift-off, which lies between two contact points, both are 9e-5 off.
+    np.testing.assert_allclose(by_frames.nodes, plain.nodes, rtol=0, atol=1e-5)
     np.testing.assert_allclose(by_frames.contact_forces, plain.contact_forces, rtol=0, atol=1e-4)
     assert by_frames.iterations <= plain.iterations + 1
     np.testing.assert_allclose(by_frames.error_estimate, plain.error_estimate, rtol=0, atol=1e-3)

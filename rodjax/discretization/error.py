@@ -293,7 +293,7 @@ def _integrated(
     def slope(section: Section, s: Float[Array, "n"]) -> Section:
         """Derivatives by arclength, at s from the first node."""
         n = start - weight[:, None] * s[None]
-        if scene.potentials:
+        if scene.potentials or scene.obstacles:
             x = (s / field.h)[None]
             n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]

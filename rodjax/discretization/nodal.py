@@ -51,7 +51,7 @@ from rodjax.model.supports import Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
-SOFTNESS = 1e-4
+SOFTNESS = 1e-5
 # Of a contact in the middle of an element, as a part of h^3/EI: it gives way by so much times its pressure, which both
 # nodes beside it would bear else. Harder ones leave all but undetermined who of the three does where the rod lies on.
 INNER_SOFTNESS = 1e-3
@@ -253,9 +253,22 @@ class NodalForm(Form):
         return potentials.at_nodes(self.scene, self.field.s, *self._node_lines(point), self.node_axes(point))
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
-        if not self.scene.potentials:
-            return None
-        return potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
+        """With the contacts in their middles, whose forces count as if spread along them."""
+        fields = None
+        if self.scene.potentials:
+            fields = potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
+        if not self.smooth:
+            return fields
+        contacts = self.contacts_on_elements(point)
+        return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
+
+    def contacts_on_elements(self, point: Any) -> OnElements:
+        middles, _, normals = self.within_elements(point)
+        forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[len(self.scene.obstacles) :, :-1], normals)
+        halves = -jnp.stack([forces, forces], axis=1) / 2
+        by_tangent = jnp.einsum("cn,cdn->dn", forces, middles.by_difference)
+        by_tangent = jnp.stack([-by_tangent, by_tangent], axis=1)
+        return OnElements(halves, by_tangent, jnp.zeros_like(halves))
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
         fields = self.fields_on_elements(point)

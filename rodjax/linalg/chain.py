@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
 
-# Solutions with soft contacts, before that which is told.
+# Solutions with soft contacts, after the first one.
 HARDENINGS = 5
 
 
@@ -106,14 +106,6 @@ class ContactRows(eqx.Module):
         own = jnp.pad(self.inner.softness, (0, 1), constant_values=1.0)
         softness = jnp.broadcast_to(self.softness, self.is_closed.shape)
         return softness.at[self.inner.rows].set(jnp.maximum(self.softness, own)[None])
-
-    @property
-    def of_model(self) -> Float[Array, "#k #n+1"]:
-        """What of the softness no contact has."""
-        softness = self.softness[None, None]
-        if self.inner is None:
-            return softness
-        return jnp.broadcast_to(softness, self.is_closed.shape).at[self.inner.rows].set(0.0)
 
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
         """The system with what closed contacts add to its stiffness."""
@@ -293,10 +285,12 @@ class _Middles(eqx.Module):
 class ChainFactors(eqx.Module):
     """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`, 0 without symmetry.
 
-    `system`: that without pressures. Where elimination begins at the end, it and all else is mirrored.
+    `whole`: the system; `system`: that without pressures. Where elimination begins at the end, it and all below is
+    mirrored.
     """
 
     contacts: ContactRows
+    whole: ChainSystem
     system: ChainSystem
     middles: _Middles
     inverses: Float[Array, "n+1 c c"]
@@ -312,24 +306,20 @@ class ChainFactors(eqx.Module):
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        """As if no contact were soft: what their softness gives way by is asked for again, by which it becomes less by
-        softness times stiffness of the rod each time.
+        """As if no contact were softer than it is: what the softness of the model gives way by is asked for again, by
+        which it becomes less by softness times stiffness of the rod each time, and with it what rounding has left.
         """
-        contacts = self.contacts
-        if not contacts.is_closed.size:
+        if not self.contacts.is_closed.size:
             return self.solve_softly(f, c)
-        first, given, nodes, gaps = self.system.parted(c)
+        hard = dataclasses.replace(self.contacts, softness=jnp.zeros_like(self.contacts.softness))
+        hard = dataclasses.replace(self.whole, contacts=hard)
 
-        def harder(given: Float[Array, "k p"], _) -> tuple[Float[Array, "k p"], None]:
-            pressures = self.system.parted(self.solve_softly(f, whole(given))[1])[1]
-            return jnp.where(contacts.is_closed, asked - contacts.of_model * pressures, asked), None
+        def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
+            left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
+            return jax.tree.map(jnp.add, found, self.solve_softly(*left)), None
 
-        def whole(given: Float[Array, "k p"]) -> Float[Array, "j"]:
-            return jnp.concatenate([part.reshape(-1) for part in (first, given, nodes, gaps)])
-
-        asked = given
-        given, _ = jax.lax.scan(harder, given, None, length=HARDENINGS)
-        return self.solve_softly(f, whole(given))
+        found, _ = jax.lax.scan(nearer, self.solve_softly(f, c), None, length=HARDENINGS)
+        return found
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -397,7 +387,7 @@ class ChainFactors(eqx.Module):
 
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
-    contacts, system = system.contacts, system.condensed()
+    whole, contacts, system = system, system.contacts, system.condensed()
     b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
     middles, elements, negative = _eliminated(system)
@@ -466,7 +456,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    factors = ChainFactors(contacts, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative)
+    factors = ChainFactors(contacts, whole, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative)
     if not k:
         return factors
     solution = factors._without_border(system.border, *nothing)
@@ -474,7 +464,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     if is_symmetric:
         negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
     complement = jnp.linalg.inv(matrix)
-    return ChainFactors(contacts, system, middles, inverses, below, above, solution, complement, negative)
+    return ChainFactors(contacts, whole, system, middles, inverses, below, above, solution, complement, negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:

@@ -11,6 +11,7 @@ from scipy.integrate import solve_bvp
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
+from rodjax.discretization.inner_contacts import Middles
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.model.supports import Support
 from rodjax.solving.equilibrium import checked_options
@@ -194,6 +195,75 @@ def test_a_rod_that_begins_across_a_box_and_stays_there_is_told():
         result = rj.solve(scene)
     assert not result.converged
     assert len(result.s) - 1 < 512
+
+
+@pytest.mark.slow
+def test_a_thin_pipe_between_nodes_carries_a_heavy_cable():
+    """Of 2 mm, below nodes 31 mm apart at first. Beside its contact points the rod may lie deeper, never through."""
+    s = np.linspace(0, 1, 65)
+    above = np.stack([0.9 * s, 0 * s, 0.2 * s * (1 - s)], axis=1)
+    pipe = rj.Capsule((0.45625, -1, -0.05), (0.45625, 1, -0.05), 0.001)
+    ends = Pin((0, 0, 0)), Pin((0.9, 0, 0))
+    scene = Scene(Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=RADIUS), *ends, (0, 0, -1.0), obstacles=[pipe])
+    result = rj.solve(scene, guess=rj.Guess(above))
+    assert result.converged
+    pushed = result.obstacle_forces[0].sum(0)
+    assert float(pushed[2]) > 100.0
+    carried = pushed + result.end_force - result.start_force
+    np.testing.assert_allclose(carried, [0, 0, 300.0], rtol=0, atol=1e-9 * 300.0)
+    assert deepest(result) < 0.4
+
+
+def test_contact_points_within_elements_have_exact_derivatives():
+    """Second ones too, beside those that JAX finds of the same point."""
+    rng = np.random.default_rng(0)
+    places, tangents = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+    tangents /= np.linalg.norm(tangents, axis=0)
+    axes, h = rng.normal(size=(3, 2, 3)), np.array([0.3, 0.5])
+    forces = rng.normal(size=(3, 2))
+
+    def moved(change: jax.Array) -> jax.Array:
+        """forces . x, by rotation and place of each node."""
+        turn = jnp.einsum("cbn,nb->cn", axes, change[:, :2])
+        across = jnp.cross(turn, tangents, axis=0)
+        turned = tangents + across + jnp.cross(turn, across, axis=0) / 2
+        middles = Middles.of(places + change[:, 2:], turned, jnp.asarray(axes), jnp.ones(3), jnp.asarray(h))
+        return jnp.sum(middles.points.T * forces)
+
+    nothing = jnp.zeros((3, 5))
+    middles = Middles.of(*map(jnp.asarray, (places, tangents, axes)), jnp.ones(3), jnp.asarray(h))
+    rates = np.einsum("cn,cemn->enm", forces, middles.rates)
+    first = np.zeros((3, 5))
+    first[:-1] += rates[0]
+    first[1:] += rates[1]
+    np.testing.assert_allclose(first, jax.grad(moved)(nothing), rtol=0, atol=1e-14)
+    blocks, second = np.asarray(middles.second(jnp.asarray(forces))), np.zeros((3, 5, 3, 5))
+    for k in range(2):
+        second[k : k + 2, :, k : k + 2, :] += blocks[..., k].reshape(2, 5, 2, 5)
+    np.testing.assert_allclose(second, jax.hessian(moved)(nothing), rtol=0, atol=1e-14)
+    # On a circle of an element's length/8 it is where the circle is, to the sixth order.
+    angle, turn = np.array([0.0, 0.125]), np.zeros((3, 2, 2))
+    circle = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)
+    along = np.stack([np.cos(angle), 0 * angle, np.sin(angle)])
+    middle = Middles.of(*map(jnp.asarray, (circle, along, turn)), jnp.ones(2), jnp.full(1, 0.125)).points[0]
+    np.testing.assert_allclose(middle, [np.sin(0.0625), 0, 1 - np.cos(0.0625)], rtol=0, atol=0.125**6)
+
+
+def test_a_rod_too_short_for_its_side_is_told_by_how_much():
+    """A cable of 0.5 m between pins 0.5 m apart, below a cylinder between them: two tangents and an arc. Chords of 1/32
+    of the string ask for up to 4e-4 too little.
+    """
+    around = 0.1 + RADIUS
+    angle = np.arccos(around / 0.25)
+    needed = 2 * np.sqrt(0.25**2 - around**2) + around * (np.pi - 2 * angle)
+    cylinder = rj.Cylinder((0.25, -1, 0), (0.25, 1, 0), 0.1)
+    s = np.linspace(0, 1, 65)
+    below = rj.Guess(np.stack([0.5 * s, 0 * s, -1.2 * s * (1 - s)], axis=1))
+    scene = Scene(cable(0.5), Pin((0, 0, 0)), Pin((0.5, 0, 0)), GRAVITY, obstacles=[cylinder])
+    lacking = f"{needed - 0.5:.2g}"
+    message = rf"at least {lacking} m too short to pass obstacles\[0\] \(Cylinder\) on the side where it was"
+    with pytest.warns((rj.NotConvergedWarning, rj.OverstretchedWarning), match=message):
+        rj.solve(scene, segments=32, guess=below)
 
 
 # --- over a cylinder -------------------------------------------------------------------------------------------------

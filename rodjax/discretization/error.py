@@ -204,7 +204,8 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
-    last, passed = _integrated(form, field, forces, torque, first)
+    has_fields = form.fields_on_elements(point) is not None
+    last, passed = _integrated(form, field, forces, torque, first, has_fields)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
     # a twist.
@@ -282,9 +283,16 @@ def _axial_error(
 
 
 def _integrated(
-    form: MixedForm, field: HermiteElements, forces: Float[Array, "3 3 n"], torque: Float[Array, ""], first: Section
+    form: MixedForm,
+    field: HermiteElements,
+    forces: Float[Array, "3 3 n"],
+    torque: Float[Array, ""],
+    first: Section,
+    has_fields: bool,
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
-    """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
+    """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta.
+    `has_fields`: the forces are parabolas, else those at the start less the weight.
+    """
     scene, rod = form.scene, form.scene.rod
     start, middle, end = (forces[:, k] for k in range(3))
     weight = jnp.zeros(3, start.dtype) if scene.gravity is None else scene.gravity
@@ -293,7 +301,7 @@ def _integrated(
     def slope(section: Section, s: Float[Array, "n"]) -> Section:
         """Derivatives by arclength, at s from the first node."""
         n = start - weight[:, None] * s[None]
-        if scene.potentials or scene.obstacles:
+        if has_fields:
             x = (s / field.h)[None]
             n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]

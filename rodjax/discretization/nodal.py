@@ -323,6 +323,18 @@ class NodalForm(Form):
         h = jnp.diff(self.field.s)
         return SOFTNESS * h[jnp.argmin(h)] ** 3
 
+    @property
+    def inner_softness(self) -> Float[Array, "n"]:
+        """Of the contacts within elements [L^3/EI]."""
+        return INNER_SOFTNESS * jnp.diff(self.field.s) ** 3
+
+    def with_cushions(self, gaps: Float[Array, "r n+1"], pressures: Float[Array, "r n+1"]) -> Float[Array, "r n+1"]:
+        """The gaps less what contacts within elements give way by."""
+        if not self.smooth:
+            return gaps
+        inner = slice(len(self.scene.obstacles), None)
+        return gaps.at[inner, :-1].add(self.inner_softness[None] * pressures[inner, :-1])
+
     def distances_and_normals(
         self, places: Float[Array, "n+1 3"]
     ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
@@ -399,16 +411,14 @@ class NodalForm(Form):
     ) -> tuple[Float[Array, "q n+1"], InnerRows, InnerStiffness]:
         """Gaps in the middles of the elements, their gradients, and what pressures there add to L."""
         middles, gaps, normals = self.within_elements(point)
-        h = jnp.diff(self.field.s)
         rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
         b = rates.shape[1] - 3
-        rows = InnerRows(rates[:, :b], rates[:, b:], INNER_SOFTNESS * h**3, first=len(self.scene.obstacles))
+        rows = InnerRows(rates[:, :b], rates[:, b:], self.inner_softness, first=len(self.scene.obstacles))
         curved = self._curving(middles.points, pressures, self.smooth)
         by_moves = middles.rates.reshape(3, 2 * (b + 3), -1)
         blocks = jnp.einsum("cin,ncd,djn->ijn", by_moves, curved, by_moves)
         blocks -= middles.second(jnp.einsum("qn,qnc->cn", pressures, normals))
         gradient = -rows.turned(jnp.pad(pressures, ((0, 0), (0, 1))))
-        gaps = gaps.at[:, :-1].add(rows.softness[None] * pressures)
         return gaps, rows, InnerStiffness(gradient, blocks)
 
     def _across(self, normals: Float[Array, "k n+1 3"]) -> Float[Array, "3f n+1 3"]:
@@ -432,7 +442,7 @@ class NodalForm(Form):
     def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
         """The contacts of the model of a step from a point, to gaps and ways."""
         nodal = point.nodal
-        gaps = gaps + nodal.relaxed[:, None]
+        gaps = self.with_cushions(gaps + nodal.relaxed[:, None], nodal.pressures)
         if nodal.friction is None or ways is None:
             return Unilateral(gaps, nodal.pressures)
         _, normals = self.gaps_and_normals(nodal.places)
@@ -462,7 +472,7 @@ class NodalForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        nodal, gaps = point.nodal, contacts.gaps
+        nodal, gaps = point.nodal, self.with_cushions(contacts.gaps, point.nodal.pressures)
         pressures, forces = nodal.pressures, nodal.contact_forces
         balance = self.applied(point).T - contacts.rows.pushed(forces)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
@@ -497,10 +507,10 @@ class NodalForm(Form):
         pressures = nodal.pressures[:k]
         if self.smooth:
             _, _, normals_within = self.within_elements(point)
-            within = nodal.pressures[k:, :-1]
+            in_middles = nodal.pressures[k:, :-1, None]
             smooth = np.array(self.smooth)
-            pushes = pushes.at[smooth].add(_shared(within[..., None] * normals_within))
-            pressures = pressures.at[smooth].add(_shared(within[..., None])[..., 0])
+            pushes = pushes.at[smooth].add(_shared(in_middles * normals_within))
+            pressures = pressures.at[smooth].add(_shared(in_middles)[..., 0])
         states = jnp.where(pressures > 0, SLIPS, OPEN)
         if nodal.friction is None:
             return pushes, jnp.zeros_like(pushes), states

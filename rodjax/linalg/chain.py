@@ -456,7 +456,9 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    factors = ChainFactors(contacts, whole, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative)
+    factors = ChainFactors(
+        contacts, whole, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative
+    )
     if not k:
         return factors
     solution = factors._without_border(system.border, *nothing)

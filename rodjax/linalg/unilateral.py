@@ -273,7 +273,10 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     trial = contacts.pressures - contacts.gaps / softnesses(final)
     begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), trial, system.contacts.is_closed, final, no, no, count, count)
     end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
-    change = contacts.allowed(contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / softnesses(final)) - contacts.pressures
+    change = (
+        contacts.allowed(contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / softnesses(final))
+        - contacts.pressures
+    )
     first, _, u, force = open_system.parted(end.y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, change, u, force)])
     return ModelMinimum(end.x, y, end.is_minimum & end.is_done, end.count)

@@ -35,5 +35,7 @@ def taut(
         return string.at[1:-1].set(inner + out[:, None] * normals)
 
     string = jax.lax.fori_loop(0, ROUNDS, pulled, string)
-    touched = jnp.stack([jnp.min(jax.vmap(obstacle.at)(string[1:-1])) < (1 + TOUCHES) * radius for obstacle in obstacles])
+    touched = jnp.stack(
+        [jnp.min(jax.vmap(obstacle.at)(string[1:-1])) < (1 + TOUCHES) * radius for obstacle in obstacles]
+    )
     return jnp.sum(jnp.sqrt(jnp.sum(jnp.diff(string, axis=0) ** 2, axis=1))), touched

@@ -1,4 +1,4 @@
-"""What contacts at a few places alone add to the error of a mesh, and how deep the rod lies within obstacles between them."""
+"""What contacts at a few places add to the error of a mesh, and how deep the rod lies within obstacles between them."""
 
 from typing import Any
 
@@ -19,8 +19,8 @@ DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
-    """With what it adds that contacts act at nodes and middles of elements: where one lies by itself, it may be anywhere
-    beside these; with friction they act at nodes alone.
+    """With what it adds that contacts act at nodes and middles of elements, with friction at nodes alone: where one
+    lies by itself, it may be anywhere beside these.
 
     And how deep the rod lies between the nodes.
     """

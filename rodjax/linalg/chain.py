@@ -11,7 +11,7 @@ element before it and displacement, coupled with those of its neighbours only: O
     balance      S u + T^T theta - N p - K q + F_before - F_after = balance,   for each node that is not held
     border       border^T theta - compliance y = c
     pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
-    within       -M^T theta - K^T u - softness q = d, the same; not softer than an element by orders, as it couples nodes
+    within       -M^T theta - K^T u - softness q = d, the same
 
 Loads without a potential add rows of their own to the first three, without symmetry (`LoadRows`).
 """
@@ -107,6 +107,13 @@ class ContactRows(eqx.Module):
         softness = jnp.broadcast_to(self.softness, self.is_closed.shape)
         return softness.at[self.inner.rows].set(jnp.maximum(self.softness, own)[None])
 
+    def softened(self, factor: float) -> "ContactRows":
+        """With contacts within elements softer by a factor."""
+        if self.inner is None:
+            return self
+        inner = dataclasses.replace(self.inner, softness=factor * self.inner.softness)
+        return dataclasses.replace(self, inner=inner)
+
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
         """The system with what closed contacts add to its stiffness."""
         weights = jnp.where(self.is_closed, 1 / self.softnesses, 0.0)
@@ -147,8 +154,8 @@ class ChainSystem(eqx.Module):
     place is given; `turning`: T, of what a field of forces has of both the place and the rotation of a node, `None` for
     none. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
     `between`: what rotations and place (b, 3) of the last node of an element have by those of its first, beside H;
-    `None` for none. `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or touches has no
-    pivot. `loads`: `None` where all have a potential.
+    `None` for none. `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or
+    touches has no pivot. `loads`: `None` where all have a potential.
     """
 
     diagonal: Float[Array, "b b m"]

@@ -141,7 +141,8 @@ class Equilibrium(eqx.Module):
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
       when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
       just beyond it, and tension the mean of both sides
-    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
+    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node, and half of what they apply in the
+      middle of each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
       not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
@@ -659,13 +660,13 @@ def _too_short(equilibrium: Equilibrium) -> str:
     taut around the obstacles on the side where the rod last was sound.
     """
     scene, before = equilibrium.scene, equilibrium.state.before
-    is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
-    if before is None or not is_held or scene.clips:
+    start, end = scene.start, scene.end
+    if before is None or not isinstance(start, Held) or not isinstance(end, Held) or scene.clips:
         return ""
     if bool(equilibrium.converged) and not bool(_is_overstretched(equilibrium)):
         return ""
     radius, length = float(np.min(_radii(scene.rod))), float(scene.rod.length)
-    ends = np.asarray(scene.start.position), np.asarray(scene.end.position)
+    ends = np.asarray(start.position), np.asarray(end.position)
     points = np.asarray(before.points).copy()
     points[0], points[-1] = ends
     distances = np.min([np.asarray(obstacle.distance(points[1:-1])) for obstacle in scene.obstacles], axis=0)

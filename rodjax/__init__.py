@@ -3,39 +3,53 @@
 import importlib
 from typing import TYPE_CHECKING
 
-from rodjax import problems
-from rodjax.analysis.clearance import Clearance, clearance
-from rodjax.analysis.curvature import most_curved
-from rodjax.analysis.sensitivity import end_stiffness, sensitivities
-from rodjax.io.files import load, save
-from rodjax.io.scene_file import SceneFileError, read_scene
-from rodjax.io.scene_writing import write_scene
 from rodjax.model.along import Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential
+from rodjax.model.harness import Body, Harness
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Distance, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Law, Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Clip, Free, Pin, Swivel, frame, rotate
+from rodjax.model.supports import (
+    Clamp,
+    Clip,
+    Free,
+    Hinge,
+    Joint,
+    Pin,
+    Slider,
+    Spring,
+    Swivel,
+    frame,
+    rotate,
+)
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.paths.batch import solve_batch
-from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
-from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
-from rodjax.paths.path import solve_path
-from rodjax.paths.tracing import BranchEnd
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.line_search import LineSearch
 from rodjax.solving.newton import Newton
 from rodjax.solving.nonlinear_cg import NonlinearCG
-from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning, describe
+from rodjax.solving.result import (
+    Equilibrium,
+    MeshWarning,
+    NotConvergedWarning,
+    OverstretchedWarning,
+    PrecisionWarning,
+    describe,
+)
+from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from rodjax import problems
+    from rodjax.analysis.clearance import Clearance, clearance
     from rodjax.analysis.continuum import solve_continuum
+    from rodjax.analysis.curvature import most_curved
+    from rodjax.analysis.discrete_energy import energy, residual
+    from rodjax.analysis.sensitivity import end_stiffness, sensitivities
     from rodjax.identification.each import Fits, fit_each
     from rodjax.identification.fit import fit
     from rodjax.identification.measurements import (
@@ -50,6 +64,17 @@ if TYPE_CHECKING:
     )
     from rodjax.identification.result import Fit, NotIdentifiableError
     from rodjax.identification.unknowns import Unknown
+    from rodjax.io.cad import write_dxf
+    from rodjax.io.files import load, save
+    from rodjax.io.harness_file import read_scene
+    from rodjax.io.quantities import SceneFileError
+    from rodjax.io.scene_writing import write_scene
+    from rodjax.io.tables import centerline_table, write_table
+    from rodjax.paths.batch import solve_batch
+    from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+    from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
+    from rodjax.paths.path import solve_path
+    from rodjax.paths.tracing import BranchEnd
     from rodjax.routing.limits import Limits
     from rodjax.routing.margins import Margins, margins
     from rodjax.routing.objective import Objective
@@ -62,6 +87,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Between",
+    "Body",
     "Box",
     "Branch",
     "BranchEnd",
@@ -85,6 +111,10 @@ __all__ = [
     "Fits",
     "Free",
     "Guess",
+    "Harness",
+    "HarnessEquilibrium",
+    "Hinge",
+    "Joint",
     "Law",
     "Limits",
     "LineSearch",
@@ -105,16 +135,20 @@ __all__ = [
     "Pin",
     "Pipe",
     "Plane",
+    "PointCouple",
     "PointForce",
     "Potential",
+    "PrecisionWarning",
     "Reading",
     "Report",
     "Rod",
     "Route",
     "Scene",
     "SceneFileError",
+    "Slider",
     "Smooth",
     "Sphere",
+    "Spring",
     "Status",
     "Steps",
     "Swivel",
@@ -122,12 +156,14 @@ __all__ = [
     "Turned",
     "Union",
     "Unknown",
+    "centerline_table",
     "clearance",
     "critical_point",
     "critical_points",
     "describe",
     "enable_compilation_cache",
     "end_stiffness",
+    "energy",
     "fit",
     "fit_each",
     "follow",
@@ -143,6 +179,7 @@ __all__ = [
     "problems",
     "read_scene",
     "report",
+    "residual",
     "rotate",
     "route",
     "save",
@@ -156,12 +193,33 @@ __all__ = [
     "switch_branch",
     "tolerances",
     "view",
+    "write_dxf",
     "write_scene",
+    "write_table",
 ]
 
 
-# diffrax, optimistix and scipy take a second to import, which a solve without them need not wait for.
+# What a single solve does not need is imported where it is first asked for: diffrax, optimistix and scipy alone take a
+# second, files, paths and the analysis of equilibria a third of what is left.
 _LATER = {
+    **dict.fromkeys(("Clearance", "clearance"), "analysis.clearance"),
+    "most_curved": "analysis.curvature",
+    **dict.fromkeys(("end_stiffness", "sensitivities"), "analysis.sensitivity"),
+    **dict.fromkeys(("load", "save"), "io.files"),
+    "SceneFileError": "io.quantities",
+    "read_scene": "io.harness_file",
+    "write_scene": "io.scene_writing",
+    "write_dxf": "io.cad",
+    **dict.fromkeys(("centerline_table", "write_table"), "io.tables"),
+    **dict.fromkeys(("energy", "residual"), "analysis.discrete_energy"),
+    "solve_batch": "paths.batch",
+    **dict.fromkeys(
+        ("Branch", "CriticalPoint", "critical_point", "critical_points", "follow", "switch_branch"),
+        "paths.continuation",
+    ),
+    **dict.fromkeys(("Mode", "lowest_mode", "squared_frequencies"), "paths.modes"),
+    "solve_path": "paths.path",
+    "BranchEnd": "paths.tracing",
     "solve_continuum": "analysis.continuum",
     "fit": "identification.fit",
     "Fit": "identification.result",
@@ -199,7 +257,16 @@ _LATER = {
 }
 
 
+def __dir__() -> list[str]:
+    """The public names, those that are imported when they are first asked for too."""
+    return sorted([*__all__, "__version__", "plot"])
+
+
 def __getattr__(name: str):
     if name in _LATER:
-        return getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+        value = getattr(importlib.import_module(f"rodjax.{_LATER[name]}"), name)
+        globals()[name] = value  # found there from now on
+        return value
+    if name in ("plot", "problems"):
+        return importlib.import_module(f"rodjax.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

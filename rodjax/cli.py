@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -26,15 +26,22 @@ import rodjax
 from rodjax.analysis.curvature import curvature_along
 from rodjax.atomic_write import replace_file
 from rodjax.cluster import ClusterError, connected
+from rodjax.io.cad import SUFFIX as CAD_SUFFIX
+from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, load, save
+from rodjax.io.harness_file import is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
+from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
+from rodjax.io.tables import write_table
+from rodjax.notes import Narrator, note
 from rodjax.programs import answers, kept
 from rodjax.programs.tasks import TaskError
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
-from rodjax.sweeps.result import Summary, merge
+from rodjax.sweeps.quantities import QUANTITIES
+from rodjax.sweeps.result import Summary, merge, write_csv
 from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX
 from rodjax.sweeps.sweep import sweep
 
@@ -59,7 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
-        code = arguments.run(arguments)
+        # Commands with a bar of their own, or that ask again and again, need no other words.
+        is_told = sys.stderr.isatty() and arguments.run in (_solve, _report, _fit)
+        with Narrator() if is_told else contextlib.nullcontext():
+            code = arguments.run(arguments)
         sys.stdout.flush()
         return code
     except (CommandError, ClusterError, SceneFileError, SweepError) as error:
@@ -92,6 +102,10 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     solve.add_argument("-o", "--output", metavar=f"OUT{SUFFIX}", type=Path, help="write the result, for ParaView")
     solve.add_argument("--plot", metavar="OUT.png", type=Path, help="draw the rod, of a path its last step")
+    solve.add_argument(
+        "--csv", metavar="OUT.csv", type=Path, help="write the centerline, curvature, force and moment along it"
+    )
+    solve.add_argument("--dxf", metavar="OUT.dxf", type=Path, help="write the centerline as a spline, for CAD")
     solve.set_defaults(run=_solve)
     _add_view(commands)
     _add_sweep(commands)
@@ -99,9 +113,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_report(commands)
     demo = commands.add_parser("demo", help="solve and draw the figure of Linn & Stephan (2008)")
     demo.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-demo"), help="folder for the results")
-    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; the report's 10")
+    demo.add_argument("--segments", metavar="N", type=_segments, default=10, help="of the mesh; 10, as in the paper")
     demo.set_defaults(run=_demo)
-    warm = commands.add_parser("warm", help="compile what will be needed, so that first answers come at once")
+    warm = commands.add_parser("warm", help="compile programs ahead of time, so that first answers come at once")
     warm.add_argument(
         "file", metavar="FILE.toml", type=Path, nargs="?", help="of a scene, fit, report or route; the usual scenes"
     )
@@ -111,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_view(commands: Any) -> None:
-    view = commands.add_parser("view", help="take the rod of a scene in the hand, in a window in the browser")
+    view = commands.add_parser("view", help="move the rod of a scene by the mouse, in a window of the browser")
     view.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
     view.add_argument(
         "--port", metavar="N", type=_port, default=8080, help="of the window; 0 for any that is free; 8080"
@@ -120,7 +134,7 @@ def _add_view(commands: Any) -> None:
         "--host",
         metavar="ADDRESS",
         default="127.0.0.1",
-        help="at which it can be reached: by default from this machine only; whoever reaches it can move the rod",
+        help="address to listen on: by default this machine only; whoever reaches it can move the rod",
     )
     view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
     view.set_defaults(run=_view)
@@ -139,26 +153,30 @@ def _add_sweep(commands: Any) -> None:
     )
     run.add_argument("--resume", action="store_true", help="go on where an earlier run was stopped")
     run.add_argument("--chunk", metavar="N", type=_chunk, help="cases solved, and written, at a time; 1024")
+    run.add_argument(
+        "--also", metavar="NAME,...", default="", help=f"further quantities to write: {', '.join(QUANTITIES)}"
+    )
+    run.add_argument("--csv", metavar="OUT.csv", type=Path, help="write all but the nodes as a table too")
     _add_scheduler(run)
     run.set_defaults(run=_sweep)
-    join = commands.add_parser("merge", help="put the shards of a sweep together")
+    join = commands.add_parser("merge", help="merge the shards of a sweep")
     join.add_argument("shards", metavar=f"SHARD{SWEEP_SUFFIX}", type=Path, nargs="+")
     join.add_argument("-o", "--output", **output)
     join.set_defaults(run=_merge)
 
 
 def _add_fit(commands: Any) -> None:
-    fit = commands.add_parser("fit", help="find numbers of a scene from measured centerlines and end forces")
-    fit.add_argument("fit", metavar="FIT.toml", type=Path, help="what is sought: pydoc rodjax.identification.files")
-    fit.add_argument("data", metavar="DATA.csv", type=Path, help="what was measured: the same")
+    fit = commands.add_parser("fit", help="identify parameters of a scene from measured centerlines and end forces")
+    fit.add_argument("fit", metavar="FIT.toml", type=Path, help="the unknowns: pydoc rodjax.identification.files")
+    fit.add_argument("data", metavar="DATA.csv", type=Path, help="the measurements, same place")
     fit.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-fit"), help="folder for the results")
-    fit.add_argument("--profiles", action="store_true", help="draw likelihoods too, which takes as long again")
+    fit.add_argument("--profiles", action="store_true", help="draw profile likelihoods too, which doubles the time")
     fit.set_defaults(run=_fit)
 
 
 def _add_report(commands: Any) -> None:
     report = commands.add_parser(
-        "report", help="tell whether a cable keeps to limits, with pictures and a web page; exits with 3 where not"
+        "report", help="check a cable against limits, with pictures and a web page; exit code 3 where one is not kept"
     )
     report.add_argument("file", metavar="FILE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     report.add_argument(
@@ -169,10 +187,10 @@ def _add_report(commands: Any) -> None:
     )
     report.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-report"), help="folder for the report")
     report.set_defaults(run=_report)
-    route = commands.add_parser("route", help="find the best place of clips, ends and cable within limits")
+    route = commands.add_parser("route", help="find the best clip positions, ends and cable length within limits")
     route.add_argument("file", metavar="ROUTE.toml", type=Path, help="its format: pydoc rodjax.routing.files")
     route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
-    route.add_argument("--starts", metavar="N", type=_chunk, help="designs from which the search begins; 16")
+    route.add_argument("--starts", metavar="N", type=_chunk, help="starting points of the search; 16")
     _add_scheduler(route)
     route.set_defaults(run=_route)
 
@@ -255,6 +273,13 @@ def _demo(arguments: argparse.Namespace) -> int:
 def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SUFFIX,))
     _check_output(arguments.plot, "--plot", PLOT_SUFFIXES)
+    _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
+    _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
+    note(f"reading {arguments.scene}")
+    if is_harness_file(arguments.scene):
+        if arguments.output:
+            raise CommandError("-o is not allowed for a harness, which no file holds yet; --plot draws it")
+        return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
@@ -268,8 +293,13 @@ def _solve(arguments: argparse.Namespace) -> int:
     print("\n".join([_header(arguments.scene, file, result), *(_rows if file.is_path else _table)(result)]))
     if arguments.output:
         save(result, arguments.output)
+    last = jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result
     if arguments.plot:
-        _plot(jax.tree.map(lambda leaf: leaf[-1], result) if file.is_path else result, arguments.plot)
+        _draw(arguments.plot, last, _plot)
+    if arguments.csv:
+        _draw(arguments.csv, last, lambda _, path: write_table(result, path))
+    if arguments.dxf:
+        _draw(arguments.dxf, last, _write_dxf)
     for warning in caught:
         print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
@@ -278,6 +308,47 @@ def _solve(arguments: argparse.Namespace) -> int:
     outcome = rodjax.describe(result).replace("\n", ", ")
     print(f"rodjax: {arguments.scene}: {steps}{outcome}", file=sys.stderr)
     return 3
+
+
+def _solve_harness(arguments: argparse.Namespace) -> int:
+    for option in ("csv", "dxf"):
+        if getattr(arguments, option):
+            raise SceneFileError(f"{arguments.scene}: --{option} is for one cable: the file has several")
+    file = read_harness_file(arguments.scene)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        warnings.simplefilter("ignore", MeshWarning)
+        warnings.simplefilter("always", OverstretchedWarning)
+        result = rodjax.solve(file.harness, **file.settings)
+    print("\n".join([f"{arguments.scene}: {len(result)} cables, {len(result.joints)} joints", *_cables(result)]))
+    if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
+        from rodjax.plot import plot_harness
+
+        _save_figure(plot_harness(result), arguments.plot)
+    for warning in caught:
+        print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
+    if np.all(result.converged):
+        return 0
+    print(f"rodjax: {arguments.scene}: {rodjax.describe(result).splitlines()[0]}", file=sys.stderr)
+    return 3
+
+
+def _cables(result: rodjax.HarnessEquilibrium) -> list[str]:
+    """One row for each cable and each joint."""
+    wide = max(map(len, (*result, *result.joints, "cable")))
+    rows = [f"{'cable':{wide}}  length [m]  segments  bend radius [m]  |f| s=0 [N]  |f| s=L [N]  |m| s=0, s=L [N m]"]
+    for name, rod in result.items():
+        bend = 1 / max(float(np.max(curvature_along(rod)[1])), 1e-300)
+        forces = [float(np.linalg.norm(force)) for force in (rod.start_force, rod.end_force)]
+        moments = [float(np.linalg.norm(moment)) for moment in (rod.start_moment, rod.end_moment)]
+        rows.append(
+            f"{name:{wide}}{float(rod.s[-1]):12.4g}{rod.s.shape[-1] - 1:10}{bend:17.4g}"
+            f"{forces[0]:13.4g}{forces[1]:13.4g}{moments[0]:12.4g}{moments[1]:10.4g}"
+        )
+    rows.append(f"{'joint':{wide}}  position [m]")
+    for name, body in result.joints.items():
+        rows.append(f"{name:{wide}}" + "".join(f"{float(value) + 0.0:12.4g}" for value in body.position))
+    return [rodjax.describe(result), f"energy       {float(result.energy):.6g} J", *rows]
 
 
 def _view(arguments: argparse.Namespace) -> int:
@@ -302,6 +373,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
+    _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
     with _connected(arguments.scheduler) as executor:
         summary = sweep(
             arguments.scene,
@@ -310,10 +382,13 @@ def _sweep(arguments: argparse.Namespace) -> int:
             shard=arguments.shard,
             chunk=arguments.chunk,
             resume=arguments.resume,
+            also=[name.strip() for name in arguments.also.split(",") if name.strip()],
             executor=executor,
             progress=sys.stderr.isatty(),
             say=lambda line: print(line, flush=True),
         )
+    if arguments.csv:
+        write_csv(arguments.output, arguments.csv)
     return _swept(arguments.output, summary)
 
 
@@ -415,6 +490,9 @@ def _report(arguments: argparse.Namespace) -> int:
             obstacles=file.obstacles,
             names=file.names,
             title=file.title or str(arguments.file),
+            source=_source(arguments.file, *file.cables.values())
+            if arguments.result is None
+            else str(arguments.result),
         )
     except ValueError as error:
         if all(np.all(cable.converged) for cable in cables.values()):
@@ -464,7 +542,13 @@ def _route(arguments: argparse.Namespace) -> int:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(
-        route.verified, limits=file.limits, obstacles=file.obstacles, names=file.names, gradients=route, title=title
+        route.verified,
+        limits=file.limits,
+        obstacles=file.obstacles,
+        names=file.names,
+        gradients=route,
+        title=title,
+        source=_source(arguments.file, scene),
     )
     print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
     written = [*report.save(arguments.out), *written_route(route, arguments.out)]
@@ -473,6 +557,15 @@ def _route(arguments: argparse.Namespace) -> int:
         return 0
     print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
     return 3
+
+
+def _source(path: Path, *scenes: SceneFile) -> str:
+    """What a report is made of, and how exactly."""
+    meshes = [
+        f"rtol = {scene.rtol or DEFAULT_RTOL:g}" if scene.segments is None else f"{scene.segments} segments"
+        for scene in scenes
+    ]
+    return ", ".join([str(path), *dict.fromkeys(meshes)])
 
 
 def _solved(file: SceneFile) -> Equilibrium:
@@ -511,13 +604,25 @@ def _check_folder(path: Path, option: str) -> None:
         raise CommandError(f"{option} must be a folder that can be written, got {str(path)!r}")
 
 
-def _plot(equilibrium: Equilibrium, path: Path) -> None:
+def _draw(path: Path, equilibrium: Equilibrium, write: Callable[[Equilibrium, Path], None]) -> None:
+    """Writes a file of a shape, which must be finite."""
     if not np.all(np.isfinite(equilibrium.nodes)):
-        print(f"rodjax: {path} is not drawn: the shape is not finite", file=sys.stderr)
+        print(f"rodjax: {path} is not written: the shape is not finite", file=sys.stderr)
         return
+    write(equilibrium, path)
+
+
+def _plot(equilibrium: Equilibrium, path: Path) -> None:
     from rodjax.plot import plot_rod
 
     _save_figure(plot_rod(equilibrium), path)
+
+
+def _write_dxf(equilibrium: Equilibrium, path: Path) -> None:
+    try:
+        write_dxf(equilibrium, path)
+    except ImportError as error:
+        raise CommandError(str(error)) from None
 
 
 def _save_figure(figure: "Figure", path: Path, **options: Any) -> None:

@@ -52,7 +52,7 @@ def run(out: Path, segments: int) -> int:
     print(f"Fig. 1 of Linn & Stephan (2008): {len(scenes)} scenes of a cable in {segments} segments")
     print(_table(path))
     print(
-        f"{1e3 * again / len(scenes):.2f} ms a step; the report, with 10 segments in 2008: {REPORT_MILLISECONDS:g} ms. "
+        f"{1e3 * again / len(scenes):.2f} ms a step; the paper, with 10 segments in 2008: {REPORT_MILLISECONDS:g} ms. "
         f"First run, with compiling: {first:.1f} s"
     )
     print(f"written: {', '.join(map(str, files))}")

@@ -8,17 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LightSource, Normalize
+from matplotlib.colors import LightSource, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from rodjax.analysis.reactions import reactions
+from rodjax.analysis.samples import framed_at
 from rodjax.checks import instance, leaf, positive
-from rodjax.discretization.twist import angle_about, transport
 from rodjax.model.along import Along, Value, value_at
+from rodjax.model.surfaces import Faces, collar, quads, surfaces
 from rodjax.programs.compilation import compiled
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 Field = Literal["curvature", "twist", "tension"]
@@ -36,8 +39,14 @@ STRIPS = ((0, (0.0, 0.0, 0.0)), (FACES_AROUND // 2, (1.0, 1.0, 1.0)))
 LEAST_RADIUS = 0.018
 ARROW_LENGTH = 0.22
 LEAST_DEPTH = 0.3
+# Width and height of what is written at an arrow, by the length of the longest one.
+LABEL_SIZE = (0.6, 0.2)
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
+# Of clips and of obstacles, one after another, and how much of what is behind an obstacle it hides.
+CLIP_COLOR = "#3a3a3a"
+PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
+OPACITY = 0.35
 HALO = withStroke(linewidth=2, foreground="white")
 # The view [degrees].
 ELEVATION, AZIMUTH = 22, -62
@@ -57,12 +66,13 @@ def plot_rod(
 
     - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
     - `color_by`: `"curvature"`, `"twist"` or `"tension"`.
-    - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their size.
+    - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their magnitude.
     - `radius` [m] of the tube, of a rod whose radius varies at the thickest place; `None`: that of the rod, or thicker
       than life, 1.8 % of the picture, where the rod would be too thin to see: the figure says so.
     - `axes`: 3-D axes to draw in; `None`: a new figure.
 
-    The black strip runs along the director d1, the white one along -d1: where the rod twists they wind around it.
+    The black strip runs along the director d1, the white one along -d1: where the rod twists they wind around it. Clips
+    are dark collars. Obstacles are translucent, and drawn as far as they are near the rod.
     Raises `ValueError` or `TypeError` for arguments that make no sense.
     """
     _check(equilibrium, "equilibrium", color_by)
@@ -71,9 +81,40 @@ def plot_rod(
     instance(axes, "axes", Axes3D)
     radius, note = thickness([equilibrium], None if radius is None else float(positive(radius, "radius")))
     norm = Normalize(*_limits(getattr(equilibrium, color_by)))
-    points = [_draw_tube(axes, equilibrium, radius, color_by, norm)]
+    points = [_draw_tube(axes, equilibrium, radius, color_by, norm, _surroundings(equilibrium, radius))]
     if loads:
         points.append(_draw_loads(axes, equilibrium))
+    set_view(axes, np.concatenate(points))
+    axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
+    figure = cast(Figure, axes.get_figure(root=True))
+    figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)
+    return figure
+
+
+def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", radius: float | None = None) -> Figure:
+    """All rods of one equilibrium of a harness in one picture, with one scale of length and colour, and their names.
+
+    `color_by` as for `plot_rod`; `radius` [m]: of the thickest. Raises `ValueError` or `TypeError` for arguments that
+    make no sense.
+    """
+    instance(result, "result", HarnessEquilibrium)
+    if result.energy.ndim:
+        raise ValueError(f"result must be a single equilibrium, got a stack of shape {result.energy.shape}")
+    rods = result.values()
+    for name, rod in result.items():
+        _check(rod, f"result[{name!r}]", color_by)
+    axes = Figure(figsize=(8, 6), layout="constrained").add_subplot(projection="3d")
+    assert isinstance(axes, Axes3D)
+    true = [0.0 if rod.scene.rod.radius is None else largest_radius(rod.scene.rod.radius) for rod in rods]
+    first = int(np.argmax(true))
+    by_size = [rods[first], *rods]
+    thick, note = thickness(by_size, None if radius is None else float(positive(radius, "radius")))
+    norm = Normalize(*_limits(np.concatenate([getattr(rod, color_by) for rod in rods])))
+    points = []
+    for (name, rod), own in zip(result.items(), true, strict=True):
+        points.append(_draw_tube(axes, rod, thick * own / true[first] if own else thick, color_by, norm))
+        middle = np.asarray(rod.nodes)[len(rod.s) // 2]
+        axes.text(*middle, name, fontsize=8, path_effects=[HALO], zorder=10)
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     figure = cast(Figure, axes.get_figure(root=True))
@@ -172,40 +213,37 @@ def _framed(
     return framed_at(equilibrium, s)
 
 
-def framed_at(
-    equilibrium: Equilibrium, s: Float[jax.Array, "k"]
-) -> tuple[Float[jax.Array, "k 3"], Float[jax.Array, "k 3"], Float[jax.Array, "k 3"]]:
-    """Centerline, tangents and d1 of one equilibrium between its nodes."""
-    centerline, slopes = jax.jvp(equilibrium.position_at, (s,), (jnp.ones_like(s),))
-    tangents = slopes / jnp.linalg.norm(slopes, axis=1, keepdims=True)
-    return centerline, tangents, _directors(equilibrium, s, tangents)
-
-
-def _directors(
-    equilibrium: Equilibrium, s: Float[jax.Array, "k"], tangents: Float[jax.Array, "k 3"]
-) -> Float[jax.Array, "k 3"]:
-    """d1 between the nodes: carried from both neighbours without twist, the angle between the two shared evenly."""
-    nodes = equilibrium.s
-    cell = jnp.clip(jnp.sum(nodes[None] <= s[:, None], axis=1) - 1, 0, len(nodes) - 2)
-    length = nodes[cell + 1] - nodes[cell]
-    d1 = equilibrium.frames[:, :, 0]
-    from_before = jax.vmap(transport)(d1[cell], equilibrium.tangents[cell], tangents)
-    from_after = jax.vmap(transport)(d1[cell + 1], equilibrium.tangents[cell + 1], tangents)
-    # Frames give the angle up to turns: take the one nearest to the twist rate.
-    expected = length * (equilibrium.twist[cell] + equilibrium.twist[cell + 1]) / 2
-    angle = jax.vmap(angle_about)(tangents, from_before, from_after)
-    angle += 2 * jnp.pi * jnp.round((expected - angle) / (2 * jnp.pi))
-    angle = ((s - nodes[cell]) / length * angle)[:, None]
-    return jnp.cos(angle) * from_before + jnp.sin(angle) * jnp.cross(tangents, from_before)
+def _surroundings(equilibrium: Equilibrium, radius: float) -> list[tuple[Faces, tuple[float, ...]]]:
+    """Faces of a collar for each clip of a rod that is drawn this thick, and of the obstacles near it, with their
+    colors.
+    """
+    scene = equilibrium.scene
+    clips = reactions(equilibrium)[1:-1] if scene.clips else []
+    drawn = [(collar(clip.position, clip.axes[0], radius), to_rgba(CLIP_COLOR)) for clip in clips]
+    if scene.obstacles:
+        nodes = np.asarray(equilibrium.nodes)
+        # The room that the tube takes, so that a patch of a floor lies below all of it.
+        seen = surfaces(scene.obstacles, np.concatenate([nodes - radius, nodes + radius]))
+        drawn += [(faces, to_rgba(PALETTE[k % len(PALETTE)], OPACITY)) for k, faces in enumerate(seen)]
+    return drawn
 
 
 def _draw_tube(
-    axes: Axes3D, equilibrium: Equilibrium, radius: float, color_by: Field, norm: Normalize
+    axes: Axes3D,
+    equilibrium: Equilibrium,
+    radius: float,
+    color_by: Field,
+    norm: Normalize,
+    others: Sequence[tuple[Faces, tuple[float, ...]]] = (),
 ) -> Float[np.ndarray, "p 3"]:
-    """Draw one rod; returns points of its surface."""
+    """Draws one rod and other faces, all of which are sorted in depth together; returns points of them."""
     scale = ScalarMappable(norm, COLOR_MAP)
     nodes, values = np.asarray(equilibrium.s), np.asarray(getattr(equilibrium, color_by))
     faces, colors = tube_faces(equilibrium, radius, lambda s: scale.to_rgba(np.interp(s, nodes, values)))
+    if others:
+        shades = [np.pad(colors, ((0, 0), (0, 1)), constant_values=1.0)]
+        shades += [np.tile(color, (len(other), 1)) for other, color in others]
+        faces, colors = np.concatenate([faces, *(other for other, _ in others)]), np.concatenate(shades)
     draw_faces(axes, faces, colors)
     return faces.reshape(-1, 3)
 
@@ -228,12 +266,6 @@ def tube_faces(
     caps = [centerline[k] + hole * (points[k] - centerline[k]) for k in (0, -1)]
     colors = np.pad(colors, ((1, 1), (0, 0), (0, 0)), mode="edge")
     return quads(np.concatenate([caps[:1], points, caps[1:]])), colors.reshape(-1, 3)
-
-
-def quads(grid: Float[np.ndarray, "p q 3"]) -> Float[np.ndarray, "f 4 3"]:
-    """The faces between neighbours in a grid of points, row by row."""
-    corners = (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1])
-    return np.stack(corners, axis=2).reshape(-1, 4, 3)
 
 
 def draw_faces(
@@ -274,10 +306,12 @@ def draw_arrows(
     heads: Sequence[float] = (1.0,),
     azimuth: float = AZIMUTH,
 ) -> Float[np.ndarray, "p 3"]:
-    """Arrows with their sizes for loads not smaller than `least`, the largest `length` [m] long; returns their tips."""
+    """Arrows for loads not smaller than `least`, with their magnitudes, the largest `length` [m] long; returns their
+    tips.
+    """
     sizes = np.linalg.norm(loads, axis=1)
     right, up, _ = seen_axes(azimuth)
-    tips = []
+    tips, written = [], []
     for foot, load, size in zip(feet, loads, sizes, strict=True):
         if size < least:
             continue
@@ -286,8 +320,15 @@ def draw_arrows(
             (fx, fy, fz), (x, y, z) = foot, head * reach * along
             ratio = 0.2 * length / (head * reach)
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
-        x, y, z = foot + (reach + 0.05 * length) * along
-        ha, va = "left" if along @ right > 0 else "right", "bottom" if along @ up > 0 else "top"
+        # Beyond the tip, or where something is written there already before the foot.
+        for at, sign in ((foot + (reach + 0.05 * length) * along, 1), (foot - 0.1 * length * along, -1)):
+            side, rise = np.sign(sign * along @ right) or 1.0, np.sign(sign * along @ up) or 1.0
+            middle = np.array([at @ right, at @ up]) + np.array([side, rise]) * np.array(LABEL_SIZE) * length / 2
+            if not any(np.all(np.abs(middle - other) < np.array(LABEL_SIZE) * length) for other in written):
+                break
+        written.append(middle)
+        x, y, z = at
+        ha, va = "left" if side > 0 else "right", "bottom" if rise > 0 else "top"
         axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
         tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))

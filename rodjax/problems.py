@@ -1,4 +1,4 @@
-"""Benchmark problems: the report's Fig. 1 and two planar ones, as scenes of one cable."""
+"""Benchmark problems: Fig. 1 of Linn & Stephan (2008) and two planar ones, as scenes of one cable."""
 
 import math
 from collections.abc import Sequence

@@ -15,8 +15,8 @@ from rodjax.model.supports import Clip
 from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
 from rodjax.programs.answers import numpy_first
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.result import Equilibrium, describe
+from rodjax.solving.solve import solve
 
 # Of an experiment's or a route's file, tables that no scene has.
 OF_FITS, OF_ROUTES, OF_REPORTS = (

@@ -63,6 +63,7 @@ RODS = {
     "flat": lambda: rj.Rod(1.0, (1.0, 2.0), 0.7, 100.0),
     "curved": lambda: rj.Rod(1.0, (1.0, 2.0), 0.7, 100.0, rest_curvature=(1.0, 0.5), rest_twist=0.7),
     "law": lambda: rj.Rod(1.0, (1.0, 2.0), 0.7, 100.0, law=Stiffening()),
+    "shearing": lambda: rj.Rod(1.0, (1.0, 2.0), 0.7, 100.0, GA=(20.0, 30.0), rest_curvature=(1.0, 0.5)),
 }
 
 

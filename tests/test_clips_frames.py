@@ -359,13 +359,14 @@ def test_derivatives_by_place_position_and_frame(is_plain):
     def found(by):
         return numbers(rj.solve(with_changes(scene, frames, by), guess=base, **options))
 
-    @jax.jit
     def derivatives(weights):
         nowhere = jnp.zeros_like(direction)
         values, change = jax.jvp(found, (nowhere,), (direction,))
         return values, change, jax.vjp(found, nowhere)[1](weights)[0]
 
-    at = jax.jit(lambda h: found(h * direction))
+    def at(h):
+        return found(h * direction)
+
     weights = jnp.asarray(np.random.default_rng(1).normal(size=found(0 * direction).shape))
     values, change, by_weights = derivatives(weights)
     h = 1e-3
@@ -510,7 +511,7 @@ def test_describe_margins_and_reactions(twisted):
     # The largest twist is that before the clip; tolerances as above.
     assert by_name["twist"] == pytest.approx(4.0, rel=1e-8)
     assert by_name["moment of clip 0"] == pytest.approx(GJ * (4.0 - 1.3 / 0.7), rel=1e-8)
-    from rodjax.routing.reactions import reactions
+    from rodjax.analysis.reactions import reactions
 
     of_clip = reactions(twisted)[1]
     assert (of_clip.name, of_clip.kind, of_clip.s) == ("clip 0", "clip with frame", 0.3)

@@ -14,14 +14,14 @@ import trimesh
 from matplotlib.image import imread
 
 import rodjax as rj
+from rodjax.analysis.reactions import axes_of
+from rodjax.model import surfaces as routing_surfaces
+from rodjax.model.surfaces import MOST_TRIANGLES, surfaces
 from rodjax.plot import AZIMUTH, seen_axes
-from rodjax.routing import surfaces as routing_surfaces
 from rodjax.routing import web_page, words
 from rodjax.routing.findings import Gradients
-from rodjax.routing.reactions import axes_of
 from rodjax.routing.report import FILES
 from rodjax.routing.sights import azimuth, coloring, extent, sight
-from rodjax.routing.surfaces import MOST_TRIANGLES, surfaces
 
 RADIUS = 0.006
 GRAVITY = (0.0, 0.0, -9.81)
@@ -107,7 +107,10 @@ def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
     assert told["smallest clearance"].note == f"to {NAMES[nearest]}"
     assert told["largest twist rate"].value == float(np.max(np.abs(equilibrium.twist)))
     assert told["largest strain"].value == np.max(np.abs(strain))
-    assert told["largest tension"].value == float(np.max(equilibrium.tension))
+    # All of it is compressed.
+    assert float(np.max(equilibrium.tension)) < 0
+    assert told["largest compression"].value == -float(np.min(equilibrium.tension))
+    assert told["least compression"].value == -float(np.max(equilibrium.tension))
     assert told["elastic energy"].value == float(equilibrium.elastic_energy)
     assert told["mass"].value == pytest.approx(1300 * np.pi * RADIUS**2 * 0.62, rel=1e-12)
     assert told["lowest eigenvalue"].value == float(rj.lowest_mode(equilibrium).stiffness)
@@ -270,7 +273,7 @@ def test_csv_holds_all_numbers(saved, report):
     assert limits == report.margins
     forces = {row["name"]: float(row["value"]) for row in rows if row["kind"] == "force"}
     assert forces["end x"] == report.cables[0].reactions[-1].force[0]
-    assert forces["clip 0 size"] == pytest.approx(np.linalg.norm(report.cables[0].reactions[1].force))
+    assert forces["clip 0 magnitude"] == pytest.approx(np.linalg.norm(report.cables[0].reactions[1].force))
     assert float(next(r for r in rows if r["name"] == "bend radius by clips.0.at")["value"]) == 3.0
 
 
@@ -283,7 +286,7 @@ def test_the_text_and_the_picture_are_written(saved, report):
 def test_the_page_loads_nothing_and_hides_no_tags_in_names(saved, report):
     page = (saved / "report.html").read_text()
     assert len(page) < 1e6
-    assert not re.search(r"https?:|//cdn|src=|@import|url\(", page)
+    assert not re.search(r"https?:|//cdn|src=|@import|url\((?!#)", page)
     assert "default-src 'none'" in page
     assert page.count("</script>") == 2
     assert "&lt;/script&gt;&lt;b&gt;pipe &amp; &#x27;co&#x27;" in page
@@ -310,6 +313,48 @@ def test_a_name_like_a_place_in_the_template_is_a_name(report):
     assert "<title>@DATA@</title>" in web_page.web_page(strange, strange._sights)
 
 
+def test_the_report_says_what_it_was_made_of(saved, equilibrium):
+    made = rj.report(equilibrium, obstacles=OBSTACLES, names=NAMES, source="line.toml, rtol = 0.001")
+    assert f"by rodjax {rj.__version__} of line.toml, rtol = 0.001" in str(made)
+    text = (saved / "report.txt").read_text()
+    assert re.search(r"made on \d{4}-\d\d-\d\d by rodjax", text)
+    told = json.loads((saved / "report.json").read_text())
+    inputs = told["cables"][0]["inputs"]
+    assert f"EI {float(equilibrium.scene.rod.EI):.4g} N m^2" in inputs["rod"]
+    assert inputs["gravity"] == "(0, 0, -9.81) m/s^2"
+    assert inputs["clips[1]"] == "Clip: at 0.42 m, position (0.37, -0.03, 0.04) m"
+    assert inputs["obstacle floor"] == "Plane: point (0, 0, -0.02) m, normal (0, 0, 1)"
+    assert inputs["mesh"] == "12 segments (hermite)"
+    assert all(name in text for name in inputs)
+    errors = {name: fact["value"] for name, fact in told["cables"][0]["facts"].items() if name.startswith("estimated")}
+    assert errors["estimated error of the moments"] == float(equilibrium.moment_error)
+    assert errors["estimated error of the smallest bend radius"] == float(equilibrium.curvature_error)
+    page = (saved / "report.html").read_text()
+    assert all(part in page for part in ("made on ", "<h2>inputs</h2>", "along the cable", "@media print"))
+
+
+def test_diagrams_have_the_limits_on_them(report, equilibrium):
+    figure = report.along()
+    panels = {axes.get_ylabel(): axes for axes in figure.axes}
+    assert list(panels)[:5] == ["curvature [1/m]", "twist [deg/m]", "tension [N]", "moment [N m]", "clearance [mm]"]
+    curvature, limit = panels["curvature [1/m]"].get_lines()[:2]
+    # An inside bend radius of 5 diameters: 11 radii of the centerline.
+    np.testing.assert_allclose(limit.get_ydata(), 1 / (11 * RADIUS))
+    assert (np.max(curvature.get_ydata()) > 1 / (11 * RADIUS)) == (report.margins["bend radius"] < 0)
+    lines = panels["clearance [mm]"].get_lines()
+    assert [line.get_label() for line in lines[:2]] == NAMES
+    smallest = min(np.min(line.get_ydata()) for line in lines[:2])
+    # Between 401 places 1.5 mm apart it may be smaller by h^2/8 times the curvature of 20 1/m.
+    assert smallest == pytest.approx(1e3 * facts(report)["smallest clearance"].value, abs=0.01)
+    bending = panels["moment [N m]"].get_lines()[0].get_ydata()
+    held = float(
+        np.linalg.norm(
+            equilibrium.end_moment - (equilibrium.end_moment @ equilibrium.tangents[-1]) * equilibrium.tangents[-1]
+        )
+    )
+    assert bending[-1] == pytest.approx(held, rel=1e-9)
+
+
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -322,6 +367,11 @@ def test_the_picture_names_what_it_shows(report):
     written = [text.get_text() for text in axes.texts]
     sizes = [f"{np.linalg.norm(reaction.force):.3g} N" for reaction in report.cables[0].reactions]
     assert written[:4] == sizes
+    # None of them on another.
+    right, up, _ = seen_axes(AZIMUTH)
+    places = [np.array([right, up]) @ text.get_position_3d() for text in axes.texts[:4]]
+    apart = [np.abs(a - b) for k, a in enumerate(places) for b in places[:k]]
+    assert all(np.max(way) > 0.01 for way in apart)
     assert written[4:6] == ["clip 0", "clip 1"]
 
 

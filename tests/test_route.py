@@ -55,7 +55,7 @@ def test_the_shortest_turn_is_an_arc(shortest):
     # The length goes with the radius, 2 * 9 times the rod's and once that: a whole limit more adds 2 * 9 of it.
     assert shortest.multipliers == {"bend radius": pytest.approx(np.pi / 2 * 18 * RADIUS, rel=1e-3)}
     assert "optimal to first order" in str(shortest)
-    assert "held by bend radius (0.0014 for 1 %)" in str(shortest)
+    assert "active limits: bend radius (0.0014 for 1 %)" in str(shortest)
     # Where the end is, the length depends on by the square.
     np.testing.assert_allclose(shortest.numbers[:2], radius, rtol=3e-3)
     assert shortest.names == ("end.position.0", "end.position.2", "rod.length")

@@ -421,7 +421,7 @@ MISTAKES = [
     (
         ROD + "color = 1\n" + START + END,
         "rod.color is not allowed",
-        "length, GJ, EA, EI, EI1, EI2, mass_per_length, radius, rest_curvature_1",
+        "length, GJ, EA, EI, EI1, EI2, GA, GA1, GA2, mass_per_length, radius, rest_curvature_1",
     ),
     (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, clips, obstacles, solve, path"),
     (ROD + START + END + "path = 1\n", "end.path is not allowed", "position, frame, tangent, d2, spin"),

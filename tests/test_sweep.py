@@ -19,10 +19,12 @@ import pytest
 from test_tasks import Unreliable
 
 import rodjax
+from rodjax.analysis.curvature import curvature_along
 from rodjax.cli import main
 from rodjax.io.scene_file import read_scene
 from rodjax.solving.refinement import SIZES
 from rodjax.sweeps.cases import CaseReader, SweepError, read_cases
+from rodjax.sweeps.quantities import QUANTITIES
 from rodjax.sweeps.result import merge, summary
 from rodjax.sweeps.sweep import sweep
 
@@ -622,6 +624,43 @@ def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
     # A batch is solved on one mesh, and says how many cases miss the tolerance there.
     with pytest.warns(rodjax.NotConvergedWarning, match=r"3.7e-01 .* above rtol = 0.01 in 2 of 5 cases on the"):
         rodjax.solve_batch(scenes, rtol=0.01)
+
+
+def test_quantities_are_chosen_by_name(files, capsys):
+    """Those of single solves on the same mesh, to the solver's tolerance; and as a table."""
+    scene = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "segments = 16")
+    scene = scene.replace("[rod]", '[rod]\nradius = "4 mm"')
+    clip, floor = '\n[[clips]]\nat = "0.3 m"\nposition = "[0.25, 0, -0.02] m"\n', '\n[[obstacles]]\nkind = "plane"\n'
+    Path("scene.toml").write_text(scene + clip + floor + 'point = "[0, 0, -0.15] m"\nnormal = [0, 0, 1]\n')
+    Path("grid.toml").write_text('"rod.EI" = [0.004, 0.005]\n')
+    command = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--csv", "out.csv"]
+    assert main([*command, "--also", ",".join(QUANTITIES)]) == 0
+    found = contents("out.h5")
+    scenes = CaseReader(Path("scene.toml"), Path("grid.toml")).scenes(np.arange(2))
+    alone = rodjax.solve(scenes[1], segments=16)
+    assert found["clip_forces"].shape == (2, 1, 3)
+    np.testing.assert_allclose(found["clip_forces"][1], alone.clip_forces, atol=1e-6)
+    np.testing.assert_allclose(found["obstacle_forces"][1], np.sum(alone.obstacle_forces, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        found["clearance"][1], rodjax.clearance(alone, alone.scene.obstacles).distance, atol=1e-6
+    )
+    np.testing.assert_allclose(found["bend_radius"][1], 1 / np.max(curvature_along(alone)[1]), rtol=1e-5)
+    np.testing.assert_allclose(found["largest_tension"][1], np.max(alone.tension), atol=1e-6)
+    table = np.genfromtxt("out.csv", delimiter=",", names=True, deletechars="", replace_space=" ")
+    np.testing.assert_array_equal(table["clip_forces.0.2 [N]"], found["clip_forces"][:, 0, 2])
+    np.testing.assert_array_equal(table["rod.EI [N m^2]"], [0.004, 0.005])
+    assert table.dtype.names[0] == "case [1]"
+    # Another choice is another sweep.
+    capsys.readouterr()
+    assert main([*command, "--resume", "--also", "clip_forces"]) == 2
+    assert "different in also" in capsys.readouterr().err
+
+
+def test_quantities_that_a_scene_lacks_are_named(files):
+    with pytest.raises(SweepError, match=r"also: clip_forces needs a scene with clips, got one without"):
+        sweep("scene.toml", "grid.toml", "out.h5", also=["clip_forces"])
+    with pytest.raises(SweepError, match=r"also must be some of bend_radius, clearance, .*, got 'bending'"):
+        sweep("scene.toml", "grid.toml", "out.h5", also=["bending"])
 
 
 @pytest.mark.slow

@@ -64,7 +64,13 @@ def end(session: Session) -> Pose:
 
 def test_a_scene_of_its_own_controls_is_the_same():
     box = rj.Box((0.4, 0.0, -0.5), (0.1, 0.1, 0.1), np.eye(3))
-    scene = hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1), tangent=(1, 0, 0))], obstacles=[box])
+    clip = rj.Clip(0.5, (0.4, 0.0, -0.1), tangent=(1, 0, 0))
+    loads = {
+        "potentials": [rj.Potential(jax.tree_util.Partial(lambda k, position, s: k * position[2] ** 2, 3.0))],
+        "point_couples": [rj.PointCouple(0.3, (0.0, 1e-3, 0.0))],
+        "distributed": [rj.DistributedForce((0.0, 0.0, 0.1), part=(0.2, 0.6))],
+    }
+    scene = hanging(clips=[clip], obstacles=[box], **loads)
     same = SceneMaker(scene)(controls_of(scene))
     assert jax_leaves(same) == pytest.approx(jax_leaves(scene), abs=1e-15)  # the tangent of a clip by way of a frame
 

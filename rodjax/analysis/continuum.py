@@ -56,8 +56,9 @@ from rodjax.mechanics.energy import (
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_places
 from rodjax.model.supports import Clamp, Directed, Pin
-from rodjax.solving.equilibrium import MAX_SEGMENTS, solve
+from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, warn_of_outcome
+from rodjax.solving.solve import solve
 from rodjax.units import Units
 
 # Of the discrete equilibrium that a solve without a guess begins with.

@@ -5,11 +5,12 @@ along the rod or that follow it. Between two stations
 
     phi' = (1 + e) t,  R' = R [kappa]x,  n' = -f,  m' = -phi' x n - c,
 
-where kappa is that at rest and what R^T m adds to it, f the weight and the forces per length, c the couples. Nothing is
-taken out of the frame's rotation. There is a station at each jump of what varies along the rod, so that all is smooth
-between two of them but for the knots of splines.
+and where sections shear phi' = (1 + e) d3 + gamma1 d1 + gamma2 d2; kappa is that at rest and what R^T m adds to it, f
+the weight and the forces per length, c the couples. Nothing is taken out of the frame's rotation. There is a station at
+each jump of what varies along the rod, so that all is smooth between two of them but for the knots of splines.
 """
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -60,10 +61,13 @@ Prepared = Any
 class Material(eqx.Module):
     """What a rod is made of and the loads that follow it, splines already made of their values.
 
-    `rest`: curvature along d1 and d2 and twist, or a curve in space.
+    `rest`: curvature along d1 and d2 and twist, or a curve in space; `shear`: stiffnesses along d1 and d2;
+    `rest_axial`: the axial strain without stress.
     """
 
     stiffnesses: tuple[Prepared, Prepared, Prepared, Prepared]
+    shear: tuple[Prepared, Prepared] | None
+    rest_axial: Prepared | None
     mass: Prepared
     rest: tuple[Prepared, Prepared, Prepared] | SplinedCurve | None
     law: Law | None
@@ -83,18 +87,28 @@ class Material(eqx.Module):
         elif isinstance(rest, SpaceCurve):
             prepared = rest.splined
         EI1, EI2, GJ, EA = (_prepared(value) for value in rod.stiffnesses)
+        pair = rod.shear_pair
         return Material(
             (EI1, EI2, GJ, EA),
+            None if pair is None else (_prepared(pair[0]), _prepared(pair[1])),
+            None if rod.rest_strain is None else _prepared(rod.rest_strain),
             _prepared(rod.mass_per_length),
             prepared,
             rod.law,
-            sum_of_loads(scene, DistributedForce, True),
-            sum_of_loads(scene, DistributedCouple, True),
+            None,
+            None,
         )
+
+    def loaded(self, scene: Scene, s: Float[Array, ""]) -> "Material":
+        """With the loads that follow it at an arclength."""
+        force, couple = (sum_of_loads(scene, kind, True, s) for kind in (DistributedForce, DistributedCouple))
+        return dataclasses.replace(self, force=force, couple=couple)
 
     def sections(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Sections:
         EI1, EI2, GJ, EA = (_at(value, s, interval) for value in self.stiffnesses)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law)
+        GA = None if self.shear is None else jnp.stack([_at(value, s, interval) for value in self.shear])
+        rest_axial = None if self.rest_axial is None else _at(self.rest_axial, s, interval)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, self.law, GA, rest_axial)
 
     def rest_strains(self, s: Float[Array, ""], interval: Float[Array, "2"]) -> Float[Array, "3"]:
         if self.rest is None:
@@ -157,12 +171,21 @@ class FarEnd(eqx.Module):
 
 
 class Strained(eqx.Module):
-    """Of a cross section: its sections, strains beyond those at rest, all of the strains, and the axial one."""
+    """Of a cross section: its sections, strains beyond those at rest, all of the strains, the axial one beyond that at
+    rest and all of it, and with shear its strains.
+    """
 
     sections: Sections
     beyond_rest: Float[Array, "3"]
     strains: Float[Array, "3"]
     axial: Float[Array, ""]
+    stretched: Float[Array, ""]
+    shear: Float[Array, "2"] | None
+
+    def slope(self, frame: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        """phi'."""
+        along = (1 + self.stretched) * frame[:, 2]
+        return along if self.shear is None else along + frame[:, :2] @ self.shear
 
 
 def _strained(
@@ -175,7 +198,9 @@ def _strained(
 ) -> Strained:
     sections = material.sections(s, interval)
     beyond_rest, axial = sections.strains_under(frame.T @ moment, jnp.sum(force * frame[:, 2]))
-    return Strained(sections, beyond_rest, beyond_rest + material.rest_strains(s, interval), axial)
+    shear = None if sections.GA is None else sections.shear_under((frame.T @ force)[:2])
+    strains = beyond_rest + material.rest_strains(s, interval)
+    return Strained(sections, beyond_rest, strains, axial, sections.stretched(axial), shear)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -191,7 +216,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
         s = piece.start + u * piece.length
         frame = rotation_of(end.quaternion)
         here = _strained(material, s, piece.interval, frame, end.force, end.moment)
-        dphi = (1 + here.axial) * frame[:, 2]
+        dphi = here.slope(frame)
         dead = origin
         if piece.gravity is not None:
             dead += _at(material.mass, s, piece.interval) * piece.gravity
@@ -209,7 +234,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
             quaternion=product(end.quaternion, jnp.concatenate([zero[None], here.strains])) / 2,
             force=-load,
             moment=dmoment,
-            elastic_energy=here.sections.density((k1, k2), twist, here.axial),
+            elastic_energy=here.sections.density((k1, k2), twist, here.axial, here.shear),
             load_energy=dead_load_energy(dead, end.position),
             twist=here.strains[2],
         )
@@ -267,14 +292,13 @@ def _reached(
 ) -> tuple[Section, FarEnd]:
     """The cross sections at the other ends of pieces of rod from cross sections on, and those ends."""
     material = Material.of(scene)
-    along = (sum_of_loads(scene, kind, False) for kind in (DistributedForce, DistributedCouple))
-    dead = (scene.gravity, *along)
 
     def reached(section, start, length, interval):
-        axes = section.frame.T
-        gravity, force, couple = (None if load is None else axes @ load for load in dead)
+        axes, middle = section.frame.T, jnp.mean(interval)
+        along = (sum_of_loads(scene, kind, False, middle) for kind in (DistributedForce, DistributedCouple))
+        gravity, force, couple = (None if load is None else axes @ load for load in (scene.gravity, *along))
         n, m = axes @ section.force, axes @ section.moment
-        piece = Piece(start, length, interval, n, m, gravity, force, couple, material)
+        piece = Piece(start, length, interval, n, m, gravity, force, couple, material.loaded(scene, middle))
         end = far_end(rtol, piece)
         beyond = Section(
             position=section.position + section.frame @ end.position,
@@ -404,11 +428,12 @@ def _equilibrium(
         nodes=nodes,
         curvature=root(dot(strains[:2], strains[:2])),
         twist=strains[2],
-        axial_strain=strained.axial,
+        axial_strain=strained.stretched,
         total_twist=jnp.sum(ends.twist),
         elastic_energy=jnp.sum(ends.elastic_energy),
         load_energy=jnp.sum(ends.load_energy),
         missed=misses(scaled, start, sections, reached),
         shape=FramedCurve(nodes.position, quaternions, s),
+        shear_strain=strained.shear,
     )
     return equilibrium(scene, start, stations, iterations, result)

@@ -14,9 +14,9 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import solve
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium
+from rodjax.solving.solve import solve
 
 FIELDS = (
     "s",
@@ -28,6 +28,7 @@ FIELDS = (
     "total_twist",
     "tension",
     "axial_strain",
+    "shear_strain",
     "energy",
     "elastic_energy",
     "start_force",
@@ -65,6 +66,8 @@ def sensitivities(
     """
     instance(scene, "scene", Scene)
     of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
+    if "shear_strain" in of and scene.rod.GA is None:
+        raise ValueError("of must not have 'shear_strain' of a rod without GA: its sections do not shear")
     wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
     found = _derivatives(scene, solve(scene, **options), of, wrt)
     return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names

@@ -24,8 +24,8 @@ from jaxtyping import Array, Float, Int
 from rodjax.discretization.shape import Shape
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.along import Along
-from rodjax.model.loads import DistributedCouple, DistributedForce
-from rodjax.model.scene import Scene, held_at_both_ends, nondimensional, slid
+from rodjax.model.loads import DistributedForce, PointCouple, per_length
+from rodjax.model.scene import Scene, dead_forces, held_at_both_ends, loads_at_nodes, nondimensional, slid
 from rodjax.model.supports import Clamp, Free, Held, Support, Swivel
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState
 from rodjax.solving.status import Status, is_converged, with_strain
@@ -84,8 +84,8 @@ class Stations(eqx.Module):
 class Start(eqx.Module):
     """Where Newton begins, with what stays fixed while it runs.
 
-    `s`: arclengths of the stations; `force_steps`: point forces at each of them; `clips`: the numbers of those at
-    clips, where there are clips.
+    `s`: arclengths of the stations; `force_steps`: dead point forces at each of them; `clips`: the numbers of those at
+    clips, where there are clips, and `loaded` of those at other loads at a point.
     """
 
     stations: Stations
@@ -95,6 +95,7 @@ class Start(eqx.Module):
     force_scale: Float[Array, ""]
     moment_scale: Float[Array, ""]
     clips: Int[Array, "clips"] | None = None
+    loaded: Int[Array, "loads"] | None = None
 
     @staticmethod
     def near(
@@ -113,7 +114,7 @@ class Start(eqx.Module):
         )
         turn = jnp.zeros_like(position)
         stations = Stations(position, turn, force / force_scale, moment / moment_scale, places)
-        return Start(stations, at.s, at.force_steps, frames, force_scale, moment_scale, at.clips)
+        return Start(stations, at.s, at.force_steps, frames, force_scale, moment_scale, at.clips, at.loaded)
 
     def sections(self, stations: Stations) -> Section:
         """The cross sections at the stations, each just beyond its point force."""
@@ -148,6 +149,7 @@ class StationPlaces(NamedTuple):
     s: Float[Array, "k"]
     force_steps: Float[Array, "k 3"]
     clips: Int[Array, "clips"] | None
+    loaded: Int[Array, "loads"] | None
 
 
 def station_places(
@@ -160,16 +162,19 @@ def station_places(
     """Stations between which errors grow equally, at jumps, clips and at the point forces; and these forces."""
     grid = jnp.interp(jnp.linspace(0.0, growth[-1], intervals + 1, dtype=s.dtype), growth, s)
     grid = grid.at[0].set(0.0).at[-1].set(1.0)
-    loads = (load.at[None] for load in scene.point_forces)
-    unsorted = jnp.concatenate([grid, *jumps, *(clip.at[None] for clip in scene.clips), *loads])
+    others, forces = loads_at_nodes(scene), dead_forces(scene)
+    held = [*scene.clips, *others, *forces]
+    unsorted = jnp.concatenate([grid, *jumps, *(each.at[None] for each in held)])
     # A stable sort: a force on an end comes behind s = 0 and s = L, and so is part of what the rod exerts there.
     order = jnp.argsort(unsorted, stable=True)
-    without_force = len(unsorted) - len(scene.point_forces)
-    steps = [jnp.zeros((without_force, 3), s.dtype), *(load.force[None] for load in scene.point_forces)]
-    clips = None
+    without_force = len(unsorted) - len(forces)
+    steps = [jnp.zeros((without_force, 3), s.dtype), *(load.force[None] for load in forces)]
+    clips, loaded, beyond = None, None, without_force - len(others)
     if scene.clips:
-        clips = jnp.argsort(order)[without_force - len(scene.clips) : without_force]
-    return StationPlaces(unsorted[order], jnp.concatenate(steps)[order], clips)
+        clips = jnp.argsort(order)[beyond - len(scene.clips) : beyond]
+    if others:
+        loaded = jnp.argsort(order)[beyond:without_force]
+    return StationPlaces(unsorted[order], jnp.concatenate(steps)[order], clips, loaded)
 
 
 def integrated(
@@ -229,10 +234,26 @@ def misses(
         force=(after.force + start.force_steps[1:] - reached.force) / start.force_scale,
         moment=(after.moment - reached.moment) / start.moment_scale,
     )
+    if start.loaded is not None:
+        gaps = _with_loads(scene, start, gaps, after)
     if scene.clips:
         gaps = _with_clips(scene, start, gaps, after, reached)
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
     return gaps, _missed_support(scene.start, start, first, -1.0), _missed_support(scene.end, start, last, 1.0)
+
+
+def _with_loads(scene: Scene, start: Start, gaps: Stations, after: Section) -> Stations:
+    """With couples and forces that follow the rod at stations."""
+    assert start.loaded is not None
+    force, moment = gaps.force, gaps.moment
+    for load, number in zip(loads_at_nodes(scene), start.loaded, strict=True):
+        value = load.couple if isinstance(load, PointCouple) else load.force
+        value = after.frame[number - 1] @ value if load.follower else value
+        if isinstance(load, PointCouple):
+            moment = moment.at[number - 1].add(value / start.moment_scale)
+        else:
+            force = force.at[number - 1].add(value / start.force_scale)
+    return Stations(gaps.position, gaps.turn, force, moment, gaps.places)
 
 
 def _with_clips(scene: Scene, start: Start, gaps: Stations, after: Section, reached: Section) -> Stations:
@@ -292,6 +313,7 @@ class Reached(eqx.Module):
     missed: Any
     shape: Shape
     clip_moments: Float[Array, "clips 3"] | None = None
+    shear_strain: Float[Array, "n+1 2"] | None = None
 
 
 def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any, reached: Reached) -> Equilibrium:
@@ -338,6 +360,7 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         scene=scene,
         state=SolverState(reached.shape, end_force, units, stations.places, reached.clip_moments),
         discretization="continuum",
+        shear_strain=reached.shear_strain,
     )
 
 
@@ -371,9 +394,9 @@ def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Fl
         mass = scene.rod.mass_per_length
         before = mass.integral(start.s) if isinstance(mass, Along) else start.s
         by_interval.append(jnp.diff(before)[:, None] * scene.gravity[None])
-    dead_force = sum_of_loads(scene, DistributedForce, False)
+    dead_force = sum_of_loads(scene, DistributedForce, False, (start.s[:-1] + start.s[1:]) / 2)
     if dead_force is not None:
-        by_interval.append(jnp.diff(start.s)[:, None] * dead_force[None])
+        by_interval.append(jnp.diff(start.s)[:, None] * dead_force.T)
     for forces in by_interval:
         energy += jnp.sum(jax.vmap(dead_load_energy)(forces, positions[:-1]))
     if scene.point_forces:
@@ -384,10 +407,10 @@ def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Fl
     return energy
 
 
-def sum_of_loads(scene: Scene, kind: type, follower: bool) -> Float[Array, "3"] | None:
-    """Of the loads of one kind all along the rod, per length."""
+def sum_of_loads(scene: Scene, kind: type, follower: bool, s: Float[Array, "*k"]) -> Float[Array, "3 *k"] | None:
+    """Of the loads of one kind along the rod, per length, at arclengths that are none of those where a part ends."""
     loads = [load for load in scene.distributed if isinstance(load, kind) and load.follower == follower]
-    values = [load.couple if isinstance(load, DistributedCouple) else load.force for load in loads]
+    values = [per_length(load, s) for load in loads]
     return sum(values[1:], values[0]) if values else None
 
 

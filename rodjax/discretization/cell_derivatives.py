@@ -37,6 +37,13 @@ class CellStates(NamedTuple):
     rest_ways: RestWays | None
 
     @property
+    def acting(self) -> slice:
+        """The components, in the axes of the frames, of the force on which the energy of strain points depends: the
+        tension, and with shear those along d1 and d2.
+        """
+        return slice(2 if self.sections.GA is None else 0, 3)
+
+    @property
     def turning(self) -> Float[Array, "3 n"] | None:
         return None if self.rest_ways is None else self.rest_ways.turning
 
@@ -72,23 +79,30 @@ class Coordinates(NamedTuple):
         return Coordinates(cells.field.seen(cells.quaternions), directors, own_forces)
 
 
-def density(cells: CellStates, strains: Float[Array, "4 p n"]) -> Float[Array, "p n"]:
-    """What a strain point adds to the Lagrangian, by the strains there and the tension."""
-    sections, (*curvature, twist, tension) = cells.sections, jnp.unstack(strains)
-    bent = (curvature[0], curvature[1])
+def density(cells: CellStates, strains: Float[Array, "v p n"]) -> Float[Array, "p n"]:
+    """What a strain point adds to the Lagrangian, by the strains there and the acting forces, the last the tension."""
+    sections, (k1, k2, twist, *across, tension) = cells.sections, jnp.unstack(strains)
+    bent = (k1, k2)
     axial = sections.axial_strain_under(tension, bent, twist)
-    value = cells.field.lengths * (sections.density(bent, twist, axial) - tension * (1 + axial))
+    if across:
+        forces = jnp.stack(across)
+        shear = sections.shear_under(forces)
+        enthalpy = sections.density(bent, twist, axial, shear) - tension * (1 + sections.stretched(axial))
+        enthalpy -= dot(forces, shear)
+    else:
+        enthalpy = sections.density(bent, twist, axial) - tension * (1 + sections.stretched(axial))
+    value = cells.field.lengths * enthalpy
     if cells.rest_ways is not None and cells.rest_ways.along is not None:
         assert cells.rest_strains is not None
         value -= cells.rest_ways.along * part(strains[:2], cells.rest_strains[:2]) * tension
     return value
 
 
-def _at_points(cells: CellStates, here: Coordinates, strains: Strains) -> Float[Array, "4 p n"]:
+def _at_points(cells: CellStates, here: Coordinates, strains: Strains) -> Float[Array, "v p n"]:
     values = strains.values
     if cells.rest_strains is not None:
         values -= cells.rest_strains
-    return jnp.concatenate([values, here.own_forces[2:]])
+    return jnp.concatenate([values, here.own_forces[cells.acting]])
 
 
 def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
@@ -97,7 +111,7 @@ def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     strains = cells.field.strains(here.seen[cells.field.coordinates])
     stresses = jax.grad(lambda values: jnp.sum(density(cells, values)))(_at_points(cells, here, strains))
     return _by_rotations(
-        cells, here, stresses, _strain_rows(here, strains.jacobian, _coordinate_rows(cells.field, here))
+        cells, here, stresses, _strain_rows(cells, here, strains.jacobian, _coordinate_rows(cells.field, here))
     )
 
 
@@ -106,27 +120,28 @@ def derivatives(cells: CellStates) -> CellDerivatives:
     strains = cells.field.strains(here.seen[cells.field.coordinates])
     values = _at_points(cells, here, strains)
     stresses, by_all = jax.linearize(jax.grad(lambda values: jnp.sum(density(cells, values))), values)
-    # Each of the four changed at all points at once.
-    directions = jnp.eye(4, dtype=values.dtype)[:, :, None, None] * jnp.ones_like(values)[None]
+    # Each of them changed at all points at once.
+    directions = jnp.eye(len(values), dtype=values.dtype)[:, :, None, None] * jnp.ones_like(values)[None]
     stiffness = jax.vmap(by_all)(directions)
 
     p, n = values.shape[1:]
     turning = _coordinate_rows(cells.field, here)
     jacobian = strains.jacobian
-    of_strains = _strain_rows(here, jacobian, turning)
-    # Rows: strains and tension at the points; columns: rotations of the frames, then the force.
-    forcing = jnp.zeros((4, p, 3, n), values.dtype).at[3].set(jnp.moveaxis(here.directors[:, 2], 1, 0))
+    of_strains = _strain_rows(cells, here, jacobian, turning)
+    # Rows: strains and acting forces at the points; columns: rotations of the frames, then the force.
+    size = len(values)
+    acting = jnp.moveaxis(here.directors[:, cells.acting], 0, 2)
+    forcing = jnp.concatenate([jnp.zeros((3, p, 3, n), values.dtype), acting])
     rows = jnp.concatenate([of_strains, forcing], axis=2)
     changed = short_sum(stiffness[:, :, :, None] * rows[:, None], axis=0)
-    quadratic = _products(rows.reshape(4 * p, -1, n), changed.reshape(4 * p, -1, n))
-    size = len(turning)
-    curving = strains.curving(stresses[:3]).reshape(size, size, n)
+    quadratic = _products(rows.reshape(size * p, -1, n), changed.reshape(size * p, -1, n))
+    curving = strains.curving(stresses[:3]).reshape(len(turning), len(turning), n)
     changed = short_sum(curving[:, :, None] * turning[None], axis=1)
     second = quadratic[: 3 * p, : 3 * p] + _products(turning, changed)
     slopes = short_sum((stresses[:3, :, None, None] * jacobian).reshape(3 * p, -1, p - 1, n), axis=0)
-    second = second.reshape(p, 3, p, 3, n) + _curving(cells, here, slopes, stresses[3])
-    by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3])
-    way = -short_sum(stresses[3][:, None] * forcing[3], axis=0)
+    second = second.reshape(p, 3, p, 3, n) + _curving(cells, here, slopes, stresses[3:])
+    by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3:])
+    way = -short_sum((stresses[3:, :, None] * acting).reshape(-1, 3, n), axis=0)
     value = jnp.sum(density(cells, values), axis=0)
     if cells.turning is not None:
         rest = rotated(cells.quaternions[:, REFERENCE], cells.turning)
@@ -152,23 +167,26 @@ def _coordinate_rows(field: Cells, here: Coordinates) -> Float[Array, "v 3p n"]:
 
 
 def _strain_rows(
-    here: Coordinates, jacobian: Float[Array, "3 p c q n"], turning: Float[Array, "v 3p n"]
-) -> Float[Array, "4 p 3p n"]:
-    """The derivatives of strains and tensions at the points by the rotations, from those of the coordinates."""
+    cells: CellStates, here: Coordinates, jacobian: Float[Array, "3 p c q n"], turning: Float[Array, "v 3p n"]
+) -> Float[Array, "v p 3p n"]:
+    """The derivatives of strains and acting forces at the points by the rotations, from those of the coordinates."""
     _, p, n = here.own_forces.shape
     by_coordinates = jnp.swapaxes(jacobian, 2, 3).reshape(3, p, len(turning), n)
     of_strains = short_sum(by_coordinates[:, :, :, None] * turning[None, None], axis=2)
     forces = here.own_forces
-    by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)  # [k, a]: t x m
-    own = jnp.eye(p, dtype=forces.dtype)[:, :, None, None] * by_own[:, None]
-    return jnp.concatenate([of_strains, own.reshape(1, p, 3 * p, n)])
+    if cells.sections.GA is None:
+        by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)[None]  # [c, k, a]: t x m
+    else:
+        by_own = jnp.swapaxes(skew(forces), 1, 2)
+    own = jnp.eye(p, dtype=forces.dtype)[None, :, :, None, None] * by_own[:, :, None]
+    return jnp.concatenate([of_strains, own.reshape(-1, p, 3 * p, n)])
 
 
 def _by_rotations(
-    cells: CellStates, here: Coordinates, stresses: Float[Array, "4 p n"], rows: Float[Array, "4 p 3p n"]
+    cells: CellStates, here: Coordinates, stresses: Float[Array, "v p n"], rows: Float[Array, "v p 3p n"]
 ) -> Float[Array, "3 p n"]:
     _, p, n = stresses.shape
-    first = short_sum((stresses[:, :, None] * rows).reshape(4 * p, 3 * p, n), axis=0)
+    first = short_sum((stresses[:, :, None] * rows).reshape(-1, 3 * p, n), axis=0)
     first = jnp.moveaxis(first.reshape(p, 3, n), 0, 1)
     if cells.turning is None:
         return first
@@ -176,15 +194,18 @@ def _by_rotations(
 
 
 def _curving(
-    cells: CellStates, here: Coordinates, slopes: Float[Array, "c q n"], by_tension: Float[Array, "p n"]
+    cells: CellStates, here: Coordinates, slopes: Float[Array, "c q n"], by_forces: Float[Array, "f p n"]
 ) -> Float[Array, "p 3 p 3 n"]:
-    """The second derivatives of coordinates and tensions by the rotations, times those of the value by them."""
+    """The second derivatives of coordinates and acting forces by the rotations, times those of the value by them."""
     _, p, n = here.own_forces.shape
     blocks = [[jnp.zeros((3, 3, n), slopes.dtype)] * p for _ in range(p)]
-    tangents = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], slopes.dtype)[:, None, None], here.own_forces.shape)
-    of_tensions = by_tension[None, None] * _of_turned(here.own_forces, tangents)
+    if cells.sections.GA is None:
+        tangents = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], slopes.dtype)[:, None, None], here.own_forces.shape)
+        of_forces = by_forces[None] * _of_turned(here.own_forces, tangents)
+    else:
+        of_forces = _of_turned(here.own_forces, by_forces)
     for k in range(p):
-        blocks[k][k] = of_tensions[:, :, k]
+        blocks[k][k] = of_forces[:, :, k]
     if cells.turning is not None:
         blocks[REFERENCE][REFERENCE] -= _of_turned(here.own_forces[:, REFERENCE], cells.turning)
     first, _, _ = cells.field.coordinates.indices(4)
@@ -202,18 +223,23 @@ def _curving(
     return jnp.stack([jnp.stack(row, axis=1) for row in blocks])
 
 
-def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "p n"]) -> Float[Array, "3 3 p n"]:
-    """Derivatives of the tangents, and of the ways at rest, by the rotations, times those of the value by the tensions:
-    [a, c, i] as in `CellDerivatives.by_force`.
+def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "f p n"]) -> Float[Array, "3 3 p n"]:
+    """Derivatives of the directors, and of the ways at rest, by the rotations, times those of the value by the acting
+    forces: [a, c, i] as in `CellDerivatives.by_force`.
     """
-    by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])
-    tilting = slopes[None, None] * by_turns
+    if cells.sections.GA is None:
+        by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])
+        tilting = slopes[None] * by_turns
+    else:
+        tilting = _turned_vector(here.directors, slopes)
     if cells.turning is None:
         return tilting
-    directors = here.directors[:, :, REFERENCE]
-    # [c, a]: the directors times e_a x way.
-    turned = short_sum(directors[:, :, None] * -skew(cells.turning)[None], axis=1)
-    return tilting.at[:, :, REFERENCE].add(-jnp.swapaxes(turned, 0, 1))
+    return tilting.at[:, :, REFERENCE].add(-_turned_vector(here.directors[:, :, REFERENCE], cells.turning))
+
+
+def _turned_vector(directors: Float[Array, "3 3 *k"], vector: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
+    """[a, c]: component c of e_a x vector, which is given in the axes of the directors."""
+    return jnp.swapaxes(short_sum(directors[:, :, None] * -skew(vector)[None], axis=1), 0, 1)
 
 
 def _products(rows: Float[Array, "r c n"], changed: Float[Array, "r c n"]) -> Float[Array, "c c n"]:

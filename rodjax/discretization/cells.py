@@ -25,9 +25,9 @@ from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes
 from rodjax.geometry.rotations import inverse, product, unit
 from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
-from rodjax.model.along import Steps, stiffness_at
+from rodjax.model.along import Steps, stiffness_at, value_at
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, loads_at_nodes
 
 # The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
 REFERENCE = 1
@@ -244,10 +244,17 @@ class JointCells(eqx.Module):
         joints = [stiffness_at(value, (a + b) / 2, a, b) for value in of_joints]
         # The strain of an edge is one, in both of its joints.
         a, b = self.s[:-1], self.s[1:]
-        edges = stiffness_at(of_edges, (a + b) / 2, a, b)
-        EA = jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
+        middles = (a + b) / 2
+
+        def of_both(edges: Float[Array, "n"]) -> Float[Array, "2 n+1"]:
+            return jnp.stack([jnp.concatenate([edges[:1], edges]), jnp.concatenate([edges, edges[-1:]])])
+
+        EA = of_both(stiffness_at(of_edges, middles, a, b))
         EI1, EI2, GJ = (jnp.stack([joint, joint]) for joint in joints)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law)
+        pair, strain = rod.shear_pair, rod.rest_strain
+        GA = None if pair is None else jnp.stack([of_both(stiffness_at(value, middles, a, b)) for value in pair])
+        rest_axial = None if strain is None else of_both(value_at(strain, middles, a, b))
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:
         of_edges = jnp.clip((at - self.s[:-1]) / jnp.diff(self.s), 0.0, 1.0)
@@ -334,7 +341,9 @@ class ElementCells(eqx.Module):
         s = self.strain_places
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
         EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in rod.stiffnesses)
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law)
+        GA = None if rod.shear_pair is None else jnp.stack([stiffness_at(value, s, a, b) for value in rod.shear_pair])
+        rest_axial = None if rod.rest_strain is None else value_at(rod.rest_strain, s, a, b)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, s, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "3 n"]:
         return parts_before(self.s, at)
@@ -346,10 +355,14 @@ class ElementCells(eqx.Module):
 
 
 def varying(scene: Scene) -> list[Float[Array, "k"]]:
-    """The arclengths of the jumps of a rod and of loads along it."""
+    """The arclengths of the jumps of a rod and of loads along it, and of loads that all belong to one node."""
     rod = scene.rod
-    values = (*rod.stiffnesses, rod.mass_per_length, *(rod.rest_curvature or ()), rod.rest_twist)
-    return [value.jumps for value in values if isinstance(value, Steps)]
+    rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
+    values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
+    jumps = [value.jumps for value in values if isinstance(value, Steps)]
+    jumps += [load.part for load in scene.distributed if load.part is not None]
+    # Of such a load all is on one node, and what it does jumps there.
+    return jumps + [load.at[..., None] for load in loads_at_nodes(scene)]
 
 
 def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbers, "..."]] | None:

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.mechanics.energy import dead_load_energy
-from rodjax.model.loads import DistributedForce
-from rodjax.model.scene import Scene
+from rodjax.model.loads import DistributedForce, loaded_length
+from rodjax.model.scene import Scene, dead_forces
 from rodjax.model.supports import Free, Held
 from rodjax.units import Units
 
@@ -42,12 +42,14 @@ def forces_on_nodes(scene: Scene, segments: int, s: Float[Array, "n+1"] | None =
 
 def total_force(scene: Scene) -> Float[Array, "3"]:
     """All dead forces together."""
-    forces = [load.force for load in scene.point_forces]
+    forces = [load.force for load in dead_forces(scene)]
     ends = [end for end in (scene.start, scene.end) if isinstance(end, Free) and not end.follower]
     forces += [end.force for end in ends if end.force is not None]
     if scene.gravity is not None:
         forces.append(scene.gravity)
-    forces += [load.force for load in scene.distributed if isinstance(load, DistributedForce) and not load.follower]
+    for load in scene.distributed:
+        if isinstance(load, DistributedForce) and not load.follower:
+            forces.append(load.force if load.part is None else load.force * loaded_length(load, scene.rod.length))
     return sum(forces, jnp.zeros(3, scene.rod.length.dtype))
 
 

@@ -1,4 +1,4 @@
-"""Tangents of the edges of a polyline: the finite differences of the report, of second order."""
+"""Tangents of the edges of a polyline: the finite differences of Linn & Stephan (2008), of second order."""
 
 import equinox as eqx
 import jax

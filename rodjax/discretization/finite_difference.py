@@ -4,7 +4,7 @@ Bending lives at the nodes, stretch on the edges between them. Where an end hold
 the end node, whose tangent is prescribed, and the middle of the first edge has a bending energy of its own: second
 order in the spacing, as measured in `docs/design.md`.
 
-Here the unknowns are the nodes, as in the report; `mixed.MixedForm` is the same discretization in other unknowns.
+Here the unknowns are the nodes, as in the paper; `mixed.MixedForm` is the same discretization in other unknowns.
 """
 
 from typing import Any
@@ -131,7 +131,7 @@ class FiniteDifference(eqx.Module):
         equilibrium or nearest to that of `first`, or that of `scene.turns`.
         """
         polyline = _moved_to_ends(guess, scene)
-        return FiniteDifference(scene, _twist_reference(scene, guess, polyline, first)), polyline
+        return FiniteDifference(scene, twist_reference(scene, guess, polyline, first)), polyline
 
     # --- unknowns: the one place that knows which nodes move -------------------------------------------------------
 
@@ -304,7 +304,7 @@ def _framed_tangents(scene: Scene, polyline: Polyline) -> FramedTangents:
     return FramedTangents(with_held_tangents(scene, tangents), start_d1, end_d1)
 
 
-def _twist_reference(scene: Scene, guess: Polyline, polyline: Polyline, first: FirstTwist) -> TwistReference | None:
+def twist_reference(scene: Scene, guess: Polyline, polyline: Polyline, first: FirstTwist) -> TwistReference | None:
     if not (isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp)):
         return None
     field = EdgeTangents.of(scene, len(polyline.edges))

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.model.scene import Scene, scene_axes
+from rodjax.model.loads import DistributedForce
+from rodjax.model.scene import Scene, dead_forces, scene_axes
 from rodjax.model.supports import Directed, Free, Held, Support, Swivel
 
 
@@ -97,10 +98,13 @@ def _helix(tangent: Float[Array, "3"], free: Support, u: Float[Array, "k 1"]) ->
 
 def _pull(scene: Scene) -> Float[Array, "3"]:
     """The direction of all dead loads together, in which a rod on a pin hangs."""
-    loads = [load.force * load.at for load in scene.point_forces]
+    loads = [load.force * load.at for load in dead_forces(scene)]
     loads += [end.force for end in (scene.start, scene.end) if isinstance(end, Free) and end.force is not None]
     if scene.gravity is not None:
         loads.append(scene.gravity / 2)
+    if not loads:
+        dead = [load for load in scene.distributed if isinstance(load, DistributedForce) and not load.follower]
+        loads = [load.force for load in dead] or [jnp.zeros(3, scene.rod.length.dtype)]
     pull = sum(loads[1:], loads[0])
     size = jnp.sqrt(jnp.sum(pull**2))
     fallback = jnp.array([0.0, 0.0, -1.0], pull.dtype)

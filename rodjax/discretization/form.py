@@ -177,6 +177,12 @@ class Form(eqx.Module):
         here = self.linearized(point)
         return here.gradient, here.closure
 
+    def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        """L at a point as `Linearization.energy` has it, and what the rod lacks of its spans: for automatic
+        derivatives, by the poses of supports too.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has a force in each element")
+
     @abstractmethod
     def under_force(
         self,

@@ -5,7 +5,8 @@ The mixed form of `mixed`, with a frame R in the place of each tangent. An equil
     L(R, F) = sum h w(strains(R), e) - n . t [h (1 + e) + g rest] - sum n . R rest + sum F . span,
 
 a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t, and
-both `rest` are what ways at rest have beyond h t (`rest_ways`).
+both `rest` are what ways at rest have beyond h t (`rest_ways`). Where sections shear, t is their normal d3, and each
+strain point has h (gamma1 d1 + gamma2 d2) in its way too, GA gamma = n . d: shear is a compliance, not an unknown.
 A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
 frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
 rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
@@ -71,31 +72,49 @@ class FramePoint(eqx.Module):
 
 
 class Strained(eqx.Module):
-    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, axial strains under
-    the tension, tangents, and the lengths along these to the next node.
+    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, and `axial` ones
+    under the tension, which with those at rest are `stretched`; tangents, and the lengths along these to the next node;
+    the lengths of rod that they stand for, and with shear its strains and what it adds to phi'.
     """
 
     curvature: Float[Array, "2 p n"]
     twist: Float[Array, "p n"]
     axial: Float[Array, "p n"]
+    stretched: Float[Array, "p n"]
     tension: Float[Array, "p n"]
     tangents: Float[Array, "3 p n"]
     lengths: Float[Array, "p n"]
+    weights: Float[Array, "p n"]
+    shear: Float[Array, "2 p n"] | None
+    sideways: Float[Array, "3 p n"] | None
 
     @property
     def ways(self) -> Float[Array, "3 p n"]:
-        return self.lengths[None] * self.tangents
+        along = self.lengths[None] * self.tangents
+        return along if self.sideways is None else along + self.weights[None] * self.sideways
+
+    @property
+    def slopes(self) -> Float[Array, "3 p n"]:
+        """phi'."""
+        along = (1 + self.stretched)[None] * self.tangents
+        return along if self.sideways is None else along + self.sideways
+
+    def work(self, forces: Float[Array, "3 p n"]) -> Float[Array, "p n"]:
+        """Of forces on the ways."""
+        along = self.lengths * dot(forces, self.tangents)
+        return along if self.sideways is None else along + self.weights * dot(forces, self.sideways)
 
 
 class Kinematics(NamedTuple):
     """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the ways at
-    rest what turns with the reference frames, and what lies along the tangents.
+    rest what turns with the reference frames, and what lies along the tangents; d1 and d2 where sections shear.
     """
 
     strains: Float[Array, "3 p n"]
     tangents: Float[Array, "3 p n"]
     rests: Float[Array, "3 n"]
     along: Float[Array, "p n"] | None
+    across: Float[Array, "3 2 p n"] | None = None
 
 
 class HeldFrame(NamedTuple):
@@ -238,8 +257,14 @@ class FrameForm(Form):
         return self.layout.spans(self.held_places[0])
 
     def tangents_in_clips(self, point: FramePoint) -> Float[Array, "3 clips"]:
-        assert self.clip_nodes is not None
-        return point.tangents[:, 2 * self.clip_nodes]
+        nodes = self.clip_nodes
+        assert nodes is not None
+        if self.sections.GA is None:
+            return point.tangents[:, 2 * nodes]
+        # The centerline has a kink where the force jumps: the work of this force is that on the mean of both sides.
+        slopes = self.strained(point).slopes
+        mean = slopes[:, -1, nodes - 1] + slopes[:, 0, nodes]
+        return mean / jnp.sqrt(dot(mean, mean))[None]
 
     def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
         """The force through the cells besides that of the loads."""
@@ -273,16 +298,24 @@ class FrameForm(Form):
         if self.rest_ways is not None and self.rest_ways.along is not None:
             assert self.rest_strains is not None
             along = self.rest_ways.along * part(strains[:2], self.rest_strains[:2])
-        return Kinematics(strains, tangent(quaternions), rests, along)
+        across = None if self.sections.GA is None else columns(quaternions)[:, :2]
+        return Kinematics(strains, tangent(quaternions), rests, along, across)
 
     def _strained(self, here: Kinematics, forces: Float[Array, "3 p n"]) -> Strained:
         strains, tangents = here.strains, here.tangents
         tension = dot(forces, tangents)
         axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-        lengths = self.field.lengths * (1 + axial)
+        weights = self.field.lengths
+        stretched = self.sections.stretched(axial)
+        lengths = weights * (1 + stretched)
         if here.along is not None:
             lengths += here.along
-        return Strained(strains[:2], strains[2], axial, tension, tangents, lengths)
+        shear = sideways = None
+        if here.across is not None:
+            shear = self.sections.shear_under(short_sum(here.across * forces[:, None], axis=0))
+            sideways = short_sum(here.across * shear[None], axis=1)
+        of_axis = strains[2], axial, stretched, tension
+        return Strained(strains[:2], *of_axis, tangents, lengths, weights, shear, sideways)
 
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)
@@ -301,14 +334,15 @@ class FrameForm(Form):
     # --- energies ----------------------------------------------------------------------------------------------------
 
     def elastic_energy(self, point: FramePoint) -> Float[Array, ""]:
-        here = self.strained(point)
-        densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
-        return jnp.sum(self.field.lengths * densities)
+        return jnp.sum(self.field.lengths * self._densities(self.strained(point)))
+
+    def _densities(self, here: Strained) -> Float[Array, "p n"]:
+        return self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial, here.shear)
 
     def load_energy(self, point: FramePoint) -> Float[Array, ""]:
         """The potential of dead forces, zero at the origin, where the rod is held; other loads have none."""
         here = self.strained(point)
-        work = jnp.sum(here.lengths * dot(self.loads, here.tangents))
+        work = jnp.sum(here.work(self.loads))
         rest = self._rest_of_ways(self.field.of_cells(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work
@@ -375,6 +409,15 @@ class FrameForm(Form):
             residual=self._residual(gradient),
         )
 
+    def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        layout = self.layout
+        assert isinstance(layout, SpanForces)
+        value, ways = self.in_cells(self._kinematics(self.field.of_cells(point.quaternions)), point.end_force)
+        if not layout.size:
+            return value, jnp.zeros(0, value.dtype)
+        closure = layout.components(self.spans - layout.sums(ways))
+        return value + jnp.sum(point.end_force * self.spans), closure
+
     def _residual(self, gradient: Float[Array, "3 m"]) -> Float[Array, ""]:
         """Largest component of the moment left at a frame, per length of rod."""
         return jnp.max(jnp.abs(gradient) / self.field.weights[None])
@@ -422,8 +465,9 @@ class FrameForm(Form):
         """What the cells add to L under forces, and their ways."""
         forces = self.through(end_force) + self.loads
         here = self._strained(of_frames, forces)
-        densities = self.sections.density((here.curvature[0], here.curvature[1]), here.twist, here.axial)
-        value = jnp.sum(self.field.lengths * densities - here.tension * here.lengths)
+        value = jnp.sum(self.field.lengths * self._densities(here) - here.tension * here.lengths)
+        if here.sideways is not None:
+            value -= jnp.sum(here.weights * dot(forces, here.sideways))
         value -= jnp.sum(forces[:, REFERENCE] * of_frames.rests)
         return value, short_sum(here.ways, axis=1) + of_frames.rests
 

@@ -18,7 +18,6 @@ from rodjax.discretization.twist import nearest_twist
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
 from rodjax.geometry.vectors import dot
-from rodjax.model.rest import RestStrain
 from rodjax.model.scene import Scene, held_at_both_ends, scene_axes
 from rodjax.model.supports import Clamp, Directed, Held, Swivel
 
@@ -265,8 +264,7 @@ def _neighbours(places: Float[Array, "m"]) -> tuple[Float[Array, "m"], Float[Arr
 def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurve:
     """The rod at rest in the place to which one of its ends is held; in any place between two pins."""
     start, end = scene.start, scene.end
-    rest = scene.rod.rest_shape
-    poses = (RestStrain(None, None) if rest is None else rest).poses(ElementCells(s).places)
+    poses = scene.rod.stress_free.poses(ElementCells(s).places)
     q, positions = poses.quaternions, poses.positions[:, ::2]
     if of_joints:
         q = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1)

@@ -9,18 +9,19 @@ from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.rest_ways import RestWays
 from rodjax.model.along import Along
-from rodjax.model.loads import DistributedForce
-from rodjax.model.scene import Scene
+from rodjax.model.loads import DistributedForce, length_before, loaded_length
+from rodjax.model.scene import Scene, dead_forces
 from rodjax.model.supports import Free, Held
 
 
 def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     """The fields of a `framed.FrameForm`."""
-    rest_strains, rest_ways = _at_rest(scene, field)
+    sections = field.sections(scene.rod)
+    rest_strains, rest_ways = _at_rest(scene, field, sections.rest_axial)
     return {
         "scene": scene,
         "field": field,
-        "sections": field.sections(scene.rod),
+        "sections": sections,
         "rest_strains": rest_strains,
         "rest_ways": rest_ways,
         "loads": _dead_loads(scene, field),
@@ -28,7 +29,9 @@ def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     }
 
 
-def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
+def _at_rest(
+    scene: Scene, cells: Cells, rest_axial: Float[Array, "k n"] | None
+) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
     """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
     rest = scene.rod.rest_shape
     if rest is None:
@@ -40,22 +43,24 @@ def _at_rest(scene: Scene, cells: Cells) -> tuple[Float[Array, "3 k n"] | None, 
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
     strains = strains_between(cells, frames)
-    return strains, RestWays.of(cells, frames, strains, jnp.diff(poses.positions[:, ::2], axis=1), q[:, 1::2])
+    edges = jnp.diff(poses.positions[:, ::2], axis=1)
+    return strains, RestWays.of(cells, frames, strains, edges, q[:, 1::2], rest_axial)
 
 
 def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
     """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
     starts_held = isinstance(scene.start, Held)
     s = cells.strain_places
-    forces = jnp.zeros((3, *s.shape), s.dtype)
+    forces, one = jnp.zeros((3, *s.shape), s.dtype), jnp.ones((), s.dtype)
     if scene.gravity is not None:
         mass = scene.rod.mass_per_length
         before = mass.integral(s) if isinstance(mass, Along) else s
         forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
     for load in scene.distributed:
         if isinstance(load, DistributedForce) and not load.follower:
-            forces += load.force[:, None, None] * (1.0 - s if starts_held else -s)[None]
-    for load in scene.point_forces:
+            before = length_before(load, s)
+            forces += load.force[:, None, None] * (loaded_length(load, one) - before if starts_held else -before)[None]
+    for load in dead_forces(scene):
         before = cells.parts_before(load.at)
         forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
     for end, sign in ((scene.start, -1), (scene.end, 1)):

@@ -17,6 +17,7 @@ from rodjax.discretization.error import (
     of_sections,
 )
 from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.nonconservative import point_couples
 from rodjax.discretization.rest_ways import RestWays
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
@@ -29,12 +30,15 @@ from rodjax.model.supports import Directed, Free, Held
 
 
 class NodeStrains(eqx.Module):
-    """At the nodes: section moment (global axes), curvature along d1 and d2, twist, axial strain and tension."""
+    """At the nodes: section moment (global axes), curvature along d1 and d2, twist, axial strain and tension; with
+    shear its strains.
+    """
 
     moments: Float[Array, "3 n+1"]
     strains: Float[Array, "3 n+1"]
     axial: Float[Array, "n+1"]
     tension: Float[Array, "n+1"]
+    shear: Float[Array, "2 n+1"] | None
 
 
 def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
@@ -57,6 +61,7 @@ def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
         start_moment=moments[0],
         end_force=forces[1],
         end_moment=moments[1],
+        shear_strain=None if at_nodes.shear is None else at_nodes.shear.T,
     )
 
 
@@ -90,12 +95,15 @@ def section_forces(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
 
 
 def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
-    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip they may
-    jump, and are those beyond it.
+    """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip or a
+    couple they may jump, and are those beyond it.
     """
     field = form.field
     own = own_moments(form, point)
-    moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
+    if form.scene.point_couples:
+        moments = jnp.concatenate([-own[:, 0], own[:, 2, -1:]], axis=1)
+    else:
+        moments = jnp.concatenate([-own[:, 0, :1], own[:, 2]], axis=1)
     if form.clip_nodes is not None:
         moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
@@ -115,19 +123,27 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
         last_cell = jnp.concatenate([a, a[-1:]]), jnp.concatenate([b, b[-1:]])
         strains += rest.at(field.s, *last_cell)
     mean = jnp.concatenate([first[:, :1], (first[:, 1:] + last[:, :-1]) / 2, last[:, -1:]], axis=1)
-    return NodeStrains(moments, strains, axial, dot(mean, tangent(q)))
+    shear = _shear_under(sections, q, beyond)
+    return NodeStrains(moments, strains, sections.stretched(axial), dot(mean, tangent(q)), shear)
+
+
+def _shear_under(
+    sections: Sections, quaternions: Float[Array, "4 *k"], forces: Float[Array, "3 *k"]
+) -> Float[Array, "2 *k"] | None:
+    """Shear strains under forces in global axes; `None` where sections do not shear."""
+    return None if sections.GA is None else sections.shear_under(rotated(inverse(quaternions), forces)[:2])
 
 
 def strains_beside_nodes(
     form: FrameForm, point: FramePoint
 ) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
     """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
-    strains, axial = _strains_at_ends(form, point, _end_moments(form, point))
+    strains, axial = _strains_at_ends(form, point, end_moments(form, point))
     s = form.field.strain_places[::2]
     return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
 
 
-def _end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
+def end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
     """The section moments at both ends of each element, on its side of the node."""
     own = own_moments(form, point)
     return jnp.stack([-own[:, 0], own[:, 2]], axis=1)
@@ -147,7 +163,7 @@ def _strains_at_ends(
     if rest is not None:
         s = field.strain_places[::2]
         strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
-    return strains, axial
+    return strains, sections.stretched(axial)
 
 
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
@@ -155,6 +171,11 @@ def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "
     own, nodes = own_moments(form, point), form.clip_nodes
     assert nodes is not None
     jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
+    if form.scene.point_couples and isinstance(form.field, ElementCells):
+        q = form.field.of_cells(point.quaternions)
+        couples = point_couples(form.scene, form.field, q)
+        assert couples is not None
+        jumps -= rotated(q[:, 0], couples)[:, nodes]
     moments = []
     for k, clip in enumerate(form.scene.clips):
         moment = jnp.zeros_like(jumps[:, k])
@@ -185,14 +206,23 @@ def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
     def between(start: Float[Array, "*c 1"], inner: Float[Array, "*c 2 n-1"], end: Float[Array, "*c 1"]) -> Array:
         return jnp.concatenate([start, (inner[..., 0, :] + inner[..., 1, :]) / 2, end], axis=-1)
 
-    parts = ((strains[..., 1:-1], here.axial[:, 1:-1], here.tension[:, 1:-1])[k] for k in range(3))
-    return NodeStrains(moments, *(between(ends[0][k], inner, ends[1][k]) for k, inner in enumerate(parts)))
+    first, last = ends
+    shear = None
+    if here.shear is not None and first[3] is not None and last[3] is not None:
+        shear = between(first[3], here.shear[..., 1:-1], last[3])
+    return NodeStrains(
+        moments,
+        between(first[0], strains[..., 1:-1], last[0]),
+        between(first[1], here.stretched[:, 1:-1], last[1]),
+        between(first[2], here.tension[:, 1:-1], last[2]),
+        shear,
+    )
 
 
 def _strains_at_end(
     form: FrameForm, point: FramePoint, moment: Float[Array, "3"], force: Float[Array, "3"], k: int
-) -> tuple[Float[Array, "3 1"], Float[Array, "1"], Float[Array, "1"]]:
-    """Strains, axial strain and tension at the first or last node."""
+) -> tuple[Float[Array, "3 1"], Float[Array, "1"], Float[Array, "1"], Float[Array, "2 1"] | None]:
+    """Strains, axial strain, tension and shear strains at the first or last node."""
     q = point.quaternions[:, k, None]
     sections = eqx.combine(jax.tree.map(lambda leaf: leaf[..., k, k, None], _arrays(form.sections)), form.sections)
     tension = dot(force[:, None], tangent(q))
@@ -201,7 +231,7 @@ def _strains_at_end(
     if rest is not None:
         s = form.field.s
         strains += rest.at(s[k, None], s[[0, -2][k], None], s[[1, -1][k], None])
-    return strains, axial, tension
+    return strains, sections.stretched(axial), tension, _shear_under(sections, q, force[:, None])
 
 
 def positions_between_frames(
@@ -211,10 +241,14 @@ def positions_between_frames(
     middle, where a parabola through the slopes leads.
     """
     field, q = form.field, point.quaternions
-    here = form.strained(point)
-    slopes = (1 + here.axial)[None] * here.tangents
+    slopes = form.strained(point).slopes
     if not isinstance(field, ElementCells):
-        t = tangent(field.at_nodes(q))
+        frames = field.at_nodes(q)
+        t = tangent(frames)
+        if form.sections.GA is not None:
+            at_nodes = _on_joints(form, point)
+            assert at_nodes.shear is not None
+            t = (1 + at_nodes.axial)[None] * t + short_sum(columns(frames)[:, :2] * at_nodes.shear[None], axis=1)
         return cubic(field.s, nodes, t.T, s)
     a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
     ways = field.h[None] * (5 * a + 8 * b - c) / 24
@@ -249,9 +283,9 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point, axis)
-    ends = _end_moments(form, point)
+    ends = end_moments(form, point)
     moments = ends[:, 0]
-    if not form.scene.clips:
+    if not (form.scene.clips or form.scene.point_couples):
         moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
     nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments), nodes[:, :-1], moments)
@@ -294,7 +328,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     # A difference, as a derivative of these would be a third one of the energy.
     there = form.moved(point, here.bases, motion.rotation, change)
     before = section_forces(form, point), ends, _strains_at_ends(form, point, ends)[0][:2]
-    moments = _end_moments(lacking(1.0), there).at[:, 1].add(couple)
+    moments = end_moments(lacking(1.0), there).at[:, 1].add(couple)
     after = section_forces(form, there), moments, _strains_at_ends(form, there, moments)[0][:2]
     changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
@@ -327,10 +361,13 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         here = jax.tree.map(lambda leaf: parabola(x, leaf), _arrays(sections))
         here = eqx.combine(here, sections)
         strains, axial = here.strains_under(rotated(inverse(q), pose.moment), dot(force, t))
+        shear = _shear_under(here, q, force)
         if rest is not None:
             strains += rest.at(field.s[:-1] + x * h, field.s[:-1], field.s[1:])
         rate = product(q, jnp.concatenate([jnp.zeros_like(t[:1]), strains])) / 2
-        way = (1 + axial)[None] * t
+        way = (1 + here.stretched(axial))[None] * t
+        if shear is not None:
+            way += short_sum(columns(q)[:, :2] * shear[None], axis=1)
         moment = -cross(way, force)
         if couples is not None:
             moment -= parabola(x, couples)
@@ -377,7 +414,7 @@ def _errors_of_joints(form: FrameForm, point: FramePoint, axis: Float[Array, "3"
         after - before for after, before in zip(elements.end_forces(end), form.end_forces(point), strict=True)
     ]
     error = Sizes(longest(jnp.stack(end_changes, axis=1)), longest(jnp.stack(moments, axis=1)), curvature)
-    scale = Sizes(longest(forces), longest(_end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
+    scale = Sizes(longest(forces), longest(end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
     return Errors(
         elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)),
         *error.relative_to(scale),

@@ -340,6 +340,20 @@ class MixedForm(Form):
         energy = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
         return ByCells(energy, gradient, diagonal, lengths, along, softness, by_force)
 
+    def lagrangian(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        rod, layout = self.scene.rod, self.layout
+        assert isinstance(layout, SpanForces)
+        _, tension = self.forces_and_tensions(point)
+        strain = axial_strain_under(rod, tension)
+        stretching = density(rod, axial_strain=strain) - tension * (1 + strain)
+        energy = self.field.bending_energy(self.scene, point.tangents) + jnp.sum(self.field.side_weights * stretching)
+        if self.has_torsion:
+            energy += density(rod, twist=point.total_twist)
+        if not layout.size:
+            return energy, jnp.zeros(0, energy.dtype)
+        closure = layout.components(self.spans - layout.sums(self.edges(point).T))
+        return energy + jnp.sum(point.end_force * self.spans), closure
+
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
         assert isinstance(system, SaddlePointSystem | ChainSystem)

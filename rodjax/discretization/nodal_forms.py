@@ -133,8 +133,12 @@ class NodalFrames(NodalForm, FrameForm):
         return cls(**{**parts, "layout": CellForces(len(field.s) - 1)})
 
     def node_slopes(self, point: FramePoint) -> Float[Array, "n+1 3"]:
-        strain = self.field.assembled(self.field.lengths * self.strained(point).axial) / self.field.weights
-        return ((1 + strain)[None] * point.tangents)[:, ::2].T
+        here = self.strained(point)
+        strain = self.field.assembled(self.field.lengths * here.stretched) / self.field.weights
+        slopes = (1 + strain)[None] * point.tangents
+        if here.sideways is not None:
+            slopes += self.field.assembled(self.field.lengths[None] * here.sideways) / self.field.weights[None]
+        return slopes[:, ::2].T
 
     def node_axes(self, point: FramePoint) -> Float[Array, "3 3 n+1"]:
         return product(columns(point.quaternions[:, ::2]), self._projections[..., ::2])

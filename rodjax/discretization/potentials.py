@@ -6,7 +6,8 @@ trapezoidal rule with the correction of its ends, of fourth order:
     h/2 (V_start + V_end) + h^2/12 (V'_start - V'_end),    V' = grad V . t + dV/ds
 
 So each node has a part of its own, a function of its position and tangent, and no node is coupled with another; between
-elements of one length the corrections cancel. Stretch is left out of V', where it would be h^2 times the strain.
+elements of one length the corrections cancel. Stretch and shear are left out of V', where they would be h^2 times their
+strains.
 """
 
 from typing import NamedTuple

@@ -40,15 +40,17 @@ class RestWays(NamedTuple):
         strains: Float[Array, "3 p n"],
         edges: Float[Array, "3 segments"],
         middles: Float[Array, "4 segments"],
+        rest_axial: Float[Array, "p n"] | None,
     ) -> "RestWays":
         """Of a rod at rest with these frames and strains; `edges`: from node to node; `middles`: frames half way."""
+        own_lengths = cells.lengths if rest_axial is None else cells.lengths * (1 + rest_axial)
         tangents, axes = tangent(cells.of_cells(frames)), tangent(middles)
 
         def ways(lengths: Float[Array, "p n"]) -> Float[Array, "3 segments"]:
             by_point = lengths[None] * tangents
             return cells.ways(by_point, jnp.zeros_like(by_point[:, 0]))
 
-        missing = edges - ways(cells.lengths)
+        missing = edges - ways(own_lengths)
         lacking = dot(missing, axes)
         # Parted by the squared curvatures, each by as much of its tangent as lies along that of the middle.
         squares = cells.lengths * dot(strains[:2], strains[:2])

@@ -31,6 +31,7 @@ class Resultants(eqx.Module):
     start_moment: Float[Array, "3"]
     end_force: Float[Array, "3"]
     end_moment: Float[Array, "3"]
+    shear_strain: Float[Array, "n+1 2"] | None = None
 
 
 def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
@@ -81,6 +82,15 @@ def _by_ends(
     """The derivatives of L of each element by the tangents of its nodes."""
     by_ends = field.by_end_tangents(form.scene, point.tangents, form.forces(point)[:, ::2], torque)
     return with_fields_by_tangent(form.fields_on_elements(point), by_ends)
+
+
+def element_end_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "3 2 n"]:
+    """The section moments at both ends of each element, on its side of the node."""
+    tangents, torque = point.tangents, torque_at(form.scene.rod, point.total_twist)
+    assert isinstance(form.field, HermiteElements)
+    by_start, by_end = _by_ends(form, form.field, point, torque)
+    start, end = tangents[:, 0:-1:2], tangents[:, 2::2]
+    return jnp.stack([torque * start - cross(start, by_start), torque * end + cross(end, by_end)], axis=1)
 
 
 def with_fields_by_tangent(

@@ -31,6 +31,7 @@ from rodjax.identification.setup import (
     warn_of_lost,
 )
 from rodjax.identification.unknowns import Unknown, with_values
+from rodjax.notes import note
 from rodjax.paths.continuation import critical_point
 from rodjax.programs.answers import one_answer
 from rodjax.solving.equilibrium import Discretization
@@ -84,6 +85,7 @@ def fit(
     structure, problem, at = _with_held(setup, structure, problem, at, held)
     results = beginnings(structure, problem, at, guesses)
     while True:
+        note(f"fitting {len(setup.experiments)} experiments on {structure.segments} segments")
         found, problem = _settled(setup, structure, problem, at, results)
         at, results = found.at, found.evaluation.results
         error = largest_error(results, tolerance)

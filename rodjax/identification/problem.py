@@ -18,8 +18,9 @@ from rodjax.identification.measurements import Experiment
 from rodjax.identification.unknowns import Scale, inside, nominal, with_values
 from rodjax.model.scene import Scene
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import Discretization, solve
+from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.result import Equilibrium
+from rodjax.solving.solve import solve
 
 
 class Sought(NamedTuple):

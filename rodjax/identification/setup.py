@@ -22,10 +22,11 @@ from rodjax.identification.unknowns import Subject, Unknown, known_names, nomina
 from rodjax.model.scene import held_position
 from rodjax.paths.path import stack_scenes
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import Discretization, checked_options, first_state, solve
+from rodjax.solving.equilibrium import Discretization, checked_options, first_state
 from rodjax.solving.guess import Guess
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
+from rodjax.solving.solve import solve
 from rodjax.warn import warn
 
 DEFAULT_RTOL = 1e-4

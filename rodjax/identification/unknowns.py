@@ -18,17 +18,19 @@ Scale = Literal["log", "linear"]
 Per = Literal["all", "experiment"]
 
 # Numbers that are positive by their nature, and so sought by their logarithm where nothing else is said.
-POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
+POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.GA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
 UNITS = {
     "jumps": "m",
     "rod.EI": "N m^2",
     "rod.GJ": "N m^2",
     "rod.EA": "N",
+    "rod.GA": "N",
     "rod.mass_per_length": "kg/m",
     "rod.length": "m",
     "rod.radius": "m",
     "rod.rest_curvature": "1/m",
     "rod.rest_twist": "rad/m",
+    "rod.rest_strain": "",
     "position": "m",
     "tangent": "",
     "frame": "rad",
@@ -109,6 +111,8 @@ def unit_of(name: str) -> str:
     """SI unit of a number by its dotted name; none of a number without one."""
     if name.startswith("distributed.") and _matches(name, ("force",)):
         return "N/m"
+    if name.startswith("point_couples.") and _matches(name, ("couple",)):
+        return "N m"
     if name.startswith("obstacles."):
         return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal", "friction")) else "m"
     return next((unit for part, unit in UNITS.items() if _matches(name, (part,))), "")

@@ -4,14 +4,13 @@ Such a clamp is fitted without torsion. Where a result would depend on what is n
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from rodjax.io.quantities import SceneFileError
-from rodjax.model.loads import DistributedCouple, DistributedForce
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce
 from rodjax.model.rod import Rod
 from rodjax.model.supports import Clip
 
@@ -41,7 +40,7 @@ class Clocking(NamedTuple):
     unclocked: Sequence[str]
     rod: Rod
     clips: Sequence[Clip]
-    distributed: Sequence[DistributedForce | DistributedCouple]
+    loads: Sequence[PointForce | PointCouple | DistributedForce | DistributedCouple]
     values: Values
     along: Sequence[Values]
     followers: Mapping[str, bool]
@@ -63,6 +62,7 @@ class Clocking(NamedTuple):
         (other,) = {"start", "end"} - {name}
         if (
             isinstance(self.rod.EI, tuple)
+            or isinstance(self.rod.GA, tuple)
             or self.rod.rest_curvature is not None
             or self.rod.rest_centerline is not None
         ):
@@ -92,12 +92,14 @@ class Clocking(NamedTuple):
 
     @property
     def has_couples(self) -> bool:
-        return any(isinstance(load, DistributedCouple) for load in self.distributed)
+        return any(isinstance(load, DistributedCouple | PointCouple) for load in self.loads)
 
     @property
     def follows_across(self) -> bool:
         """Whether a load that follows the rod has a part across it, along d1 or d2."""
-        loads = [jax.tree.leaves(load)[0] for load in self.distributed if load.follower]
+        loads: list[Any] = [
+            getattr(load, "couple", getattr(load, "force", None)) for load in self.loads if load.follower
+        ]
         for name in (name for name, follower in self.followers.items() if follower):
             loads += [load for target in (self.values, *self.along) for load in target[name].values()]
         return any(np.any(np.asarray(load)[:2]) for load in loads)
@@ -108,5 +110,5 @@ class Clocking(NamedTuple):
         if len(self.unclocked) != 1 or self.has_clocking:
             return False
         has_moment = any("moment" in self.values[name] for name in self.kinds)
-        follows = any(self.followers.values()) or any(load.follower for load in self.distributed)
+        follows = any(self.followers.values()) or any(load.follower for load in self.loads)
         return has_moment or follows or self.has_couples

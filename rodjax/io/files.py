@@ -1,9 +1,9 @@
 """save() and load(): an `Equilibrium` in one VTKHDF file, which ParaView draws and rodjax reads back to the last bit.
 
-The file is HDF5 with two groups. `/VTKHDF` holds the picture: the centerline as one polyline, with the point data of
-`point_data`, over time steps for a path. `/rodjax` holds every field of `Equilibrium` under its own name, each with
-the attributes `units` and `description`, so that `load` needs no pickle and other programs need no rodjax. A hash
-follows after the end of the HDF5 file, by which `load` finds damage.
+The file is HDF5 with two groups. `/VTKHDF` holds the picture, for ParaView and other programs on VTK: see `vtk_parts`.
+`/rodjax` holds every field of `Equilibrium` under its own name, each with the attributes `units` and `description`, so
+that `load` needs no pickle and other programs need no rodjax. A hash follows after the end of the HDF5 file, by which
+`load` finds damage.
 """
 
 import dataclasses
@@ -19,27 +19,28 @@ import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from rodjax.atomic_write import has_seal, replace_file, seal
 from rodjax.checks import file_path, instance, is_known, one_of, shown
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
+from rodjax.io.vtk_parts import write_picture
 from rodjax.model.along import Smooth, Steps
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.scene import has_node_places
 from rodjax.model.supports import Clamp, Free, Pin, Swivel
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.result import Equilibrium, PrecisionWarning
 from rodjax.solving.status import Status
 from rodjax.version import __version__
+from rodjax.warn import warn
 
 SUFFIX = ".vtkhdf"
 # Of the group /rodjax. Raise it where an older rodjax could not read what this one writes, and with it the oldest one
 # that this one reads where fields are asked for that the older ones lack.
-FORMAT = 12
+FORMAT = 13
 OLDEST_FORMAT = 7
 
 # Units and meaning of each field, by its place under /rodjax.
@@ -51,7 +52,8 @@ FIELDS = {
     "twist": ("rad/m", "twist Omega at the nodes"),
     "total_twist": ("rad", "integral of the twist, not reduced by whole turns"),
     "tension": ("N", "tension at the nodes"),
-    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes"),
+    "axial_strain": ("1", "axial strain |phi'| - 1 at the nodes, with shear along d3"),
+    "shear_strain": ("1", "with shear: components of phi' along d1 and d2 at the nodes"),
     "energy": ("J", "elastic energy minus the work of dead forces, zero of height at the origin"),
     "elastic_energy": ("J", "elastic energy"),
     "start_force": ("N", "force of the rod beyond s = 0 on the support there, global axes"),
@@ -93,10 +95,13 @@ FIELDS = {
             ("EI/*", "N m^2", "bending stiffness about d1 and d2"),
             ("GJ", "N m^2", "torsional stiffness"),
             ("EA", "N", "axial stiffness"),
+            ("GA", "N", "shear stiffness"),
+            ("GA/*", "N", "shear stiffness along d1 and d2"),
             ("mass_per_length", "kg/m", "mass per length"),
             ("radius", "m", "radius of the rod, for pictures"),
             ("rest_curvature/*", "1/m", "curvature without stress, t x t' along d1 and d2"),
             ("rest_twist", "rad/m", "twist without stress"),
+            ("rest_strain", "1", "axial strain without stress"),
         )
         for leaf, leaf_unit, what in (
             ("", "", ""),
@@ -108,8 +113,10 @@ FIELDS = {
     "scene/rod/rest_centerline/points": ("m", "points of the centerline without stress"),
     "scene/rod/rest_centerline/s": ("1", "arclengths of these points as parts of the length"),
     "scene/rod/rest_centerline/d1": ("1", "directors d1 at these points"),
-    "scene/point_forces/*/at": ("m", "arclength at which a dead force acts"),
-    "scene/point_forces/*/force": ("N", "dead force on the rod, global axes"),
+    "scene/point_forces/*/at": ("m", "arclength at which a force acts"),
+    "scene/point_forces/*/force": ("N", "force on the rod, global axes or, of a follower, the frame there"),
+    "scene/point_couples/*/at": ("m", "arclength at which a couple acts"),
+    "scene/point_couples/*/couple": ("N m", "couple on the rod, global axes or, of a follower, the frame there"),
     "scene/clips/*/at": ("m", "arclength at which a clip holds the rod"),
     "scene/clips/*/position": ("m", "position that a clip holds, global axes"),
     "scene/clips/*/tangent": ("1", "tangent that a clip holds, global axes"),
@@ -133,6 +140,7 @@ FIELDS = {
     },
     **{f"{where}/obstacles/*/friction": ("1", "coefficient of friction") for where in ("scene", "state/before")},
     "scene/distributed/*/force": ("N/m", "force per length, global axes or, of a follower, material frames"),
+    "scene/distributed/*/part": ("m", "arclengths between which a load acts"),
     "scene/distributed/*/couple": ("N m/m", "couple per length, global axes or, of a follower, material frames"),
     **{
         f"scene/{end}/{name}": (unit, f"{description} at s = {place}, {axes}")
@@ -148,6 +156,8 @@ FIELDS = {
 }
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
+# Loads of which files of older formats have none.
+LATER = ("potentials", "point_couples")
 # How deep unions may lie in one another in a file.
 MOST_UNIONS = 2
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
@@ -199,7 +209,7 @@ def file_content(equilibrium: Equilibrium) -> bytes:
     # Put together in memory: an error of the disk is then an ordinary one, and HDF5 never holds a half-written file.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
-        _write_vtk(file.create_group("VTKHDF"), equilibrium)
+        write_picture(file.create_group("VTKHDF", track_order=True), equilibrium)
         _write(file.create_group("rodjax"), equilibrium)
         file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
     seal(image)
@@ -221,8 +231,9 @@ def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) ->
 def load(path: str | os.PathLike[str]) -> Equilibrium:
     """Reads what `rodjax.save` wrote: the same `Equilibrium` to the last bit, which serves as a `guess` too.
 
+    Where the file holds float64 while JAX is set to float32 the numbers are rounded, and a `PrecisionWarning` says so.
     Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
-    rodjax, and where it holds float64 while JAX is set to float32, which would round it.
+    rodjax.
     """
     path = file_path(path, "path", SUFFIX)
     image = io.BytesIO(path.read_bytes())
@@ -249,19 +260,13 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
             "rodjax has no longer: solve its scene again"
         )
-    return jax.tree.map(lambda values: _as_jax(values, path), equilibrium)
-
-
-def point_data(equilibrium: Equilibrium) -> dict[str, Float[Array, "..."]]:
-    """What is drawn along the centerline, by the name that ParaView shows."""
-    return {
-        "Curvature": equilibrium.curvature,
-        "Twist": equilibrium.twist,
-        "Tension": equilibrium.tension,
-        "Frame d1": equilibrium.frames[..., 0],
-        "Frame d2": equilibrium.frames[..., 1],
-        "Tangent": equilibrium.tangents,
-    }
+    if jnp.zeros(()).dtype == np.float32 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
+        warn(
+            f"{path} holds float64 numbers, which are rounded to float32: "
+            'call jax.config.update("jax_enable_x64", True) before anything else to keep them',
+            PrecisionWarning,
+        )
+    return jax.tree.map(jnp.asarray, equilibrium)
 
 
 def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
@@ -327,6 +332,8 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
     for field in dataclasses.fields(kind):
         if field.metadata.get("static"):
             value = _static(group, field, path)
+        elif field.name in LATER and field.name not in group:
+            value = ()
         else:
             value = _read_value(group, field.name, field.type, path, shape)
         object.__setattr__(module, field.name, value)
@@ -334,7 +341,9 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
 
 
 def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
-    value = group.attrs[field.name]
+    # Files until format 12 have no `follower` of a point force.
+    has_default = field.default is not dataclasses.MISSING
+    value = group.attrs.get(field.name, np.bool_(field.default)) if has_default else group.attrs[field.name]
     if field.type is not bool:
         one_of(value, f"{path}: {field.name}", DISCRETIZATIONS)
         return value
@@ -384,49 +393,3 @@ def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...])
             f"got {dataset.dtype.name} of shape {dataset.shape}"
         )
     return dataset[()]
-
-
-def _as_jax(values: Any, path: Path) -> Array:
-    array = jnp.asarray(values)
-    if array.dtype != values.dtype:
-        raise ValueError(
-            f"{path} holds {values.dtype} numbers, which JAX would make {array.dtype}: "
-            'call jax.config.update("jax_enable_x64", True) before anything else'
-        )
-    return array
-
-
-def _write_vtk(root: h5py.Group, equilibrium: Equilibrium) -> None:
-    """VTKHDF 2.0 PolyData, as in https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/."""
-    points = equilibrium.s.shape[-1]
-    root.attrs["Version"] = (2, 0)
-    root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads no string of variable length here
-    root["NumberOfPoints"] = [points]
-    root["Points"] = np.reshape(equilibrium.nodes, (-1, 3))
-    # VTK takes the file for empty where one of the four kinds of cells is missing.
-    for kind in ("Vertices", "Lines", "Polygons", "Strips"):
-        cells = root.create_group(kind)
-        ids = np.arange(points if kind == "Lines" else 0)
-        cells["NumberOfCells"] = [min(len(ids), 1)]
-        cells["NumberOfConnectivityIds"] = [len(ids)]
-        cells["Connectivity"] = ids
-        cells["Offsets"] = [0, len(ids)] if len(ids) else [0]
-    data = point_data(equilibrium)
-    for name, values in data.items():
-        root[f"PointData/{name}"] = np.reshape(values, (-1, *values.shape[equilibrium.s.ndim :]))
-    if equilibrium.s.ndim == 2:
-        _write_steps(root.create_group("Steps"), equilibrium.s.shape[0], points, list(data))
-
-
-def _write_steps(steps: h5py.Group, count: int, points: int, names: list[str]) -> None:
-    """Where each time step begins in the arrays: the points and their data move on, the polyline stays."""
-    offsets = np.arange(count) * points
-    steps.attrs["NSteps"] = count
-    steps["Values"] = np.arange(count, dtype=float)
-    steps["PartOffsets"] = np.zeros(count, int)
-    steps["NumberOfParts"] = np.ones(count, int)
-    steps["PointOffsets"] = offsets
-    steps["CellOffsets"] = np.zeros((count, 4), int)
-    steps["ConnectivityIdOffsets"] = np.zeros((count, 4), int)
-    for name in names:
-        steps[f"PointDataOffsets/{name}"] = offsets

@@ -33,10 +33,14 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "EI2": ("N m^2", (), '"2.5e-3 N m^2"'),
     "GJ": ("N m^2", (), '"3.3e-3 N m^2"'),
     "EA": ("N", (), '"785 N"'),
+    "GA": ("N", (), '"260 N"'),
+    "GA1": ("N", (), '"260 N"'),
+    "GA2": ("N", (), '"260 N"'),
     "mass_per_length": ("kg/m", (), '"0.1 kg/m"'),
     "rest_curvature_1": ("1/m", (), '"2 1/m"'),
     "rest_curvature_2": ("1/m", (), '"0 1/m"'),
     "rest_twist": ("rad/m", (), '"0.5 rad/m"'),
+    "rest_strain": ("", (), "0.002"),
     "width": ("m", (), '"10 mm"'),
     "height": ("m", (), '"1 mm"'),
     "wires": ("", (), "7"),
@@ -51,6 +55,11 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
     "force": ("N", (3,), '"[0, 0, -0.2] N"'),
     "moment": ("N m", (3,), '"[0, 0.01, 0] N m"'),
     "couple": ("N m/m", (3,), '"[0, 0, 0.01] N m/m"'),
+    "axis": ("", (3,), "[0, 1, 0]"),
+    "offset": ("m", (3,), '"[0, 5, 0] mm"'),
+    "mass": ("kg", (), '"0.05 kg"'),
+    "translation": ("N/m", (), '"1e4 N/m"'),
+    "rotation": ("N m/rad", (), '"0.5 N m/rad"'),
     "gravity": ("m/s^2", (3,), '"[0, 0, -9.81] m/s^2"'),
     "at": ("m", (), '"0.5 m"'),
     "segments": ("", (), "50"),
@@ -59,7 +68,9 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...], str]] = {
 }
 # The same of keys that mean something else in one table, by the name of that table.
 OF_TABLES: dict[str, dict[str, tuple[str, tuple[int, ...], str]]] = {
-    "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"')},
+    "distributed_force": {"force": ("N/m", (3,), '"[0, 0, -0.2] N/m"'), "part": ("m", (2,), '"[0.2, 0.5] m"')},
+    "point_couple": {"couple": ("N m", (3,), '"[0, 0, 0.01] N m"')},
+    "distributed_couple": {"part": ("m", (2,), '"[0.2, 0.5] m"')},
     "obstacles": {
         "point": ("m", (3,), '"[0, 0, -0.1] m"'),
         "normal": ("", (3,), "[0, 0, 1]"),
@@ -107,11 +118,12 @@ LISTS: dict[str, tuple[str, tuple[int | None, ...], str]] = {
     "poisson_ratios": ("", (None,), "[0.5, 0.4]"),
     "densities": ("kg/m^3", (None,), '"[1100, 1200] kg/m^3"'),
     "points": ("m", (None, 3), '"[[0, 0, 0], [1, 0, 0], [2, 0.5, 0], [3, 1, 0]] cm"'),
+    "directions": ("", (None, 3), "[[1, 0, 0]]"),
     "jumps": ("m", (None,), '"[0.5] m"'),
     "s": ("m", (None,), '"[0, 0.5, 1] m"'),
 }
 # Keys whose vectors get the length 1.
-DIRECTIONS = ("tangent", "d2", "normal")
+DIRECTIONS = ("tangent", "d2", "normal", "axis")
 NUMBER = r"[-+]?(?:nan|inf|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?)"
 NUMBER_AND_UNIT = re.compile(rf"\s*(\[.*\]|{NUMBER})\s*(.*?)\s*", re.I | re.S)
 # A unit has names, exponents of them, signs of products and quotients, and the 1 of "1/m". Other numbers, signs and

@@ -13,7 +13,9 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 
     [start]
     support = "clamp"              # also "swivel": position, tangent; "pin": position; "free": optional force, moment
-                                   # and follower = true where these turn with the end
+                                   # and follower = true where these turn with the end; "hinge": position, frame or
+                                   # tangent and d2, axis = [0, 1, 0]; "slider": position, directions = [[1, 0, 0]],
+                                   # optionally a frame; "joint", of a harness: see `rodjax.io.harness_file`
     position = "[0, 0, 0] m"
     tangent = [1, 0, 0]            # with d2 a 3x3 frame, its columns d1, d2, t; or frame = [[0, 0, 1], [0, 1, 0], ...]
     d2 = [0, 1, 0]                 # optional: the clocking, see below
@@ -24,6 +26,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     tangent = [1, 0, 0]
     d2 = [0, 1, 0]
     spin = "0 deg"                 # optional: turns the frame of a clamp with a clocking about its own tangent
+    # translation = "1e4 N/m"      # optional, of a clamp, pin, hinge or slider: springs about the support
+    # rotation = "0.5 N m/rad"     # the same of all but a pin
     # turns = 1                    # optional: whole extra turns of the end frame, for two clamps and no path
 
     [loads]                        # optional
@@ -32,9 +36,16 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     [[loads.point_force]]          # any number of these
     at = "0.5 m"
     force = "[0, 0, -0.2] N"
+    # follower = true              # optional: where it turns with the rod
+
+    # [[loads.point_couple]]       # any number of these, too
+    # at = "0.5 m"
+    # couple = "[0, 0.01, 0] N m"
+    # follower = true
 
     # [[loads.distributed_force]]  # any number of these, too: all along the rod
     # force = "[0, 0, -0.02] N/m"
+    # part = "[0.2, 0.5] m"        # optional: the arclengths between which it acts
     # follower = true              # optional: where it turns with the rod
     # [[loads.distributed_couple]]
     # couple = "[0, 1e-5, 0] N m/m"
@@ -69,17 +80,18 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
 The keys of a rod, besides its section (optional ones in brackets; all but those of "centerline" have a length):
 
 - none: EI = "4.9e-3 N m^2", or EI1 and EI2, GJ = "3.3e-3 N m^2", EA = "785 N" [mass_per_length = "0.1 kg/m", radius,
-  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m"]
-- "circular": radius, material; "tube": outer_radius, inner_radius, material
-- "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist]
+  rest_curvature_1 = "2 1/m" and rest_curvature_2, rest_twist = "0.5 rad/m", rest_strain = 0.002; GA = "260 N", or GA1
+  and GA2: sections shear]
+- "circular": radius, material; "tube": outer_radius, inner_radius, material [shear = true: GA of the material]
+- "rectangular": width, height, material [rest_curvature_1 and rest_curvature_2, rest_twist, shear]
 - "bundle": wires = 7, wire_radius, stick = 0.2, material
 - "layered": radii = "[0, 2, 3] mm", youngs_moduli = "[1, 50] MPa", poisson_ratios or shear_moduli [densities]
 - "centerline": points = "[[0, 0, 0], [1, 0, 0], ...] m", the shape without stress, d2 = [0, 1, 0], EI, or EI1 and EI2,
-  GJ, EA [mass_per_length, radius]
+  GJ, EA [mass_per_length, radius, GA, or GA1 and GA2]
 
-material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures and
-twist, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps, EI = {
-jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, EI = { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
+material: youngs_modulus, poisson_ratio or shear_modulus [density]. Stiffnesses, mass_per_length, rest curvatures, twist
+and strain, and the radius where the section is none or "centerline", may vary along the rod: constant between jumps,
+EI = { jumps = "[0.5] m", values = "[1, 4] N m^2" }, or smooth, { s = "[0, 0.5, 1] m", values = "[1, 3, 4] N m^2" }.
 
 A clamp with a tangent alone says nothing of its clocking, the angle about that tangent. Such an end is fitted without
 torsion: its frame follows the rod, which is a swivel in energy. Where one clamp alone resists a moment about the
@@ -123,11 +135,24 @@ from rodjax.io.quantities import (
     table_list,
 )
 from rodjax.model.along import Along, Smooth, Steps
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import LEAST_ACROSS, Clamp, Clip, Free, Pin, Support, Swivel, frame
+from rodjax.model.supports import (
+    LEAST_ACROSS,
+    Clamp,
+    Clip,
+    Free,
+    Hinge,
+    Joint,
+    Pin,
+    Slider,
+    Spring,
+    Support,
+    Swivel,
+    frame,
+)
 from rodjax.solving.equilibrium import (
     MAX_SEGMENTS,
     Discretization,
@@ -142,6 +167,7 @@ MAX_STEPS = 10_000
 
 _ELASTIC = ("shear_modulus", "poisson_ratio", "density")
 _BENDING = ("EI", "EI1", "EI2")
+_SHEAR = ("GA", "GA1", "GA2")
 _REST = ("rest_curvature_1", "rest_curvature_2", "rest_twist")
 # What makes the rod, and the keys it must and may have.
 _SECTIONS = {
@@ -150,24 +176,39 @@ _SECTIONS = {
     "rectangular": (Rod.rectangular, ("length", "width", "height", "youngs_modulus"), (*_ELASTIC, *_REST)),
     "bundle": (Rod.bundle, ("length", "wires", "wire_radius", "youngs_modulus", "stick"), _ELASTIC),
     "layered": (Rod.layered, ("length", "radii", "youngs_moduli"), ("shear_moduli", "poisson_ratios", "densities")),
-    "centerline": (Rod.from_centerline, ("points", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", "d2")),
-    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, "mass_per_length", "radius", *_REST)),
+    "centerline": (
+        Rod.from_centerline,
+        ("points", "GJ", "EA"),
+        (*_BENDING, *_SHEAR, "mass_per_length", "radius", "d2"),
+    ),
+    None: (Rod, ("length", "GJ", "EA"), (*_BENDING, *_SHEAR, "mass_per_length", "radius", *_REST, "rest_strain")),
 }
+# Those whose stiffnesses follow from their material.
+_SHEARING = ("circular", "tube", "rectangular")
 # The keys that may vary along the rod, and those of the pairs that the arguments of a rod are.
-_VARYING = (*_BENDING, "GJ", "EA", "mass_per_length", "radius", *_REST)
-PAIRS = {"EI": ("EI1", "EI2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
+_VARYING = (*_BENDING, *_SHEAR, "GJ", "EA", "mass_per_length", "radius", *_REST, "rest_strain")
+PAIRS = {"EI": ("EI1", "EI2"), "GA": ("GA1", "GA2"), "rest_curvature": ("rest_curvature_1", "rest_curvature_2")}
 DISTRIBUTED = {"distributed_force": (DistributedForce, "force"), "distributed_couple": (DistributedCouple, "couple")}
+_FRAME = ("frame", "tangent", "d2", "spin")
+_SPRINGS = ("translation", "rotation")
 # The keys that a support must have, may have, and may change along a path.
 _SUPPORTS = {
-    "clamp": (("position",), ("frame", "tangent", "d2", "spin"), ("position", "tangent", "d2", "spin")),
+    "clamp": (("position",), (*_FRAME, *_SPRINGS), ("position", "tangent", "d2", "spin")),
     "swivel": (("position", "tangent"), (), ("position", "tangent")),
-    "pin": (("position",), (), ("position",)),
+    "pin": (("position",), ("translation",), ("position",)),
     "free": ((), ("force", "moment"), ("force", "moment")),
+    "hinge": (("position", "axis"), (*_FRAME, *_SPRINGS), ()),
+    "slider": (("position", "directions"), (*_FRAME, *_SPRINGS), ()),
+    "joint": ((), (*_FRAME, "offset"), ()),
 }
+# Keys of a support that are no numbers.
+_OTHER = {"free": ("support", "follower"), "joint": ("support", "joint")}
 # How the scene's own error messages begin, and the keys that they are about.
 _SCENE_KEYS = {
     "turns": "end.turns",
     "point_forces": "loads.point_force",
+    "point_couples": "loads.point_couple",
+    "distributed": "loads: distributed",
     "clips": "clips",
     "obstacles": "obstacles",
     "rod": "rod",
@@ -205,17 +246,8 @@ class SceneFile(NamedTuple):
         return {name: getattr(self, name) for name in names}
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene]:
-    """The scene in a TOML file, or the list of scenes where the file has a `[[path]]`.
-
-    Raises `SceneFileError` where the file cannot be read or says what makes no sense. See this module for the format.
-    """
-    file = read_scene_file(path)
-    return file.scenes if file.is_path else file.scenes[0]
-
-
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
-    """As `read_scene`, with the settings of the solve."""
+    """The scenes of a TOML file that is not one of a harness, with the settings of the solve."""
     path = file_path(path, "path")
     with in_file(path):
         return SceneReader().read(toml_tables(read_text(path)))
@@ -300,7 +332,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     kinds = {name: _support_kind(content[name], name) for name in ("start", "end")}
     values = {name: dict(part(_end_values, content[name], name, kind)) for name, kind in kinds.items()}
     followers = {name: kind == "free" and flag(content[name], name, "follower") for name, kind in kinds.items()}
-    loads, point_forces, distributed = part(_loads, content.get("loads", {}))
+    loads, point_forces, distributed, point_couples = part(_loads, content.get("loads", {}))
     clips = part(_clips, content.get("clips", []))
     obstacles = part(_obstacles, content.get("obstacles", []))
     values["loads"] = dict(loads)
@@ -316,6 +348,10 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
         raise SceneFileError("solve.rtol is not allowed together with solve.segments: it chooses the segments")
     turns = values["end"].pop("turns", None)
     unclocked = tuple(name for name, kind in kinds.items() if kind == "clamp" and is_unclocked(values[name]))
+    movable = next((name for name, kind in kinds.items() if kind in (*_MOVABLE, "joint")), None)
+    movable = next((name for name in kinds if any(key in values[name] for key in _SPRINGS)), movable)
+    if movable and "path" in content:
+        raise SceneFileError(f"path is not allowed where the pose of an end is unknown, as that of the {movable} is")
     changes = _changes(content["path"], kinds, values, unclocked) if "path" in content else []
     if changes and turns is not None:
         raise SceneFileError("end.turns is not allowed together with path: turn the end along the path by end.spin")
@@ -324,16 +360,18 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     if unclocked:
         spun = {name for name in kinds if "spin" in content[name]}
         along = [target for _, _, target in changes]
-        resists = Clocking(kinds, unclocked, rod, clips, distributed, values, along, followers, spun, turns).check()
+        loads_on_rod = [*point_forces, *point_couples, *distributed]
+        resists = Clocking(kinds, unclocked, rod, clips, loads_on_rod, values, along, followers, spun, turns).check()
 
     def scene(values: Values, where: str = "") -> Scene:
         gravity = None if "gravity" not in values["loads"] else part(_leaf, values["loads"]["gravity"])
         start, end = (
-            part(_support, kind, values[name], f"{where}{name}", followers[name], resists)
+            part(_support, kind, values[name], f"{where}{name}", followers[name], resists, content[name].get("joint"))
             for name, kind in kinds.items()
         )
         try:
-            return Scene(rod, start, end, gravity, point_forces, turns, distributed, clips, obstacles)
+            others = distributed, clips, obstacles, (), point_couples
+            return Scene(rod, start, end, gravity, point_forces, turns, *others)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))
             raise SceneFileError(f"{where}{_SCENE_KEYS[begin]}{str(error).removeprefix(begin)}") from None
@@ -359,7 +397,8 @@ def _leaf(reader: SceneReader, number: np.ndarray) -> Float[Array, "..."]:
 def _rod(reader: SceneReader, table: Any) -> Rod:
     section = choice(table, "rod", "section", [name for name in _SECTIONS if name])
     make, required, optional = _SECTIONS[section]
-    check_keys(table, "rod", required, (*optional, "section"))
+    may_shear = ("shear",) if section in _SHEARING else ()
+    check_keys(table, "rod", required, (*optional, *may_shear, "section"))
     if section == "centerline" and "d2" not in table:
         raise SceneFileError(
             "rod.d2 is missing: where d2 of the first frame along the centerline points, for example d2 = [0, 1, 0]"
@@ -367,10 +406,13 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
     # Not the radius from which the stiffnesses of a circular section come.
     may_vary = [key for key in _VARYING if key != "radius" or key in optional]
     varying = {key: value for key, value in table.items() if key in may_vary and isinstance(value, dict)}
-    values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=("section", *varying))
+    other = ("section", *may_shear, *varying)
+    values: dict[str, Any] = reader.si_values(table, "rod", (), (*required, *optional), other=other)
     values |= {key: reader.part(_along, key, value) for key, value in varying.items()}
+    if may_shear and flag(table, "rod", "shear"):
+        values["shear"] = True
     if "EI" in optional:
-        _check_bending(table)
+        _check_stiffnesses(table)
     for name, keys in PAIRS.items():
         pair = [values.pop(key) for key in keys if key in values]
         if len(pair) == 1:
@@ -389,11 +431,13 @@ def _rod(reader: SceneReader, table: Any) -> Rod:
             raise ValueError(_by_keys(str(error))) from None
 
 
-def _check_bending(table: dict[str, Any]) -> None:
+def _check_stiffnesses(table: dict[str, Any]) -> None:
     if not any(key in table for key in _BENDING):
         raise SceneFileError(f"rod.EI is missing, for example EI = {quantity('EI')[2]}; or rod.EI1 and rod.EI2")
     if "EI" in table and ("EI1" in table or "EI2" in table):
         raise SceneFileError("rod.EI is not allowed together with rod.EI1 and rod.EI2")
+    if "GA" in table and ("GA1" in table or "GA2" in table):
+        raise SceneFileError("rod.GA is not allowed together with rod.GA1 and rod.GA2")
 
 
 def _by_keys(message: str) -> str:
@@ -431,8 +475,9 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     required, optional, _ = _SUPPORTS[kind]
     if kind == "clamp" and where == "end":
         optional = (*optional, "turns")
-    other = ("support", "follower") if kind == "free" else ("support",)
-    values = reader.si_values(table, where, required, optional, other=other)
+    values = reader.si_values(table, where, required, optional, other=_OTHER.get(kind, ("support",)))
+    if kind in ("hinge", "slider", "joint"):
+        return _framed_values(values, table, where, kind)
     if kind == "clamp":
         if ("frame" in values) == ("tangent" in values):
             raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a clamp, exactly one of them")
@@ -451,6 +496,21 @@ def _end_values(reader: SceneReader, table: dict[str, Any], where: str, kind: st
     return values
 
 
+def _framed_values(
+    values: dict[str, np.ndarray], table: dict[str, Any], where: str, kind: str
+) -> dict[str, np.ndarray]:
+    """Of a support that holds a frame, or may hold one."""
+    if kind == "hinge" or any(key in values for key in _FRAME):
+        if ("frame" in values) == ("tangent" in values):
+            raise SceneFileError(f"{where}.tangent or {where}.frame is needed for a {kind}, exactly one of them")
+        if is_unclocked(values):
+            raise SceneFileError(f"{where}.d2 or {where}.frame is needed for a {kind}, whose clocking counts")
+        values = _frame_values(values, where)
+    if kind == "joint" and not (isinstance(table.get("joint"), str) and table["joint"]):
+        raise SceneFileError(f'{where}.joint is missing: the name of a joint, such as joint = "y"')
+    return values
+
+
 def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
     """With the spin of a frame, or of the tangent and d2 that make one."""
     if "frame" in values and "d2" in values:
@@ -462,21 +522,28 @@ def _frame_values(values: dict[str, np.ndarray], where: str) -> dict[str, np.nda
 
 def _loads(
     reader: SceneReader, table: Any
-) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple]]:
-    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", *DISTRIBUTED))
-    forces = []
-    for k, force in enumerate(table_list(table.get("point_force", []), "loads.point_force")):
-        where = f"loads.point_force[{k}]"
-        with named(where):
-            forces.append(PointForce(**reader.si_values(force, where, ("at", "force"), ())))
+) -> tuple[dict[str, np.ndarray], list[PointForce], list[DistributedForce | DistributedCouple], list[PointCouple]]:
+    values = reader.si_values(table, "loads", (), ("gravity",), other=("point_force", "point_couple", *DISTRIBUTED))
+
+    def at_points(make: Callable[..., Any], name: str, key: str) -> list[Any]:
+        found = []
+        for k, load in enumerate(table_list(table.get(name, []), f"loads.{name}")):
+            where = f"loads.{name}[{k}]"
+            with named(where):
+                numbers = reader.si_values(load, where, ("at", key), (), other=("follower",))
+                found.append(make(**numbers, follower=flag(load, where, "follower")))
+        return found
+
+    forces = at_points(PointForce, "point_force", "force")
     distributed = []
     for name in (name for name in table if name in DISTRIBUTED):
         make, key = DISTRIBUTED[name]
         for k, load in enumerate(table_list(table[name], f"loads.{name}")):
             where = f"loads.{name}[{k}]"
-            numbers = reader.si_values(load, where, (key,), (), other=("follower",))
-            distributed.append(make(numbers[key], flag(load, where, "follower")))
-    return values, forces, distributed
+            numbers = reader.si_values(load, where, (key,), ("part",), other=("follower",))
+            with named(where):
+                distributed.append(make(numbers[key], flag(load, where, "follower"), numbers.get("part")))
+    return values, forces, distributed, at_points(PointCouple, "point_couple", "couple")
 
 
 def _clips(reader: SceneReader, tables: Any) -> list[Clip]:
@@ -513,8 +580,7 @@ def _clip_direction(reader: SceneReader, values: dict[str, np.ndarray], where: s
         raise SceneFileError(
             f"{where}.spin must lie in -180 deg to 180 deg, got {math.degrees(float(values['spin'])):g} deg"
         )
-    placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-    return {"frame": _spun(placed, values["spin"])}
+    return {"frame": _placed(reader, values)}
 
 
 def _changes(
@@ -549,20 +615,57 @@ def _changes(
 
 
 def _support(
-    reader: SceneReader, kind: str, values: dict[str, np.ndarray], where: str, follower: bool, resists: bool
+    reader: SceneReader,
+    kind: str,
+    values: dict[str, np.ndarray],
+    where: str,
+    follower: bool = False,
+    resists: bool = False,
+    joint: str | None = None,
 ) -> Support:
+    springs = {key: values[key] for key in _SPRINGS if key in values}
+    if springs:
+        if kind == "clamp" and is_unclocked(values):
+            raise SceneFileError(f"{where}.d2 or {where}.frame is needed for a clamp with springs")
+        rigid = {key: value for key, value in values.items() if key not in springs}
+        with named(where):
+            return Spring(_support(reader, kind, rigid, where), **springs)
     with named(where):
+        if kind in ("hinge", "slider", "joint"):
+            numbers = {key: value for key, value in values.items() if key not in _FRAME}
+            if "spin" in values:
+                numbers["frame"] = _placed(reader, values)
+            return Joint(joint or "", **numbers) if kind == "joint" else _MOVABLE[kind](**numbers)
         if kind == "clamp" and is_unclocked(values):
             if resists:  # any clocking gives the same
                 across = np.eye(3)[np.argmin(np.abs(values["tangent"]))]
                 return Clamp(values["position"], reader.part(_frame, values["tangent"], across))
             return with_direction(Swivel(values["position"], values["tangent"]), "tangent", values)
         if kind == "clamp":
-            placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
-            return Clamp(values["position"], _spun(placed, values["spin"]))
+            return Clamp(values["position"], _placed(reader, values))
         if kind == "swivel":
             return with_direction(Swivel(**values), "tangent", values)
         return Pin(**values) if kind == "pin" else Free(**values, follower=follower)
+
+
+def body_support(reader: SceneReader, table: dict[str, Any], where: str) -> Support:
+    """The support of a body of a harness, of the keys that an end has."""
+    kind = choice(table, where, "support", ["clamp", "pin", "hinge", "slider"])
+    if kind is None:
+        raise SceneFileError(f"{where}.support is missing; allowed are clamp, pin, hinge, slider")
+    values = _end_values(reader, table, where, kind)
+    if kind == "clamp" and is_unclocked(values):
+        raise SceneFileError(f"{where}.d2 or {where}.frame is needed for the clamp of a joint")
+    return _support(reader, kind, values, where)
+
+
+_MOVABLE = {"hinge": Hinge, "slider": Slider}
+
+
+def _placed(reader: SceneReader, values: dict[str, np.ndarray]) -> Any:
+    """The frame that a table states."""
+    placed = values["frame"] if "frame" in values else reader.part(_frame, values["tangent"], values["d2"])
+    return _spun(placed, values["spin"])
 
 
 def _frame(reader: SceneReader, tangent: np.ndarray, d2: np.ndarray) -> Float[Numbers, "3 3"]:

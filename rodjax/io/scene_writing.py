@@ -14,7 +14,7 @@ from rodjax.io.scene_file import DISTRIBUTED, PAIRS
 from rodjax.model.along import Along, Steps
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp
+from rodjax.model.supports import Clamp, Movable
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 
 
@@ -49,6 +49,10 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
             "scene.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
             "its rest_centerline; save writes them with a result"
         )
+    for name in ("start", "end"):
+        if isinstance(getattr(scene, name), Movable):
+            kind = type(getattr(scene, name)).__name__
+            raise ValueError(f"scene.{name} must be a Clamp, Swivel, Pin or Free to be written, got a {kind}")
     lines = ["[rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']
@@ -58,12 +62,15 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
     if scene.gravity is not None:
         lines += ["", "[loads]", *_written(scene, ("gravity",))]
     for force in scene.point_forces:
-        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force"))]
+        lines += ["", "[[loads.point_force]]", *_written(force, ("at", "force")), *_written_follower(force)]
+    for couple in scene.point_couples:
+        where = "point_couple"
+        lines += ["", f"[[loads.{where}]]", *_written(couple, ("at", "couple"), where), *_written_follower(couple)]
     for kind in dict.fromkeys(type(load) for load in scene.distributed):
         name, key = next((name, key) for name, (of_name, key) in DISTRIBUTED.items() if of_name is kind)
         for load in scene.distributed:
             if isinstance(load, kind):
-                lines += ["", f"[[loads.{name}]]", *_written(load, (key,), name), *_written_follower(load)]
+                lines += ["", f"[[loads.{name}]]", *_written(load, (key, "part"), name), *_written_follower(load)]
     for clip in scene.clips:
         lines += ["", "[[clips]]", *_written(clip, ("at", "position", "tangent", "frame"))]
         lines += ["sliding = true"] if clip.sliding else []
@@ -82,7 +89,7 @@ def _written(module: eqx.Module, keys: Sequence[str], where: str = "") -> list[s
 
 def _written_rod(rod: Rod) -> list[str]:
     lines = _written(rod, ("length",))
-    for name in ("radius", "EI", "GJ", "EA", "mass_per_length", "rest_curvature", "rest_twist"):
+    for name in ("radius", "EI", "GJ", "EA", "GA", "mass_per_length", "rest_curvature", "rest_twist", "rest_strain"):
         value = getattr(rod, name)
         values = zip(PAIRS[name], value, strict=True) if isinstance(value, tuple) else [(name, value)]
         lines += [_written_value(key, value) for key, value in values if value is not None]

@@ -79,7 +79,8 @@ def dead_load_energy(force: Float[Array, "3"], position: Float[Array, "3"]) -> F
 class Sections(eqx.Module):
     """What resists at k places along a rod that is not the same everywhere, or has a law of its own.
 
-    `EI`: of the components of t x t' along d1 and d2; `s`: arclengths.
+    `EI`: of the components of t x t' along d1 and d2; `s`: arclengths; `GA`: of the shear strains along d1 and d2,
+    `None` where sections do not shear; `rest_axial`: the axial strains without stress, `None` where these are none.
     """
 
     EI: Float[Array, "2 *k"]
@@ -87,15 +88,30 @@ class Sections(eqx.Module):
     EA: Float[Array, "*k"]
     s: Float[Array, "*k"]
     law: Law | None
+    GA: Float[Array, "2 *k"] | None = None
+    rest_axial: Float[Array, "*k"] | None = None
 
     def at(self, k: int) -> "Sections":
         """At the strain point k of every cell."""
-        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law)
+        GA = None if self.GA is None else self.GA[:, k]
+        rest_axial = None if self.rest_axial is None else self.rest_axial[k]
+        return Sections(self.EI[:, k], self.GJ[k], self.EA[k], self.s[k], self.law, GA, rest_axial)
 
     def density(
-        self, curvature: tuple[Array, Array], twist: Float[Array, "*k"], axial_strain: Float[Array, "*k"]
+        self,
+        curvature: tuple[Array, Array],
+        twist: Float[Array, "*k"],
+        axial_strain: Float[Array, "*k"],
+        shear: Float[Array, "2 *k"] | None = None,
     ) -> Float[Array, "*k"]:
-        """Energy [J/m] by what the strains exceed those of the stress-free shape by."""
+        """Energy [J/m] by what the strains exceed those of the stress-free shape by.
+
+        `shear`: the components of phi' along d1 and d2, which add GA1/2 gamma1^2 + GA2/2 gamma2^2; `None` for none.
+        """
+        if shear is not None:
+            assert self.GA is not None
+            of_shear = (self.GA[0] * shear[0] ** 2 + self.GA[1] * shear[1] ** 2) / 2
+            return self.density(curvature, twist, axial_strain) + of_shear
         if self.law is not None:
             law = self.law
             for _ in self.s.shape:
@@ -104,10 +120,19 @@ class Sections(eqx.Module):
         bending = (self.EI[0] * curvature[0] ** 2 + self.EI[1] * curvature[1] ** 2) / 2
         return bending + self.GJ / 2 * twist**2 + self.EA / 2 * axial_strain**2
 
+    def stretched(self, axial_strain: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """All of the axial strain, of what it exceeds that without stress by."""
+        return axial_strain if self.rest_axial is None else axial_strain + self.rest_axial
+
+    def shear_under(self, force: Float[Array, "2 *k"]) -> Float[Array, "2 *k"]:
+        """The shear strains at which their forces dw/d(gamma) along d1 and d2 are the given ones [N]."""
+        assert self.GA is not None
+        return force / self.GA
+
     def axial_strain_under(
         self, tension: Float[Array, "*k"], curvature: tuple[Array, Array], twist: Float[Array, "*k"]
     ) -> Float[Array, "*k"]:
-        """The axial strain at which the tension dw/d(axial strain) is the given one [N].
+        """What the axial strain exceeds that at rest by where the tension dw/d(axial strain) is the given one [N].
 
         By Newton's method where there is a law; the derivatives of the last step are those of the solution as far as
         they enter derivatives of the energy (to the third).
@@ -131,7 +156,7 @@ class Sections(eqx.Module):
     def strains_under(
         self, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
     ) -> tuple[Float[Array, "3 *k"], Float[Array, "*k"]]:
-        """What the strains exceed those at rest by, under a moment in material axes, and the axial strain."""
+        """What the strains exceed those at rest by, under a moment in material axes, and the axial strain likewise."""
         strains = moment / jnp.concatenate([self.EI, self.GJ[None]])
         if self.law is None:
             return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])

@@ -7,62 +7,124 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, leaf, not_negative, shown, vector
+from rodjax.checks import instance, is_known, leaf, not_negative, number_array, shown, vector
 from rodjax.units import Units
 
 
 class PointForce(eqx.Module):
-    """A dead force at an arclength. `at`: arclength s [m]; `force`: (3,) [N], global axes."""
+    """A force at an arclength. `at`: arclength s [m]; `force`: (3,) [N], a dead one along global axes; or, where
+    `follower` is True, along the material frame (d1, d2, t) of the section, which has no potential: inside the rod, as
+    on an end it is one of `Free`.
+    """
 
     at: Float[Array, ""]
     force: Float[Array, "3"]
+    follower: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, at: Any, force: Any):
+    def __init__(self, at: Any, force: Any, follower: bool = False):
         self.at = leaf(not_negative(at, "at"))
-        self.force = leaf(vector(force, "force"))
-
-    def in_units(self, units: Units) -> "PointForce":
-        """The same force in the units of the rod: see `rodjax.model.scene.nondimensional`."""
-        return PointForce(self.at / units.length, self.force / units.force)
-
-
-class DistributedForce(eqx.Module):
-    """A force per length all along the rod: (3,) [N/m].
-
-    `force`: along global axes; or, where `follower` is True, along the material frame (d1, d2, t) of each section, as
-    of a pressure or a flow, which has no potential.
-    """
-
-    force: Float[Array, "3"]
-    follower: bool = eqx.field(static=True)
-
-    def __init__(self, force: Any, follower: bool = False):
         self.force = leaf(vector(force, "force"))
         instance(follower, "follower", bool)
         self.follower = follower
 
-    def in_units(self, units: Units) -> "DistributedForce":
-        return DistributedForce(self.force * (units.length / units.force), self.follower)
+    def in_units(self, units: Units) -> "PointForce":
+        """The same force in the units of the rod: see `rodjax.model.scene.nondimensional`."""
+        return PointForce(self.at / units.length, self.force / units.force, self.follower)
 
 
-class DistributedCouple(eqx.Module):
-    """A couple per length all along the rod: (3,) [N m/m]; it has no potential.
-
-    `couple`: along global axes, or, where `follower` is True, along the material frame (d1, d2, t) of each section.
+class PointCouple(eqx.Module):
+    """A couple at an arclength inside the rod; it has no potential. `at`: arclength s [m]; `couple`: (3,) [N m], along
+    global axes, or, where `follower` is True, along the material frame (d1, d2, t) of the section.
     """
 
+    at: Float[Array, ""]
     couple: Float[Array, "3"]
     follower: bool = eqx.field(static=True)
 
-    def __init__(self, couple: Any, follower: bool = False):
+    def __init__(self, at: Any, couple: Any, follower: bool = False):
+        self.at = leaf(not_negative(at, "at"))
         self.couple = leaf(vector(couple, "couple"))
         instance(follower, "follower", bool)
         self.follower = follower
 
+    def in_units(self, units: Units) -> "PointCouple":
+        return PointCouple(self.at / units.length, self.couple / units.energy, self.follower)
+
+
+class DistributedForce(eqx.Module):
+    """A force per length along the rod: (3,) [N/m].
+
+    `force`: along global axes; or, where `follower` is True, along the material frame (d1, d2, t) of each section, as
+    of a pressure or a flow, which has no potential. `part`: (2,) [m], the arclengths between which it acts, where
+    meshes of elements have nodes as at jumps of `Steps`; `None` for all along the rod.
+    """
+
+    force: Float[Array, "3"]
+    part: Float[Array, "2"] | None
+    follower: bool = eqx.field(static=True)
+
+    def __init__(self, force: Any, follower: bool = False, part: Any = None):
+        self.force = leaf(vector(force, "force"))
+        instance(follower, "follower", bool)
+        self.follower = follower
+        self.part = _part(part)
+
+    def in_units(self, units: Units) -> "DistributedForce":
+        part = None if self.part is None else self.part / units.length
+        return DistributedForce(self.force * (units.length / units.force), self.follower, part)
+
+
+class DistributedCouple(eqx.Module):
+    """A couple per length along the rod: (3,) [N m/m]; it has no potential.
+
+    `couple`: along global axes, or, where `follower` is True, along the material frame (d1, d2, t) of each section.
+    `part`: as of a `DistributedForce`.
+    """
+
+    couple: Float[Array, "3"]
+    part: Float[Array, "2"] | None
+    follower: bool = eqx.field(static=True)
+
+    def __init__(self, couple: Any, follower: bool = False, part: Any = None):
+        self.couple = leaf(vector(couple, "couple"))
+        instance(follower, "follower", bool)
+        self.follower = follower
+        self.part = _part(part)
+
     def in_units(self, units: Units) -> "DistributedCouple":
-        return DistributedCouple(self.couple * (units.length / units.energy), self.follower)
+        part = None if self.part is None else self.part / units.length
+        return DistributedCouple(self.couple * (units.length / units.energy), self.follower, part)
+
+
+def _part(part: Any) -> Float[Array, "2"] | None:
+    if part is None:
+        return None
+    part = leaf(number_array(part, "part", (2,)))
+    if is_known(part) and not 0 <= float(part[0]) < float(part[1]):
+        raise ValueError(f"part must be two arclengths from 0 m on that increase, got {np.asarray(part).tolist()}")
+    return part
+
+
+def loaded_length(load: DistributedForce | DistributedCouple, length: Float[Array, ""]) -> Float[Array, ""]:
+    """Of a rod of this length."""
+    return length if load.part is None else load.part[1] - load.part[0]
+
+
+def length_before(load: DistributedForce | DistributedCouple, s: Float[Array, "*k"]) -> Float[Array, "*k"]:
+    """How much of the loaded length lies before arclengths."""
+    return s if load.part is None else jnp.clip(s - load.part[0], 0.0, load.part[1] - load.part[0])
+
+
+def per_length(load: DistributedForce | DistributedCouple, s: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
+    """The load at arclengths, which are none of those where its part ends."""
+    value = load.couple if isinstance(load, DistributedCouple) else load.force
+    value = jnp.broadcast_to(value.reshape(3, *[1] * s.ndim), (3, *s.shape))
+    if load.part is None:
+        return value
+    return jnp.where(((s > load.part[0]) & (s < load.part[1]))[None], value, 0.0)
 
 
 class Potential(eqx.Module):

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import is_known
 from rodjax.model.along import Along
 from rodjax.model.loads import DistributedForce
-from rodjax.model.scene import Scene, dead_end_moment
+from rodjax.model.scene import Scene, dead_end_moment, dead_forces
 from rodjax.model.supports import Clamp, Clip, Directed, Free, Held
 from rodjax.programs.compilation import compiled
 
@@ -111,7 +111,7 @@ def _directions(scene: Scene) -> Float[Array, "k 3"]:
     vectors += [place - places[0] for place in places[1:]]
     if scene.gravity is not None:
         vectors.append(scene.gravity)
-    vectors += [load.force for load in scene.point_forces]
+    vectors += [load.force for load in dead_forces(scene)]
     vectors += [load.force for load in scene.distributed if isinstance(load, DistributedForce) and not load.follower]
     ends = [end for end in (scene.start, scene.end) if isinstance(end, Free) and not end.follower]
     vectors += [end.force for end in ends if end.force is not None]

@@ -31,16 +31,20 @@ class Poses(eqx.Module):
 
 
 class RestStrain(eqx.Module):
-    """Components k1, k2 of t x t' along d1, d2 [1/m] and twist [rad/m], each a number or `Along`; `None` for none."""
+    """Components k1, k2 of t x t' along d1, d2 [1/m], twist [rad/m] and axial strain, each a number or `Along`; `None`
+    for none.
+    """
 
     curvature: Pair | None
     twist: Value | None
+    axial: Value | None
 
     def scaled(self, length: Float[Array, ""]) -> "RestStrain":
         curvature = self.curvature
         if curvature is not None:
             curvature = (scaled(curvature[0], length, 1 / length), scaled(curvature[1], length, 1 / length))
-        return RestStrain(curvature, None if self.twist is None else scaled(self.twist, length, 1 / length))
+        twist = None if self.twist is None else scaled(self.twist, length, 1 / length)
+        return RestStrain(curvature, twist, None if self.axial is None else scaled(self.axial, length, length / length))
 
     def at(self, s: Float[Array, "*k"], a: Float[Array, "*k"], b: Float[Array, "*k"]) -> Float[Array, "3 *k"]:
         """At arclengths that each lie from a to b."""
@@ -59,7 +63,11 @@ class RestStrain(eqx.Module):
         along = jnp.array([0.0, 0.0, 1.0], s.dtype)[:, None, None]
         turn = steps[None] * (first + second) / 2 + by_turn[None] * cross(first, second)
         along = jnp.broadcast_to(along, first.shape)
-        way = steps[None] * along + by_turn[None] * cross(first - second, along)
+        if self.axial is None:
+            way = steps[None] * along + by_turn[None] * cross(first - second, along)
+        else:
+            ahead, further = ((1 + value_at(self.axial, begins + part * steps, a, b))[None] * along for part in GAUSS)
+            way = steps[None] * (ahead + further) / 2 + by_turn[None] * (cross(first, further) - cross(second, ahead))
         q, ways = screw(turn.reshape(3, -1), way.reshape(3, -1))
 
         def onward(carry, step):
@@ -189,7 +197,7 @@ def _size(vectors: Float[Array, "3 *k"]) -> Float[Array, "*k"]:
 
 
 def ends(
-    rest: RestShape | None, length: Float[Array, ""], position: Any, frame: Any
+    rest: RestShape, length: Float[Array, ""], position: Any, frame: Any
 ) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], tuple[Float[Array, "3"], Float[Array, "3 3"]]]:
     """Position and frame of both ends of a rod of this rest shape, from those of the start."""
     is_curve = isinstance(rest, SpaceCurve)
@@ -197,8 +205,7 @@ def ends(
     if isinstance(rest, SpaceCurve):
         poses = rest.world(parts)
     else:
-        straight = RestStrain(None, None) if rest is None else rest
-        poses = straight.poses(_with_jumps(straight, parts * length))
+        poses = rest.poses(_with_jumps(rest, parts * length))
     if position is None and frame is None and is_curve:
         q = poses.quaternions
         return tuple((poses.positions[:, k], columns(q[:, k])) for k in (0, -1))  # pyright: ignore[reportReturnType]
@@ -212,6 +219,6 @@ def ends(
 
 def _with_jumps(rest: RestStrain, s: Float[Array, "k"]) -> Float[Array, "m"]:
     """These arclengths, and those at which the strain jumps."""
-    values = (*(rest.curvature or ()), rest.twist)
+    values = (*(rest.curvature or ()), rest.twist, rest.axial)
     jumps = [value.jumps for value in values if isinstance(value, Steps)]
     return jnp.sort(jnp.concatenate([s, *jumps]))

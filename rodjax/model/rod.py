@@ -26,6 +26,7 @@ from rodjax.checks import (
 )
 from rodjax.model.along import Along, Pair, Smooth, Steps, Value, scaled
 from rodjax.model.rest import RestShape, RestStrain, SpaceCurve, ends
+from rodjax.model.summaries import rod_text
 from rodjax.units import Units
 
 # Of St-Venant's series, which falls like k^-5: 13 digits.
@@ -61,7 +62,7 @@ class ScaledLaw(Law):
 
 
 class Rod(eqx.Module):
-    """An extensible Kirchhoff rod.
+    """An extensible Kirchhoff rod; with `GA` the rod of Simo and Reissner, whose sections shear too.
 
     **Arguments:**
 
@@ -75,10 +76,16 @@ class Rod(eqx.Module):
         for a straight one. Not a first guess.
     - `rest_twist` [rad/m] in the shape without stress; `None` for none.
     - `law`: a density of energy of one's own, in place of the quadratic one. The stiffnesses above are then its scale.
+    - `GA`: shear stiffness [N], shear factor included; or a pair (GA1, GA2) for the components of phi' along d1 and d2,
+        whose energy GA1/2 gamma1^2 + GA2/2 gamma2^2 is added to any law. The frames (d1, d2, d3) are then those of the
+        sections, as is what clamps and tangents of supports hold: the centerline leaves d3 by the shear. `None`:
+        sections do not shear.
+    - `rest_strain`: the axial strain |phi'| - 1 without stress, above -1: of a heated part its expansion times the rise
+        of temperature, of a shrunk part negative; `None` for none. Rest curvature and twist stay per length s.
 
     Stiffnesses, mass, radius and components of the rest shape may be `Along`: `rodjax.Steps` or `rodjax.Smooth`. A rod
-    with one EI, nothing but its radius that varies, no rest shape and no law of its own needs no angle about its
-    tangent, and is solved faster.
+    with one EI, nothing but its radius that varies, no rest shape or strain, no shear and no law of its own needs no
+    angle about its tangent, and is solved faster.
 
     Raises `ValueError` or `TypeError` where a stiffness or the length is not a positive finite number.
     """
@@ -93,6 +100,8 @@ class Rod(eqx.Module):
     rest_twist: Value | None
     rest_centerline: SpaceCurve | None
     law: Law | None
+    GA: Value | Pair | None
+    rest_strain: Value | None
 
     def __init__(
         self,
@@ -106,6 +115,8 @@ class Rod(eqx.Module):
         rest_twist: Any = None,
         *,
         law: Law | None = None,
+        GA: Any = None,
+        rest_strain: Any = None,
     ):
         self.length = leaf(positive(length, "length"))
         self.EI = _pair(EI, "EI", positive) if _is_pair(EI) else _value(EI, "EI", positive)
@@ -119,7 +130,12 @@ class Rod(eqx.Module):
         self.rest_twist = None if rest_twist is None else _value(rest_twist, "rest_twist", number_array)
         self.rest_centerline = None
         self.law = None if law is None else _law(law)
+        self.GA = None if GA is None else _pair(GA, "GA", positive) if _is_pair(GA) else _value(GA, "GA", positive)
+        self.rest_strain = None if rest_strain is None else _value(rest_strain, "rest_strain", _above_minus_one)
         _check_arclengths(self)
+
+    def __str__(self) -> str:
+        return rod_text(self)
 
     @property
     def is_plain(self) -> bool:
@@ -134,6 +150,8 @@ class Rod(eqx.Module):
             and self.rest_twist is None
             and self.rest_centerline is None
             and self.law is None
+            and self.GA is None
+            and self.rest_strain is None
         )
 
     @property
@@ -146,12 +164,23 @@ class Rod(eqx.Module):
         return (*self.bending_pair, self.GJ, self.EA)
 
     @property
+    def shear_pair(self) -> tuple[Value, Value] | None:
+        """Against shear along d1 and d2; `None` where sections do not shear."""
+        return self.GA if self.GA is None or isinstance(self.GA, tuple) else (self.GA, self.GA)
+
+    @property
     def rest_shape(self) -> RestShape | None:
         if self.rest_centerline is not None:
             return self.rest_centerline
         if self.rest_curvature is None and self.rest_twist is None:
             return None
-        return RestStrain(self.rest_curvature, self.rest_twist)
+        return RestStrain(self.rest_curvature, self.rest_twist, self.rest_strain)
+
+    @property
+    def stress_free(self) -> RestShape:
+        """The rest shape, or the straight rod where there is none."""
+        shape = self.rest_shape
+        return RestStrain(None, None, self.rest_strain) if shape is None else shape
 
     @property
     def bending_scale(self) -> Float[Array, ""]:
@@ -178,7 +207,7 @@ class Rod(eqx.Module):
         EI = tuple(scaled(value, L, bending) for value in self.bending_pair)
         mass = self.mass_per_length
         rest = self.rest_shape
-        strain = rest.scaled(L) if isinstance(rest, RestStrain) else RestStrain(None, None)
+        strain = rest.scaled(L) if isinstance(rest, RestStrain) else RestStrain(None, None, None)
         scaled_rod = Rod(
             one,
             EI,
@@ -189,6 +218,8 @@ class Rod(eqx.Module):
             strain.curvature,
             strain.twist,
             law=None if self.law is None else ScaledLaw(self.law, L, units.energy),
+            GA=None if self.shear_pair is None else tuple(scaled(value, L, units.force) for value in self.shear_pair),
+            rest_strain=None if self.rest_strain is None else scaled(self.rest_strain, L, one),
         )
         return _shaped(scaled_rod, rest.scaled(L)) if isinstance(rest, SpaceCurve) else scaled_rod
 
@@ -204,6 +235,7 @@ class Rod(eqx.Module):
         d2: Any = DEFAULT_D2,
         frames: Any = None,
         law: Law | None = None,
+        GA: Any = None,
     ) -> "Rod":
         """A rod that has the shape of a curve when it is free of stress; its length is that of the curve.
 
@@ -215,7 +247,7 @@ class Rod(eqx.Module):
         `Rod.rest_ends` gives position and frame of its ends, for the supports that leave it free of stress.
         """
         curve, length = SpaceCurve.through(points, d2, frames)
-        return _shaped(Rod(length, EI, GJ, EA, mass_per_length, radius, law=law), curve)
+        return _shaped(Rod(length, EI, GJ, EA, mass_per_length, radius, law=law, GA=GA), curve)
 
     def rest_ends(
         self, position: Any = None, frame: Any = None
@@ -225,7 +257,7 @@ class Rod(eqx.Module):
         `position`, `frame`: of the start; `None` for where `from_centerline` was given the points, else for the origin
         and the global axes.
         """
-        return ends(self.rest_shape, self.length, position, frame)
+        return ends(self.stress_free, self.length, position, frame)
 
     @staticmethod
     def circular(
@@ -235,14 +267,17 @@ class Rod(eqx.Module):
         shear_modulus: Any = None,
         poisson_ratio: Any = None,
         density: Any = 0.0,
+        shear: bool = False,
     ) -> "Rod":
         """A rod of solid circular section: EI = E pi R^4/4, GJ = G pi R^4/2, EA = E pi R^2.
 
         `length` and `radius` [m], `youngs_modulus` [Pa], `density` [kg/m^3], and exactly one of `shear_modulus` [Pa]
-        and `poisson_ratio`.
+        and `poisson_ratio`. `shear`: whether sections shear, GA = k G pi R^2 with the factor k = 6 (1 + nu)/(7 + 6 nu),
+        nu = E/(2 G) - 1, of Cowper, J. Appl. Mech. 33 (1966) 335.
         """
         radius = positive(radius, "radius")
-        return _round_section(length, radius, 0.0 * radius, youngs_modulus, shear_modulus, poisson_ratio, density)
+        section = radius, 0.0 * radius, youngs_modulus, shear_modulus, poisson_ratio, density
+        return _round_section(length, *section, shear=shear)
 
     @staticmethod
     def tube(
@@ -253,11 +288,16 @@ class Rod(eqx.Module):
         shear_modulus: Any = None,
         poisson_ratio: Any = None,
         density: Any = 0.0,
+        shear: bool = False,
     ) -> "Rod":
-        """A rod of annular section, a hose or pipe; arguments as for `Rod.circular`, radii [m]."""
+        """A rod of annular section, a hose or pipe; arguments as for `Rod.circular`, radii [m], shear factor likewise:
+
+        k = 6 (1 + nu) (1 + m^2)^2 / ((7 + 6 nu) (1 + m^2)^2 + (20 + 12 nu) m^2), m = inner_radius/outer_radius.
+        """
         outer = positive(outer_radius, "outer_radius")
         inner = positive(inner_radius, "inner_radius")
-        return _round_section(length, outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density)
+        section = outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density
+        return _round_section(length, *section, shear=shear)
 
     @staticmethod
     def layered(
@@ -307,11 +347,14 @@ class Rod(eqx.Module):
         density: Any = 0.0,
         rest_curvature: Any = None,
         rest_twist: Any = None,
+        shear: bool = False,
     ) -> "Rod":
         """A ribbon or strip: `width` [m] along d1, `height` [m] along d2; other arguments as for `Rod.circular`.
 
         EI1 = E width height^3/12 resists the bending that turns the section about d1. GJ by the series of St-Venant.
+        Cowper's factor of the shear is 10 (1 + nu)/(12 + 11 nu), along d1 and d2 alike.
         """
+        instance(shear, "shear", bool)
         width, height = positive(width, "width"), positive(height, "height")
         E = positive(youngs_modulus, "youngs_modulus")
         G = _shear_modulus(E, shear_modulus, poisson_ratio)
@@ -326,6 +369,7 @@ class Rod(eqx.Module):
             density * area,
             rest_curvature=rest_curvature,
             rest_twist=rest_twist,
+            GA=10 * E / (2 * G + 11 * E) * G * area if shear else None,
         )
 
     @staticmethod
@@ -377,9 +421,19 @@ def _round_section(
     shear_modulus: Any,
     poisson_ratio: Any,
     density: Any,
+    *,
+    shear: bool,
 ) -> Rod:
+    instance(shear, "shear", bool)
     EI, GJ, EA, mass = _ring(outer, inner, youngs_modulus, shear_modulus, poisson_ratio, density)
-    return Rod(length, EI, GJ, EA, mass_per_length=mass, radius=outer)
+    GA = None
+    if shear:
+        # Cowper's factor with 1 + nu = E/(2 G), times G A = G EA/E.
+        E = positive(youngs_modulus, "youngs_modulus")
+        G, m = _shear_modulus(E, shear_modulus, poisson_ratio), (inner / outer) ** 2
+        ring = (1 + m) ** 2
+        GA = 3 * G * EA * ring / ((G + 3 * E) * ring + (8 * G + 6 * E) * m)
+    return Rod(length, EI, GJ, EA, mass_per_length=mass, radius=outer, GA=GA)
 
 
 def _ring(
@@ -442,6 +496,13 @@ def _shaped(rod: Rod, curve: SpaceCurve) -> Rod:
     return eqx.tree_at(lambda rod: rod.rest_centerline, rod, curve, is_leaf=lambda value: value is None)
 
 
+def _above_minus_one(value: Any, name: str) -> Float[Numbers, ""]:
+    number = number_array(value, name)
+    if is_known(number) and not float(number) > -1:
+        raise ValueError(f"{name} must be above -1, where nothing of the rod is left, got {float(number):g}")
+    return number
+
+
 def _law(law: Any) -> Law:
     """A law with arrays for its numbers, which gives a number."""
     instance(law, "law", Law)
@@ -487,7 +548,7 @@ def _check_arclengths(rod: Rod) -> None:
     if not is_known(rod):
         return
     length = float(rod.length)
-    for field in ("EI", "GJ", "EA", "mass_per_length", "radius", "rest_curvature", "rest_twist"):
+    for field in ("EI", "GJ", "EA", "GA", "mass_per_length", "radius", "rest_curvature", "rest_twist", "rest_strain"):
         values = getattr(rod, field)
         named = {field: values}
         if isinstance(values, tuple):

@@ -12,10 +12,11 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointForce, Potential, check_potential
+from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential, check_potential
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
-from rodjax.model.supports import Clamp, Clip, Free, Held, Pin, Support, Swivel
+from rodjax.model.summaries import scene_text
+from rodjax.model.supports import Clamp, Clip, Free, Held, Movable, Pin, Support, Swivel
 from rodjax.units import Units
 
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
@@ -33,7 +34,8 @@ class Scene(eqx.Module):
     **Arguments:**
 
     - `rod`: `Rod`.
-    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`.
+    - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`; `Hinge`, `Slider` or `Spring`,
+        whose pose `rodjax.solve` finds; `Joint` in a scene of a `Harness`.
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an
@@ -41,7 +43,7 @@ class Scene(eqx.Module):
         whose frames turn by less than pi to those of this scene, so that turns are carried along a path; else the total
         twist nearest to that of the initial shape. Two clamps only, and no clip with a frame between them: there an
         earlier equilibrium as a guess carries the turns of each span.
-    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod.
+    - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod, or along a part of it.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
         it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding. Of a mesh
@@ -52,6 +54,7 @@ class Scene(eqx.Module):
         touches the rod they only cost time: to see how far it is from what it stays away from, `rodjax.clearance` needs
         none in the scene. Double precision only.
     - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
+    - `point_couples`: `PointCouple`s along the rod.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
@@ -68,6 +71,7 @@ class Scene(eqx.Module):
     clips: tuple[Clip, ...]
     obstacles: tuple[Obstacle, ...]
     potentials: tuple[Potential, ...]
+    point_couples: tuple[PointCouple, ...]
 
     def __init__(
         self,
@@ -81,6 +85,7 @@ class Scene(eqx.Module):
         clips: Sequence[Clip] = (),
         obstacles: Sequence[Obstacle] = (),
         potentials: Sequence[Potential] = (),
+        point_couples: Sequence[PointCouple] = (),
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -100,15 +105,21 @@ class Scene(eqx.Module):
         potentials = sequence(potentials, "potentials", "Potential")
         for k, potential in enumerate(potentials):
             instance(potential, f"potentials[{k}]", Potential)
-        along = (distributed, clips, obstacles, potentials)
+        point_couples = sequence(point_couples, "point_couples", "PointCouple")
+        for k, couple in enumerate(point_couples):
+            instance(couple, f"point_couples[{k}]", PointCouple)
+        along = (distributed, clips, obstacles, potentials, point_couples)
         parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, *along))
         self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
-        self.distributed, self.clips, self.obstacles, self.potentials = rest
+        self.distributed, self.clips, self.obstacles, self.potentials, self.point_couples = rest
         for k, potential in enumerate(self.potentials):
             check_potential(potential, f"potentials[{k}]")
         _check_supports(self)
         _check_obstacles(self)
         _check_numbers(self)
+
+    def __str__(self) -> str:
+        return scene_text(self)
 
 
 def _of_one_precision(parts: Any) -> Any:
@@ -122,7 +133,7 @@ def _of_one_precision(parts: Any) -> Any:
 def _check_supports(scene: Scene) -> None:
     ends = (scene.start, scene.end)
     pair = f"{type(scene.start).__name__} at the start and {type(scene.end).__name__} at the end"
-    if not any(isinstance(end, Held) for end in ends):
+    if not any(isinstance(end, Held | Movable) for end in ends):
         raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
     for end, other in (ends, ends[::-1]):
         if not isinstance(end, Free):
@@ -131,7 +142,7 @@ def _check_supports(scene: Scene) -> None:
         loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
         if isinstance(other, Pin) and not loaded and not scene.clips:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
-        if end.moment is not None and not isinstance(other, Clamp):
+        if end.moment is not None and not isinstance(other, Clamp | Movable):
             raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
@@ -163,6 +174,18 @@ def _check_numbers(scene: Scene) -> None:
     for k, force in enumerate(scene.point_forces):
         if float(force.at) > length:
             raise ValueError(f"point_forces[{k}].at must lie in 0 to {length:g} m, got {float(force.at):g} m")
+    inside = [(f"point_forces[{k}].at", load) for k, load in enumerate(scene.point_forces) if load.follower]
+    inside += [(f"point_couples[{k}].at", load) for k, load in enumerate(scene.point_couples)]
+    for name, load in inside:
+        if not 0 < float(load.at) < length:
+            raise ValueError(
+                f"{name} must lie inside 0 to {length:g} m, got {float(load.at):g} m; rodjax.Free takes loads on an end"
+            )
+    for k, load in enumerate(scene.distributed):
+        if load.part is not None and float(load.part[1]) > length * (1 + ONE_PLACE):
+            raise ValueError(
+                f"distributed[{k}].part must lie in 0 to {length:g} m, got {np.asarray(load.part).tolist()}"
+            )
     start, end = scene.start, scene.end
     if isinstance(start, Held) and isinstance(end, Held):
         with np.errstate(over="ignore"):
@@ -178,10 +201,10 @@ def _check_numbers(scene: Scene) -> None:
 
 def _check_turning(scene: Scene, length: float) -> None:
     """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
-    if any(isinstance(end, Clamp | Swivel) for end in (scene.start, scene.end)):
+    if any(isinstance(end, Clamp | Swivel | Movable) for end in (scene.start, scene.end)):
         return
     loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
-    loaded |= bool(scene.potentials)
+    loaded |= bool(scene.potentials or scene.point_couples)
     loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
     if loaded or any(clip.direction is not None for clip in scene.clips):
         return
@@ -274,7 +297,8 @@ def scene_axes(scene: Scene) -> Float[Array, "3 3"]:
     directions += [clip.tangent for clip in scene.clips if clip.tangent is not None]
     positions = [held.position for held in (start, *scene.clips, end) if isinstance(held, Held | Clip)]
     directions += [position - positions[0] for position in positions[1:]]
-    directions += [load.force for load in scene.point_forces]
+    directions += [load.force for load in dead_forces(scene)]
+    directions += [load.couple for load in scene.point_couples if not load.follower]
     ends = [end for end in (start, end) if isinstance(end, Free) and not end.follower]
     directions += [load for end in ends for load in (end.force, end.moment) if load is not None]
     for load in scene.distributed:
@@ -335,6 +359,8 @@ def needs_frames(scene: Scene) -> bool:
     """Whether the rod, its loads or clips ask for the angle of the sections about the tangent, all along the rod."""
     if scene.distributed or not scene.rod.is_plain or _follows(scene.start) or _follows(scene.end):
         return True
+    if loads_at_nodes(scene):
+        return True
     if scene.clips and any(clip.frame is not None for clip in scene.clips):
         return True
     return bool(scene.obstacles or scene.potentials) and dead_end_moment(scene) is not None
@@ -345,7 +371,17 @@ def with_plain_rod(scene: Scene) -> Scene:
     rod = scene.rod
     EI1, EI2, GJ, EA = (rod.mean(stiffness) for stiffness in rod.stiffnesses)
     plain = Rod(rod.length, (EI1 + EI2) / 2, GJ, EA, rod.mean_mass_per_length)
-    return Scene(plain, scene.start, scene.end, scene.gravity, scene.point_forces, scene.turns)
+    return Scene(plain, scene.start, scene.end, scene.gravity, dead_forces(scene), scene.turns)
+
+
+def dead_forces(scene: Scene) -> list[PointForce]:
+    """The point forces that do not follow the rod."""
+    return [load for load in scene.point_forces if not load.follower]
+
+
+def loads_at_nodes(scene: Scene) -> list[PointForce | PointCouple]:
+    """The loads at points inside the rod that have no potential."""
+    return [*(load for load in scene.point_forces if load.follower), *scene.point_couples]
 
 
 def has_node_places(scene: Scene) -> bool:
@@ -373,8 +409,8 @@ def _follows(end: Support) -> bool:
 
 
 def has_potential(scene: Scene) -> bool:
-    """Whether all loads have one: a dead moment, a couple along the rod and a load that follows the rod have none."""
-    follows = _follows(scene.start) or _follows(scene.end)
+    """Whether all loads have one: a dead moment, a couple on the rod and a load that follows the rod have none."""
+    follows = _follows(scene.start) or _follows(scene.end) or bool(loads_at_nodes(scene))
     follows |= any(isinstance(load, DistributedCouple) or load.follower for load in scene.distributed)
     return dead_end_moment(scene) is None and not follows
 
@@ -398,5 +434,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         [clip.in_units(units) for clip in scene.clips],
         [InUnits(obstacle, units.origin, units.length) for obstacle in scene.obstacles],
         [potential.in_units(units) for potential in scene.potentials],
+        [couple.in_units(units) for couple in scene.point_couples],
     )
     return scaled, units

@@ -7,7 +7,21 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import DEFAULT_D2, direction, instance, is_known, leaf, namespace, positive, rotation, shown, vector
+from rodjax.checks import (
+    DEFAULT_D2,
+    ROTATION_TOLERANCE,
+    direction,
+    instance,
+    is_known,
+    leaf,
+    namespace,
+    not_negative,
+    number_array,
+    positive,
+    rotation,
+    shown,
+    vector,
+)
 from rodjax.units import Units
 
 
@@ -142,6 +156,125 @@ class Clip(eqx.Module):
     def direction(self) -> Float[Array, "3"] | None:
         """The direction along the rod that it holds; `None` where it holds none."""
         return self.tangent if self.frame is None else self.frame[:, 2]
+
+
+class Movable(Support):
+    """An end whose pose is unknown: it belongs to a rigid body, which other rods, a support or springs hold."""
+
+    def in_units(self, units: Units) -> "Support":
+        raise ValueError(
+            f"an end that is a {type(self).__name__} has an unknown pose, which rodjax.solve finds (a Joint: of a "
+            "Harness), and this operation does not: give it a Clamp at the pose that was found"
+        )
+
+
+class Joint(Movable):
+    """In the place of a support: this end of a rod is fixed in the rigid body `name` of a `Harness`.
+
+    `frame`: (3, 3), columns d1, d2, t, of the end in the axes of the body; `offset`: (3,) [m], from the position of the
+    body to the end, in its axes.
+    """
+
+    name: str = eqx.field(static=True)
+    frame: Float[Array, "3 3"]
+    offset: Float[Array, "3"]
+
+    def __init__(self, name: str, frame: Any = None, offset: Any = (0.0, 0.0, 0.0)):
+        instance(name, "name", str)
+        if not name:
+            raise ValueError("name must not be empty")
+        self.name = name
+        self.frame = leaf(rotation(np.eye(3) if frame is None else frame, "frame"))
+        self.offset = leaf(vector(offset, "offset"))
+
+
+class Hinge(Movable):
+    """Position is held, and the frame but for a turn about one axis.
+
+    `position`: (3,) [m]; `frame`: (3, 3), columns d1, d2, t, of the end before it turns; `axis`: (3,), any nonzero
+    vector, global axes.
+    """
+
+    position: Float[Array, "3"]
+    frame: Float[Array, "3 3"]
+    axis: Float[Array, "3"]
+
+    def __init__(self, position: Any, frame: Any, axis: Any):
+        self.position = leaf(vector(position, "position"))
+        self.frame = leaf(rotation(frame, "frame"))
+        self.axis = leaf(direction(axis, "axis"))
+
+
+# Of two directions of a `Slider`: the sine of the angle between them below which they count as one.
+LEAST_SINE = 1e-6
+
+
+class Slider(Movable):
+    """Free to move along a line, or in a plane.
+
+    `position`: (3,) [m], a point of the line or plane; `directions`: (1, 3) or (2, 3), along which it moves, any
+    length; `frame`: (3, 3), columns d1, d2, t, held if given, else the end is free to turn.
+    """
+
+    position: Float[Array, "3"]
+    directions: Float[Array, "k 3"]
+    frame: Float[Array, "3 3"] | None
+
+    def __init__(self, position: Any, directions: Any, frame: Any = None):
+        self.position = leaf(vector(position, "position"))
+        shape = np.shape(directions)
+        if shape not in ((1, 3), (2, 3)):
+            raise ValueError(f"directions must have the shape (1, 3) or (2, 3), got {shape}")
+        rows = [direction(directions[k], f"directions[{k}]") for k in range(shape[0])]
+        xp = namespace(*rows)
+        if len(rows) == 2:
+            across = rows[1] - xp.dot(rows[0], rows[1]) * rows[0]
+            size = xp.linalg.norm(across)
+            if is_known(size) and not size > LEAST_SINE:
+                raise ValueError(f"directions must not be parallel, got {shown(directions)}")
+            rows[1] = across / size
+        self.directions = leaf(xp.stack(rows))
+        self.frame = None if frame is None else leaf(rotation(frame, "frame"))
+
+
+class Spring(Movable):
+    """A support that gives way against springs.
+
+    `support`: `Clamp`, `Pin`, `Hinge` or `Slider`; `translation` [N/m] and `rotation` [N m/rad]: scalars or symmetric
+    (3, 3), global axes. The energy is d . translation d/2 + r . rotation r/2, with the displacement d from the position
+    of the support and the rotation vector r, shorter than pi, from its frame. What has no spring stays as the support
+    has it. A spring frees all translations or all rotations of a support that holds them all; where a `Slider` moves
+    along a line, or a `Hinge` turns, it acts on this motion alone.
+    """
+
+    support: Support
+    translation: Float[Array, ""] | Float[Array, "3 3"] | None
+    rotation: Float[Array, ""] | Float[Array, "3 3"] | None
+
+    def __init__(self, support: Support, translation: Any = None, rotation: Any = None):
+        instance(support, "support", (Clamp, Pin, Hinge, Slider))
+        if translation is None and rotation is None:
+            raise ValueError("a Spring needs translation or rotation, got None for both")
+        if rotation is not None and getattr(support, "frame", None) is None:
+            raise ValueError(f"rotation must be None on a {type(support).__name__} without a frame to turn from")
+        self.support = support
+        self.translation = None if translation is None else leaf(_stiffness(translation, "translation"))
+        self.rotation = None if rotation is None else leaf(_stiffness(rotation, "rotation"))
+
+
+def _stiffness(value: Any, name: str) -> Any:
+    """A scalar or a symmetric matrix without a negative eigenvalue."""
+    if np.ndim(value) == 0:
+        return not_negative(value, name)
+    array = number_array(value, name, (3, 3))
+    if is_known(array):
+        matrix = np.asarray(array)
+        size = np.max(np.abs(matrix))
+        if np.max(np.abs(matrix - matrix.T)) > ROTATION_TOLERANCE * size:
+            raise ValueError(f"{name} must be symmetric, got {shown(value)}")
+        if np.min(np.linalg.eigvalsh(matrix)) < -ROTATION_TOLERANCE * size:
+            raise ValueError(f"{name} must have no negative eigenvalue, got {shown(value)}")
+    return array
 
 
 # The supports that hold the position, and those that also hold the tangent; a `Clamp` alone holds the twist.

@@ -22,10 +22,11 @@ from rodjax.paths.path import stack_scenes
 from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import Discretization, Solver, solve
+from rodjax.solving.equilibrium import Discretization, Solver
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.result import Equilibrium
+from rodjax.solving.solve import solve
 
 # Where the parameter turns round at a fold, a change of the scene does work in the critical motion: more than this part
 # of what it could do. Where another branch crosses it does none.

@@ -17,7 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional, slides
+from rodjax.paths.harness_path import harness_path
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -33,6 +35,7 @@ from rodjax.solving.equilibrium import (
     solve_from,
 )
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find
 from rodjax.solving.ranges import check_ranges, with_ranges
@@ -58,19 +61,19 @@ MOST_EXTRAPOLATION = 2.0
 
 @one_answer
 def solve_path(
-    scenes: Sequence[Scene] | Scene,
+    scenes: Sequence[Scene] | Scene | Sequence[Harness],
     *,
     segments: int | None = None,
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | None = None,
+    guess: Guess | Equilibrium | HarnessEquilibrium | None = None,
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     at_critical: AtCritical = "jump",
     progress: bool = False,
-) -> Equilibrium:
+) -> Any:
     """The equilibria of a sequence of scenes, each solved from the last; turns are carried along.
 
     **Arguments:**
@@ -95,8 +98,13 @@ def solve_path(
         The guess is for the first scene; where the estimated error of any step is above `rtol`, the whole path is
         solved on a finer mesh of equal segments.
 
-    Returns an `Equilibrium` with a leading axis, one entry a scene.
+    Returns an `Equilibrium`, of harnesses a `HarnessEquilibrium`, with a leading axis, one entry a scene.
     """
+    if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
+        if at_critical != "jump":
+            raise ValueError(f"at_critical must be 'jump' for harnesses, got {at_critical!r}")
+        options: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
+        return harness_path(scenes, segments=segments, rtol=rtol, guess=guess, strain_limit=strain_limit, **options)
     stacked = stack_scenes(scenes)
     instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)
@@ -182,6 +190,7 @@ def _structure(scene: Scene) -> str:
     parts = [f"{type(scene.start).__name__}-{type(scene.end).__name__}"]
     parts += [name for name in ("gravity", "turns") if getattr(scene, name) is not None]
     parts.append(f"{len(scene.point_forces)} point forces")
+    parts += [f"{len(scene.point_couples)} point couples"] if scene.point_couples else []
     parts += [f"{len(scene.clips)} clips"] if scene.clips else []
     parts += [", ".join(type(obstacle).__name__ for obstacle in scene.obstacles)] if scene.obstacles else []
     return ", ".join(parts)

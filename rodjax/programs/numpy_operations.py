@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 
 Values = tuple[Any, ...]
 
@@ -329,6 +328,8 @@ def lu(x: np.ndarray) -> Values:
 
 
 def _getrf(matrix: np.ndarray) -> Values:
+    import scipy.linalg  # a tenth of a second, for few programs
+
     (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (matrix,))
     factors, pivots, info = getrf(matrix)
     return factors, pivots.astype(np.int32), info

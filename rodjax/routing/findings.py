@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.analysis.curvature import curvature_along, most_curved
+from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.model.along import Along
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import has_potential, slides
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
-from rodjax.routing.reactions import Reaction, reactions
 from rodjax.routing.route import Route
-from rodjax.solving.result import Equilibrium, describe
+from rodjax.solving.result import Equilibrium, describe, estimated_errors
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
 WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}
@@ -175,14 +175,19 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         Fact("largest twist rate", *_finite(measured["twist"][0], "rad/m", measured["twist"][1])),
         Fact("total twist", float(equilibrium.total_twist), "rad"),
         Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="either way"),
-        Fact("largest tension", float(tension[most]), "N", float(s[most])),
-        Fact("least tension", float(tension[least]), "N", float(s[least])),
+        _axial(float(tension[most]), float(s[most]), "largest tension", "least compression"),
+        _axial(float(tension[least]), float(s[least]), "least tension", "largest compression"),
         Fact("elastic energy", float(equilibrium.elastic_energy), "J"),
         Fact("mass", float(rod.mean_mass_per_length) * length, "kg"),
         _stiffness(equilibrium),
-        _error(equilibrium),
+        *_errors(equilibrium),
     ]
     return facts
+
+
+def _axial(force: float, s: float, tension: str, compression: str) -> Fact:
+    """A tension, or where it is negative the compression."""
+    return Fact(compression if force < 0 else tension, abs(force), "N", s)
 
 
 def _somewhere(equilibrium: Equilibrium) -> str:
@@ -212,11 +217,23 @@ def _stiffness(equilibrium: Equilibrium) -> Fact:
     return Fact(name, float(lowest_mode(equilibrium).stiffness), "N", note=note)
 
 
-def _error(equilibrium: Equilibrium) -> Fact:
-    error = float(equilibrium.error_estimate)
-    if not np.isfinite(error):
-        return Fact("estimated error of the shape", None, "m")
+def _errors(equilibrium: Equilibrium) -> list[Fact]:
+    """Those of the mesh, as estimated: of the shape, and of what limits and supports are told by."""
+    found = estimated_errors(equilibrium)
+    shape = float(np.max(np.linalg.norm(np.asarray(found.nodes), axis=-1)))
+    if not np.isfinite(shape):
+        return [Fact("estimated error of the shape", None, "m")]
     segments = equilibrium.s.shape[-1] - 1
     length = float(equilibrium.scene.rod.length)
-    note = f"{error:.0e} of the length, on {segments} segments"
-    return Fact("estimated error of the shape", error * length, "m", note=note)
+    note = f"{shape:.0e} of the length, on {segments} segments"
+    return [
+        Fact("estimated error of the shape", shape * length, "m", note=note),
+        Fact("estimated error of the forces", float(found.force), "", note="of the largest force in the cable"),
+        Fact(
+            "estimated error of the moments",
+            float(equilibrium.moment_error),
+            "",
+            note="of the largest moment in the cable",
+        ),
+        Fact("estimated error of the smallest bend radius", float(found.curvature), "", note="of the radius"),
+    ]

@@ -14,10 +14,19 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import line
 from rodjax.model.obstacles import Obstacle
-from rodjax.plot import ARROW_LENGTH, HALO, draw_arrows, draw_faces, seen_axes, set_view, tube_faces
-from rodjax.routing.sights import (
+from rodjax.plot import (
+    ARROW_LENGTH,
     CLIP_COLOR,
+    HALO,
+    OPACITY,
     PALETTE,
+    draw_arrows,
+    draw_faces,
+    seen_axes,
+    set_view,
+    tube_faces,
+)
+from rodjax.routing.sights import (
     Sight,
     azimuth,
     clip_faces,
@@ -27,8 +36,6 @@ from rodjax.routing.sights import (
     thickness_note,
 )
 
-# How much of what is behind an obstacle it hides.
-OPACITY = 0.35
 FORCE_COLOR = "tab:red"
 # Of flat scenes, and how much less it is of those as high as they are wide.
 ZOOM, LESS = 1.2, 0.35

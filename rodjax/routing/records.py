@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rodjax.routing.findings import Cable, Gradients
+from rodjax.routing.words import inputs
 from rodjax.solving.status import Status
+from rodjax.version import __version__
 
 if TYPE_CHECKING:
     from rodjax.routing.report import Report
@@ -31,13 +33,16 @@ def as_dict(report: "Report") -> dict[str, Any]:
         "title": report.title,
         "verdict": report.verdict,
         "kept": report.kept,
+        "date": report.date,
+        "version": __version__,
+        "source": report.source,
         "converged": all(cable.converged for cable in report.cables),
         "margins": {name: plain(margin) for name, margin in report.margins.items()},
-        "cables": [_cable(cable) for cable in report.cables],
+        "cables": [_cable(report, cable) for cable in report.cables],
     }
 
 
-def _cable(cable: Cable) -> dict[str, Any]:
+def _cable(report: "Report", cable: Cable) -> dict[str, Any]:
     return {
         "name": cable.name,
         "kept": cable.kept,
@@ -58,14 +63,15 @@ def _cable(cable: Cable) -> dict[str, Any]:
                 "position": plain(reaction.position),
                 "force": plain(reaction.force),
                 "moment": plain(reaction.moment),
-                "force_size": plain(np.linalg.norm(reaction.force)),
-                "moment_size": plain(np.linalg.norm(reaction.moment)),
+                "force_magnitude": plain(np.linalg.norm(reaction.force)),
+                "moment_magnitude": plain(np.linalg.norm(reaction.moment)),
                 "axes": dict(zip(("tangent", "left", "up"), plain(reaction.axes), strict=True)),
                 "force_in_axes": plain(reaction.axes @ reaction.force),
                 "moment_in_axes": plain(reaction.axes @ reaction.moment),
             }
             for reaction in cable.reactions
         ],
+        "inputs": dict(inputs(report, cable)),
         "gradients": None if cable.gradients is None else _gradients(cable.gradients),
     }
 
@@ -115,7 +121,7 @@ def csv_text(report: "Report") -> str:
         for reaction in cable.reactions:
             for kind, load, unit in (("force", reaction.force, "N"), ("moment", reaction.moment, "N m")):
                 own = reaction.axes @ load
-                values = dict(zip("xyz", load, strict=True)) | {"size": np.linalg.norm(load)}
+                values = dict(zip("xyz", load, strict=True)) | {"magnitude": np.linalg.norm(load)}
                 values |= dict(zip(("tangent", "left", "up"), own, strict=True))
                 rows += [
                     (kind, f"{reaction.name} {axis}", plain(value), unit, None, None, None, reaction.s, reaction.kind)

@@ -1,6 +1,7 @@
 """What an engineer wants to know of routes of cables, as text, tables and pictures."""
 
 import dataclasses
+import datetime
 import io
 import json
 import os
@@ -14,6 +15,7 @@ import numpy as np
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
 from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.notes import note
 from rodjax.programs.answers import one_answer
 from rodjax.routing import records, words
 from rodjax.routing.findings import Cable, Gradients, cable
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # What a report writes.
-FILES = ("report.txt", "report.csv", "report.json", "report.png", "report.html")
+FILES = ("report.txt", "report.csv", "report.json", "report.png", "report-along.png", "report.html")
 DPI = 130
 
 
@@ -38,12 +40,15 @@ class Report:
     - `kept`: whether all of them are equilibria that keep to all limits; `None` where there are no limits
     - `cables`: for each its name, equilibrium, margins, facts, what supports apply to it, and gradients
     - `obstacles`, and their `names`
+    - `source`: what it was made of, such as the name of a file; `date`: the day on which it was made
     """
 
     title: str
     cables: tuple[Cable, ...]
     obstacles: tuple[Obstacle, ...]
     names: tuple[str, ...]
+    source: str | None = None
+    date: str = dataclasses.field(default_factory=lambda: datetime.date.today().isoformat())
 
     @cached_property
     def verdict(self) -> str:
@@ -77,6 +82,12 @@ class Report:
 
         return plot_route(self._sights, self.obstacles, self.names, self._heading)
 
+    def along(self) -> "Figure":
+        """Curvature and bend radius, twist, tension, moment and clearances over the arclength, with their limits."""
+        from rodjax.routing.diagrams import plot_along
+
+        return plot_along(self.cables, self.obstacles, self.names)
+
     def html(self) -> str:
         """The same as a page that turns with the mouse and needs nothing but a browser."""
         from rodjax.routing.web_page import web_page
@@ -84,18 +95,22 @@ class Report:
         return web_page(self, self._sights)
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Writes report.txt, report.csv, report.json, report.png and report.html; returns their names.
+        """Writes report.txt, report.csv, report.json, report.png, report-along.png and report.html; returns their
+        names.
 
         The folder is made where it is not there. Raises `OSError` where they cannot be written.
         """
         folder = file_path(folder, "folder")
-        image = io.BytesIO()
+        note("drawing")
+        image, diagrams = io.BytesIO(), io.BytesIO()
         self.figure().savefig(image, format="png", dpi=DPI)
+        self.along().savefig(diagrams, format="png", dpi=DPI)
         contents = (
             f"{self}\n".encode(),
             records.csv_text(self).encode(),
             f"{json.dumps(self.as_dict(), indent=1, allow_nan=False)}\n".encode(),
             image.getvalue(),
+            diagrams.getvalue(),
             self.html().encode(),
         )
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,6 +139,7 @@ def report(
     names: Any = None,
     gradients: Any = None,
     title: str | None = None,
+    source: str | None = None,
 ) -> Report:
     """What there is to say of a cable at rest, or of several in one scene.
 
@@ -135,6 +151,7 @@ def report(
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
     - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
     - `title`: `None`: "Route".
+    - `source`: what the cables were read from, told beside the date and the version.
 
     Raises `ValueError` or `TypeError` for other arguments, for a stack of equilibria or one without a finite shape, and
     as `rodjax.margins` does.
@@ -151,13 +168,15 @@ def report(
         raise ValueError(
             f"names must be {len(obstacles)} different ones, one for each obstacle, got {shown(list(names))}"
         )
-    if title is not None:
-        instance(title, "title", str)
+    for name, text in (("title", title), ("source", source)):
+        if text is not None:
+            instance(text, name, str)
+    note("checking limits, supports and stability")
     found = tuple(
         cable(name, one, limit, obstacles, names, Gradients.of(gradient) if isinstance(gradient, Route) else gradient)
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
     )
-    return Report("Route" if title is None else title, found, obstacles, names)
+    return Report("Route" if title is None else title, found, obstacles, names, source)
 
 
 def _cables(equilibrium: Any) -> dict[str, Equilibrium]:

@@ -32,9 +32,10 @@ from rodjax.routing.problem import (
 )
 from rodjax.routing.search import KEPT, REGION, Outcome
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
-from rodjax.solving.equilibrium import Solver, checked_options, solve
+from rodjax.solving.equilibrium import Solver, checked_options
 from rodjax.solving.newton import Newton
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.solving.solve import solve
 from rodjax.warn import silenced
 
 SEGMENTS = 48
@@ -127,18 +128,18 @@ class Route(eqx.Module):
         count, kept = len(self.starts.feasible), int(np.sum(self.starts.feasible))
         worst = int(np.argmin(self.margins.margin))
         name, margin = self.margins.names[worst], float(self.margins.margin[worst])
-        effort = f"{self.solves} solves, {self.with_gradients} of them with derivatives by {len(self.names)} numbers"
+        effort = f"{self.solves} solves, {self.with_gradients} of them with gradients in {len(self.names)} variables"
         effort += f"; {self.failed} found no equilibrium" if self.failed else ""
         if self.feasible:
             least = f" The least margin is that of {name}, {100 * margin:.2g} %," if self.margins.names else " Solved"
             return (
                 f"A route that keeps to all limits, with the objective {self.objective:.6g}: {kept} of {count} starts "
-                f"came to one. {self.optimality}{least} on a mesh of "
+                f"led to a feasible route. {self.optimality}{least} on a mesh of "
                 f"{self.verified.s.shape[-1] - 1} segments. It took {effort}."
             )
         gap = self.starts.violated[int(np.argmin(self.starts.violation))]
         return (
-            f"No route was found that keeps to all limits: {kept} of {count} starts came to one on the mesh of the "
+            f"No route was found that keeps to all limits: {kept} of {count} starts led to one on the mesh of the "
             f"search. The one that violates them least fails in {gap or name}; on the finer mesh {name} has the margin "
             f"{100 * margin:.2g} %. It took {effort}."
         )
@@ -146,12 +147,12 @@ class Route(eqx.Module):
     @property
     def optimality(self) -> str:
         """Whether the objective is an optimum, and what holds it, in words."""
-        gain = f"within a thousandth of the ranges the objective falls by {self.gain:.1g} at most"
+        gain = f"within a thousandth of the ranges the objective decreases by at most {self.gain:.1g}"
         if not self.optimal:
             return f"It is NOT known to be an optimum, the search stalled: {gain}."
         held = sorted(self.multipliers.items(), key=lambda item: -item[1])
         told = ", ".join(f"{name} ({value / 100:.2g} for 1 %)" for name, value in held)
-        return f"It is optimal to first order: {gain}; held by {told or 'no limit'}."
+        return f"It is optimal to first order: {gain}; active limits: {told or 'none'}."
 
 
 @one_answer

@@ -10,11 +10,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
 from rodjax.analysis.curvature import curvature_along
+from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.model.obstacles import Obstacle, Plane
+from rodjax.model.surfaces import Faces, collar, parts_of, surfaces
 from rodjax.plot import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.routing.limits import Limits
-from rodjax.routing.reactions import Reaction, reactions
-from rodjax.routing.surfaces import Faces, parts_of, round_faces, surfaces
 from rodjax.solving.result import Equilibrium
 
 # Margins of the bend radius between which colors differ, and the colors: of none red, from none on yellow to blue.
@@ -27,13 +27,8 @@ MARGIN_COLORS = LinearSegmentedColormap.from_list(
 # The margin that is told of a place that is nearly straight, at most.
 FREE = 99.0
 WITHOUT_LIMIT = (0.6, 0.6, 0.6, 1.0)
-# Of obstacles, one after another.
-PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
-CLIP_COLOR = "#3a3a3a"
 # By the largest extent of the cables: the thinnest that is drawn.
 LEAST_RADIUS = 0.005
-# A clip, by the radius of the cable: its own, and half of its length.
-CLIP_RADIUS, CLIP_LENGTH = 1.7, 1.4
 POINTS = 240
 
 
@@ -137,16 +132,7 @@ def thickness_note(sights: Sequence[Sight]) -> str:
 
 def clip_faces(sight: Sight) -> list[Faces]:
     """A collar around the cable for each clip."""
-    return [
-        round_faces(
-            clip.position - CLIP_LENGTH * sight.radius * clip.axes[0],
-            clip.position + CLIP_LENGTH * sight.radius * clip.axes[0],
-            CLIP_RADIUS * sight.radius,
-            1e3 * sight.radius,
-            has_caps=False,
-        )
-        for clip in sight.reactions[1:-1]
-    ]
+    return [collar(clip.position, clip.axes[0], sight.radius) for clip in sight.reactions[1:-1]]
 
 
 def azimuth(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> float:

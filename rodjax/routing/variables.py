@@ -381,6 +381,7 @@ UNITS = {
     "EI": "N m^2",
     "GJ": "N m^2",
     "EA": "N",
+    "GA": "N",
     "mass_per_length": "kg/m",
     "gravity": "m/s^2",
     "force": "N",

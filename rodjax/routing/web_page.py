@@ -1,6 +1,7 @@
 """A report of routes as one page that turns with the mouse and loads nothing."""
 
 import importlib.resources
+import io
 import json
 import math
 import re
@@ -9,16 +10,15 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.colors import Colormap, to_hex
 
-from rodjax.plot import ARROW_LENGTH, ELEVATION
+from rodjax.model.surfaces import Faces
+from rodjax.plot import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
 from rodjax.routing import words
 from rodjax.routing.findings import Cable
 from rodjax.routing.records import plain
 from rodjax.routing.sights import (
-    CLIP_COLOR,
-    PALETTE,
     Coloring,
     Sight,
     azimuth,
@@ -28,7 +28,6 @@ from rodjax.routing.sights import (
     seen_surfaces,
     thickness_note,
 )
-from rodjax.routing.surfaces import Faces
 
 TEMPLATE = "page.html"
 OPACITY = 0.3
@@ -163,13 +162,17 @@ def _ticks(colors: Coloring) -> str:
 def _panel(report: Any) -> str:
     kind = {None: "", True: ' class="kept"', False: ' class="broken"'}[report.kept]
     parts = [f"<h1>{escape(report.title)}</h1>", f'<p id="verdict"{kind}>{escape(report.verdict)}</p>']
+    parts.append(f'<p class="soft">{escape(words.made(report))}</p>')
     for k, cable in enumerate(report.cables):
         if len(report.cables) > 1:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
-        parts += [_limits(cable, k), _facts(cable, k), _supports(cable, k)]
+        parts += [_limits(cable, k), _facts(cable, k), _supports(cable)]
         if cable.gradients is not None:
             parts.append(f"<h2>derivatives</h2><pre>{escape(words.gradients(cable))}</pre>")
         parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
+        rows = [_row([name, text], k, None) for name, text in words.inputs(report, cable)]
+        parts.append("<h2>inputs</h2>" + _table(("", ">SI units"), rows, ' class="inputs"'))
+    parts.append(f'<div id="along"><h2>along the cable</h2>{_diagrams(report)}</div>')
     if report.obstacles:
         boxes = "".join(
             f'<li><label><input type="checkbox" checked data-obstacle="{k}">'
@@ -222,20 +225,31 @@ def _facts(cable: Cable, number: int) -> str:
     return "<h2>shape</h2>" + _table(("", ">value", ">at s"), rows)
 
 
-def _supports(cable: Cable, number: int) -> str:
+def _supports(cable: Cable) -> str:
+    """For each support a block: force and moment by component, in the axes of the scene and in its own."""
     rows = []
     for reaction in cable.reactions:
-        own = reaction.axes @ reaction.force
-        cells = [
-            words.support(reaction),
-            _unbroken(words.amount(float(np.linalg.norm(reaction.force)), "N")),
-            ", ".join(f"{x:.3g}" for x in reaction.force),
-            ", ".join(f"{x:.3g}" for x in own),
-            _unbroken(words.amount(float(np.linalg.norm(reaction.moment)), "N m")),
-        ]
-        rows.append(_row(cells, number, reaction.s))
-    heads = ("what supports apply", ">force", ">x, y, z", ">tangent, left, up", ">moment")
+        rows.append(f'<tr class="support"><td colspan="6">{escape(words.support(reaction))}</td></tr>')
+        for name, load, unit in (("force", reaction.force, "N"), ("moment", reaction.moment, "N m")):
+            least = words.ROUNDING * float(np.linalg.norm(load))
+            for axes, values in (("x, y, z", load), ("tangent, left, up", reaction.axes @ load)):
+                magnitude = words.amount(float(np.linalg.norm(load)), unit) if values is load else ""
+                cells = [f"{name} [{unit}]" if values is load else "", axes]
+                cells += [*(words.above(float(x), least) for x in values), _unbroken(magnitude)]
+                rows.append(_row(cells, 0, None))
+    heads = ("what supports apply", ">axes", ">1", ">2", ">3", ">magnitude")
     return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')
+
+
+def _diagrams(report: Any) -> str:
+    """Inline, as the page loads nothing."""
+    image = io.StringIO()
+    with rc_context({"svg.hashsalt": "rodjax", "svg.fonttype": "none", "font.family": "sans-serif"}):
+        report.along().savefig(image, format="svg", metadata={"Date": None, "Creator": None})
+    text = image.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub("<metadata>.*?</metadata>", "", text, flags=re.S)
+    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
 
 
 def _unbroken(told: str) -> str:

@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rodjax.analysis.reactions import Reaction
+from rodjax.checks import line
+from rodjax.model.summaries import part_text, scene_text
 from rodjax.routing.findings import Cable, Fact, Gradients
-from rodjax.routing.reactions import Reaction
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
+from rodjax.version import __version__
 
 if TYPE_CHECKING:
     from rodjax.routing.report import Report
@@ -101,12 +104,36 @@ def _of(cable: Cable, k: int, has_name: bool) -> tuple[str, str]:
 
 
 def text(report: "Report") -> str:
-    parts = [report.title, report.verdict]
+    parts = [report.title, f"{report.verdict}\n{made(report)}"]
     for cable in report.cables:
         heading = [f"--- {cable.name}: {_kept(cable)}"] if len(report.cables) > 1 else []
         parts.append("\n".join([*heading, cable.outcome]))
-        parts += [part for part in (_limits(cable), _facts(cable), _reactions(cable), gradients(cable)) if part]
+        told = (_limits(cable), _facts(cable), _reactions(cable), gradients(cable), _inputs(report, cable))
+        parts += [part for part in told if part]
     return "\n\n".join(["\n".join(parts[:2]), *parts[2:]])
+
+
+def made(report: "Report") -> str:
+    """When, by what and of what a report was made."""
+    source = "" if report.source is None else f" of {report.source}"
+    return f"made on {report.date} by rodjax {__version__}{source}"
+
+
+def inputs(report: "Report", cable: Cable) -> list[tuple[str, str]]:
+    """What a cable was computed from: its scene part by part, the obstacles, and the mesh."""
+    rows = scene_text(cable.equilibrium.scene).split("\n  ")[1:]
+    pairs = [row.split(": ", 1) for row in rows]
+    told = [(name.lower(), text) for name, text in pairs]
+    told += [
+        (f"obstacle {line(name)}", part_text(obstacle))
+        for name, obstacle in zip(report.names, report.obstacles, strict=True)
+    ]
+    count = cable.equilibrium.s.shape[-1] - 1
+    return [*told, ("mesh", f"{count} segments ({cable.equilibrium.discretization.replace('_', ' ')})")]
+
+
+def _inputs(report: "Report", cable: Cable) -> str:
+    return "\n".join(["inputs, in SI units", table(inputs(report, cable), "<<")])
 
 
 def _kept(cable: Cable) -> str:
@@ -141,7 +168,7 @@ def _where(fact: Fact) -> str:
 def _reactions(cable: Cable) -> str:
     units = cable.equilibrium.state.units
     rows: list[tuple[str, ...]] = [
-        ("what supports apply to the cable", "force [N]", "", "", "size", "moment [N m]", "", "", "size")
+        ("what supports apply to the cable", "force [N]", "", "", "magnitude", "moment [N m]", "", "", "magnitude")
     ]
     for reaction in cable.reactions:
         cells, own = [f"{support(reaction)}, axes x, y, z"], ["  tangent, left, up"]
@@ -149,8 +176,8 @@ def _reactions(cable: Cable) -> str:
             size = float(np.linalg.norm(load))
             # Of what is smaller nothing but rounding is left.
             least = ROUNDING * max(size, float(unit))
-            cells += [_above(x, least) for x in (*load, size)]
-            own += [*(_above(x, least) for x in reaction.axes @ load), ""]
+            cells += [above(x, least) for x in (*load, size)]
+            own += [*(above(x, least) for x in reaction.axes @ load), ""]
         rows += [tuple(cells), tuple(own)]
     axes: list[tuple[str, ...]] = [("axes of the supports", "tangent", "", "", "left", "", "", "up", "", "")]
     axes += [
@@ -166,7 +193,7 @@ def support(reaction: Reaction) -> str:
     return f"{reaction.name}{kind} at s = {amount(reaction.s, 'm')}"
 
 
-def _above(x: float, least: float) -> str:
+def above(x: float, least: float) -> str:
     return f"{x:.4g}" if abs(x) > least else "0"
 
 

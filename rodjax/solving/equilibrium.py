@@ -1,4 +1,4 @@
-"""solve(): the equilibrium of a scene."""
+"""The equilibrium of a scene whose ends have known poses."""
 
 import dataclasses
 import functools
@@ -46,7 +46,7 @@ from rodjax.model.scene import (
     with_plain_rod,
 )
 from rodjax.model.supports import Clamp
-from rodjax.programs.answers import one_answer
+from rodjax.notes import note
 from rodjax.programs.compilation import compiled
 from rodjax.solving.guess import Guess
 from rodjax.solving.implicit import differentiable, not_differentiated
@@ -76,6 +76,7 @@ from rodjax.solving.result import (
     passage_to,
     warn_if_coarse,
     warn_of_outcome,
+    warn_of_single_precision,
     warn_of_unknown_mesh,
 )
 from rodjax.solving.sliding_search import INNER_TOLERANCE, slid_free
@@ -127,8 +128,7 @@ class Options:
     find: Find = "minimum"
 
 
-@one_answer
-def solve(
+def solve_scene(
     scene: Scene,
     *,
     segments: int | None = None,
@@ -140,44 +140,7 @@ def solve(
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
 ) -> Equilibrium:
-    """The equilibrium of a scene.
-
-    Compiled once for each structure of scene, solver and mesh; works inside `jax.jit` and `jax.vmap`.
-
-    **Arguments:**
-
-    - `scene`: `Scene`.
-    - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs. The
-        errors on a given mesh are not estimated unless asked for (`error_estimate`, `describe`); outside `jit` a
-        `MeshWarning` is given where a segment turns by so much that it is far too long.
-    - `rtol`: the relative error of the shape that is wanted; `None` for 1e-3. Segments are added, elements where they
-        are needed, until the estimated `error_estimate` is below it and `force_error`, `moment_error` and
-        `curvature_error` below ten times it: by default 0.1 % of the length, and 1 % of the largest force, moment and
-        curvature. The mesh of a guess that is an `Equilibrium` comes first. Where the numbers of the scene are not
-        known, as inside `jit`, `vmap` and `grad`, it is that of the guess or one of 32 elements whatever `rtol`, of
-        which a `MeshWarning` tells once; `error_estimate` says what that gives.
-    - `discretization`: `"hermite"`, elements of fourth order in 1/segments, or `"finite_difference"`, of second order,
-        not beside obstacles, and not with clips or under loads without a potential where frames are needed. `None`:
-        that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
-    - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
-    - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
-        supports and gravity.
-    - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
-        motions out of the plane too.
-    - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that would
-        rather leave its plane, is left along it, always to the same side. `"equilibrium"`: what the steps of Newton's
-        method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there.
-    - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
-        beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
-
-    Friction of obstacles has a memory (`rodjax.solve_path`): where the guess is an `Equilibrium`, the solve is one step
-    from there, and slips are counted from its nodes, in global axes, on another mesh from the same places of the rod.
-    Else it is from rest, as if all obstacles were without friction. `stable` and `index` speak of motions with the
-    pressures that bound friction held.
-
-    Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
-    Raises `ValueError` or `TypeError` for arguments that make no sense.
-    """
+    """The equilibrium of a scene whose ends have known poses: see `rodjax.solving.solve.solve`."""
     instance(scene, "scene", Scene)
     if scene.rod.length.ndim:
         raise ValueError(
@@ -190,6 +153,7 @@ def solve(
     check_single(guess)
     options, rtol = checked_options(fixed_scene, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
+    note(f"solving on {options.segments} segments")
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if is_known(result.status):
         result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
@@ -228,6 +192,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
+        note(f"solving on {options.segments} segments, as the estimated error is {error:.1e} for rtol = {rtol:g}")
         finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
         result = eqx.tree_at(
             lambda result: (result.iterations, result.evaluations),
@@ -271,6 +236,7 @@ def refined_together(
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
+        note(f"solving all on {options.segments} segments, as the largest estimated error is {error:.1e}")
         result = solve(options, result)
     return result
 
@@ -412,6 +378,8 @@ def checked_options(
     find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
+    if scene.rod.length.dtype == np.float32:
+        warn_of_single_precision()
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     if solver is None:
@@ -485,7 +453,7 @@ def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
     count, gap = int(np.max(needed[0])), float(np.min(needed[1]))
     if count <= (SIZES["hermite"][-1] if segments is None else segments):
         return max(least, count)
-    where = f"jumps of Steps must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
+    where = f"jumps of Steps and of loads must have an element each, at least {LEAST_ELEMENT:g} of a segment long"
     given = f"segments = {segments}" if segments is not None else f"the finest mesh of {SIZES['hermite'][-1]} segments"
     raise ValueError(
         f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "

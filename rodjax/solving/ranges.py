@@ -18,8 +18,8 @@ from rodjax.discretization.cells import segments_for_jumps
 from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
-from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene
-from rodjax.model.supports import Clamp, Free
+from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene, loads_at_nodes
+from rodjax.model.supports import Clamp, Clip, Held
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
@@ -107,7 +107,14 @@ def _checked_when_made(scenes: Scene) -> Any:
 
 def _values_of(rod: Rod) -> list[Any]:
     """What may vary along the rod."""
-    values = [*rod.stiffnesses, rod.mass_per_length, rod.radius, rod.rest_twist]
+    values = [
+        *rod.stiffnesses,
+        *(rod.shear_pair or ()),
+        rod.mass_per_length,
+        rod.radius,
+        rod.rest_twist,
+        rod.rest_strain,
+    ]
     return [value for value in (*values, *(rod.rest_curvature or ())) if value is not None]
 
 
@@ -119,12 +126,16 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     good = [
         _each(xp.isfinite(leaf), scenes) for leaf in jax.tree.leaves(scenes) if jnp.issubdtype(leaf.dtype, jnp.floating)
     ]
-    positive = [length, *rod.stiffnesses, *([] if rod.radius is None else [rod.radius])]
+    positive = [length, *rod.stiffnesses, *(rod.shear_pair or ()), *([] if rod.radius is None else [rod.radius])]
     good += [_each(_numbers(value) > 0, scenes) for value in positive]
     good.append(_each(_numbers(rod.mass_per_length) >= 0, scenes))
+    good += [] if rod.rest_strain is None else [_each(_numbers(rod.rest_strain) > -1, scenes)]
     places = [xp.zeros_like(length), *(clip.at for clip in clips), length]
     good += [before < after for before, after in itertools.pairwise(places)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]
+    for part in (load.part for load in scenes.distributed if load.part is not None):
+        good += [part[..., 0] >= 0, part[..., 0] < part[..., 1], part[..., 1] <= length * (1 + ARCLENGTH_TOLERANCE)]
+    good += [(load.at > 0) & (load.at < length) for load in loads_at_nodes(scenes)]
     frames = [end.frame for end in (scenes.start, scenes.end) if isinstance(end, Clamp)]
     good += [
         _each(_is_rotation(frame), scenes) for frame in (*frames, *(clip.frame for clip in clips)) if frame is not None
@@ -179,7 +190,7 @@ def _is_misplaced(scenes: Scene) -> Bool[np.ndarray, "..."]:
     """
     length = scenes.rod.length
     ends = [(np.zeros_like(length), scenes.start), *((clip.at, clip) for clip in scenes.clips), (length, scenes.end)]
-    held = [(s, end.position) for s, end in ends if not isinstance(end, Free)]
+    held = [(s, end.position) for s, end in ends if isinstance(end, Held | Clip)]
     found = np.full(length.shape, len(held) > 1)
     for _, position in held[1:]:
         found &= np.max(np.abs(position - held[0][1]), axis=-1) <= ONE_PLACE * length

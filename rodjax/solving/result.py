@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -48,6 +50,7 @@ from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional, slid, slides
+from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
 from rodjax.solving.sliding import slide
@@ -81,6 +84,17 @@ class OverstretchedWarning(UserWarning):
 
 class MeshWarning(UserWarning):
     """A mesh on which nobody looked at the errors: one far too coarse, or of a size that nobody chose."""
+
+
+class PrecisionWarning(UserWarning):
+    """Numbers of single precision, and what they cost."""
+
+
+class Described(eqx.Module):
+    """A result that `describe` lets say in words what it is."""
+
+    @abstractmethod
+    def in_words(self) -> str: ...
 
 
 class SolverState(eqx.Module):
@@ -130,17 +144,19 @@ class Equilibrium(eqx.Module):
 
     - `s` [..., n+1] arclength of the nodes, m
     - `nodes` [..., n+1, 3] centerline, m
-    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] their last column
-    - `curvature` [..., n+1] |t x t'|, 1/m
+    - `frames` [..., n+1, 3, 3] material frames, columns d1, d2, t; `tangents` [..., n+1, 3] phi'/|phi'|, their last
+      column but in rods with shear, where that is the normal d3 of the section
+    - `curvature` [..., n+1] |t x t'|, 1/m, with shear |d3 x d3'|
     - `twist` [..., n+1] Omega, rad/m; `total_twist` [...] its integral, rad, not reduced
-    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1
+    - `tension` [..., n+1] N; `axial_strain` [..., n+1] |phi'| - 1; with shear the components of force and phi' along d3
+    - `shear_strain` [..., n+1, 2] of rods with shear, else `None`: the components of phi' along d1 and d2
     - `energy` [...] elastic energy minus the work of dead forces, J, zero of height at the origin; the work of loads
       without a potential depends on the way and is left out; `elastic_energy` [...] J
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
-      when they are asked for. Of rods whose frames are unknown curvature, twist and axial strain at a clip are those
-      just beyond it, and tension the mean of both sides
+      when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain at a clip are
+      those just beyond it, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node, and half of what they apply in the
       middle of each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
@@ -166,6 +182,8 @@ class Equilibrium(eqx.Module):
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not
       examined, under loads without a potential and in the continuum. Computed when asked for
+    - `free_index` [...] int: the same where the pose of an end was unknown, this being free; else `None`. `index`,
+      `critical` and `neutral` are those of the rod between clamps at the poses that were found
     - `neutral` [...] bool: the whole rod can turn about an axis and stays in equilibrium, as between clamps on one
       line. Computed when asked for
     - `scene`: what was solved, its sliding clips `at` the arclengths where the rod passes them
@@ -197,10 +215,27 @@ class Equilibrium(eqx.Module):
     scene: Scene
     state: SolverState
     discretization: str = eqx.field(static=True)
+    shear_strain: Float[Array, "... n+1 2"] | None = None
+    free_index: Int[Array, "..."] | None = None
 
     @property
     def tangents(self) -> Float[Array, "... n+1 3"]:
-        return self.frames[..., 2]
+        if self.shear_strain is None:
+            return self.frames[..., 2]
+        slopes = _slopes(self)
+        return slopes / jnp.sqrt(jnp.sum(slopes**2, axis=-1, keepdims=True))
+
+    def __str__(self) -> str:
+        """How the solve ended, and the largest and last values along the rod with their units."""
+        return "\n".join([f"Equilibrium of {_stack_told(self)}", *(f"  {name}: {told}" for name, told in _told(self))])
+
+    def _repr_html_(self) -> str:
+        """The same as a table, which notebooks show."""
+        rows = "".join(
+            f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(told)}</td></tr>"
+            for name, told in _told(self)
+        )
+        return f"<table><caption>Equilibrium of {escape(_stack_told(self))}</caption>{rows}</table>"
 
     @property
     def clip_forces(self) -> Float[Array, "... clips 3"]:
@@ -337,6 +372,7 @@ def equilibrium(
         scene=scene,
         state=dataclasses.replace(found.state, units=units),
         discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
+        shear_strain=results.shear_strain,
     )
 
 
@@ -508,6 +544,15 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
 
+@compiled
+def _slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
+    """phi' of a rod with shear."""
+    frames, shear = equilibrium.frames, equilibrium.shear_strain
+    assert shear is not None
+    along = 1 + equilibrium.axial_strain[..., None]
+    return jnp.sum(frames * jnp.concatenate([shear, along], axis=-1)[..., None, :], axis=-1)
+
+
 @over_leading_axes
 def _clip_moments(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
     form, point = form_and_point(equilibrium)
@@ -552,17 +597,20 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
 
 
-def describe(equilibrium: Equilibrium) -> str:
+def describe(equilibrium: Equilibrium | Described) -> str:
     """How a solve ended, in words, what is special about the equilibrium, and the estimated errors of its mesh.
 
-    Of several: each with its count, and the largest errors of those that converged.
+    Of several: each with its count, and the largest errors of those that converged. Of a harness: of the whole, then
+    of each rod.
     """
+    if isinstance(equilibrium, Described):
+        return equilibrium.in_words()
     instance(equilibrium, "equilibrium", Equilibrium)
     examination = jax.tree.map(np.asarray, _examination(equilibrium))  # JAX would compile each comparison
     converged, axial_strain = np.asarray(equilibrium.converged), np.asarray(equilibrium.axial_strain)
     potential = np.full(converged.shape, has_potential(equilibrium.scene))
     remarks = {
-        "a saddle: there are motions that lower the energy": examination.index > 0,
+        "a saddle: there are motions that lower the energy": _index(equilibrium, examination) > 0,
         "neutral: the whole rod can turn about an axis and stays in equilibrium": examination.neutral,
         "critical (a motion has no stiffness left), so that derivatives are not numbers": examination.critical,
         "under loads without a potential, so that no energy tells whether it is stable": ~np.asarray(potential),
@@ -578,6 +626,58 @@ def describe(equilibrium: Equilibrium) -> str:
         return "; ".join([_outcome(equilibrium), *strain, *special, *_contacts_told(equilibrium), *told])
     special = [f"{count} {remark}" for remark, count in counts.items() if count]
     return "\n".join([_outcome(equilibrium), *strain, *special, *told])
+
+
+def _stack_told(equilibrium: Equilibrium) -> str:
+    shape, segments = equilibrium.s.shape[:-1], equilibrium.s.shape[-1] - 1
+    scenes = f"{' x '.join(map(str, shape))} scenes, " if shape else ""
+    return f"{scenes}{segments} segments"
+
+
+def _told(equilibrium: Equilibrium) -> list[tuple[str, str]]:
+    """What `print` shows: of several rods the range of each value. Nothing that takes a program to be computed."""
+    if not is_known(equilibrium):
+        return [("values", "not known inside jax.jit, vmap or grad")]
+    codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
+    many = equilibrium.status.ndim > 0
+    outcome = "; ".join(
+        f"{count} {Status(code).message}" if many else Status(code).message
+        for code, count in zip(codes, counts, strict=True)
+    )
+
+    def between(values: Any, unit: str) -> str:
+        values = np.asarray(values)
+        low, high = float(np.min(values)), float(np.max(values))
+        return f"{low + 0.0:.4g} {unit}" if low == high else f"{low + 0.0:.4g} to {high + 0.0:.4g} {unit}"
+
+    def vectors(values: Any, unit: str) -> str:
+        if many:
+            return f"{between(np.linalg.norm(values, axis=-1), unit)} in magnitude"
+        return value_text(np.asarray(values), unit)
+
+    told = [("status", outcome), ("residual", between(equilibrium.residual, "EI/L^2"))]
+    told.append(("iterations", between(equilibrium.iterations, "").strip()))
+    told += [("length", between(equilibrium.scene.rod.length, "m")), ("energy", between(equilibrium.energy, "J"))]
+    told += [
+        (name.replace("_", " "), between(getattr(equilibrium, name), unit))
+        for name, unit in (
+            ("elastic_energy", "J"),
+            ("total_twist", "rad"),
+            ("curvature", "1/m"),
+            ("tension", "N"),
+            ("axial_strain", ""),
+        )
+    ]
+    told += [
+        (f"{end} {kind}", vectors(getattr(equilibrium, f"{end}_{kind}"), unit))
+        for end in ("start", "end")
+        for kind, unit in (("force", "N"), ("moment", "N m"))
+    ]
+    return [(name, line.strip()) for name, line in told]
+
+
+def _index(equilibrium: Equilibrium, examination: _Examination) -> Int[np.ndarray, "..."]:
+    return np.asarray(examination.index if equilibrium.free_index is None else equilibrium.free_index)
 
 
 def _is_overstretched(equilibrium: Equilibrium) -> Bool[np.ndarray, "..."]:
@@ -754,6 +854,17 @@ def warn_of_unknown_mesh(segments: int) -> None:
         "or grad: values and derivatives differ by those errors from what the same solve gives outside, on a mesh "
         "chosen for rtol; segments= states a mesh (this is said once)",
         MeshWarning,
+    )
+
+
+@functools.cache
+def warn_of_single_precision() -> None:
+    """Once in a process; the errors are those of `experiments/float32.py`."""
+    warn(
+        "the numbers are float32, JAX's default: beside double precision the shape is off by 3e-8 to 2e-4 of the "
+        "length and the forces by 4e-6 to 5e-4, more on finer meshes; obstacles need float64. For more call "
+        'jax.config.update("jax_enable_x64", True) before anything else (this is said once)',
+        PrecisionWarning,
     )
 
 

@@ -22,6 +22,12 @@ need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the 
 `parameters/<key>` in SI units; each has the attributes `units` and `description`. Attributes of the file: the texts
 `scene` and `over`, and what is in `rodjax.sweeps.manifest.Manifest`, with its `fingerprint`.
 
+Further quantities are written where they are asked for (`also=["bend_radius", "clip_forces"]`, `--also
+bend_radius,clip_forces`): `bend_radius` the smallest one of the centerline, `clearance` to each obstacle, `clip_forces`
+and `clip_moments` of each clip, `obstacle_forces` of each obstacle, `largest_tension`, `least_tension`,
+`largest_strain`. `rodjax sweep --csv` writes all but the nodes as a table too, `rodjax.sweeps.result.write_csv` that of
+a sweep that is there.
+
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
 solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result; and a file with `.lock`, by
 which a second process is told that one is at work. Chunks are the same whatever the shard, whoever solves them and

@@ -22,6 +22,7 @@ from rodjax.solving.result import (
 )
 from rodjax.sweeps.cases import CaseScenes
 from rodjax.sweeps.manifest import Manifest
+from rodjax.sweeps.quantities import QUANTITIES
 from rodjax.warn import silenced
 
 RESULTS = (
@@ -37,6 +38,7 @@ DESCRIPTIONS = FIELDS | {
     "moment_error": ("1", "of the mesh: largest error of the moment, by the largest moment in the rod"),
     "curvature_error": ("1", "of the mesh: largest error of the curvature, by the largest curvature"),
     "segments": ("1", "of the mesh on which the case was solved"),
+    **{name: (quantity.unit, quantity.description) for name, quantity in QUANTITIES.items()},
 }
 
 INTEGERS = ("case", "status", "iterations", "segments")
@@ -65,15 +67,16 @@ def solved_chunk(chunk: Chunk) -> dict[str, np.ndarray]:
     # What did not converge or is strained too much is said in the end, for all together; each case has its errors.
     with silenced(NotConvergedWarning, OverstretchedWarning, MeshWarning):
         result = solve_batch(scenes, **settings)
-        arrays = {name: values[: len(cases)] for name, values in _values(result).items()}
+        arrays = {name: values[: len(cases)] for name, values in _values(result, manifest).items()}
         arrays["segments"] = np.full(len(cases), manifest.segments)
         if manifest.rtol:
             arrays = _refined(arrays, scenes, result, manifest, settings)
     return {"case": cases} | arrays | {f"parameters/{key}": values for key, values in chunk.values.items()}
 
 
-def _values(result: Equilibrium) -> dict[str, np.ndarray]:
-    return {name: np.asarray(getattr(result, name)) for name in RESULTS} | _errors(result)
+def _values(result: Equilibrium, manifest: Manifest) -> dict[str, np.ndarray]:
+    also = {name: np.asarray(QUANTITIES[name].of(result)) for name in manifest.quantities}
+    return {name: np.asarray(getattr(result, name)) for name in RESULTS} | _errors(result) | also
 
 
 def _errors(result: Equilibrium) -> dict[str, np.ndarray]:
@@ -107,7 +110,10 @@ def _refined(
         scenes, result = _rows((scenes, result), which)
         settings = settings | {"segments": segments}
         result = solve_batch(scenes, guess=result, **settings)
-        found = _values(result) | {"nodes": _nodes_at(result, s[cases]), "segments": np.full(len(cases), segments)}
+        found = _values(result, manifest) | {
+            "nodes": _nodes_at(result, s[cases]),
+            "segments": np.full(len(cases), segments),
+        }
         # What does not converge on a finer mesh stays as it was, above `rtol`.
         better = np.flatnonzero(found["converged"])
         for name, values in found.items():

@@ -16,12 +16,12 @@ from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.sweeps.cases import MAX_CASES, SweepError
 
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.
-FORMAT = 3
+FORMAT = 4
 
 
 class Manifest(NamedTuple):
     """All that the result depends on. `scene_sha256` and `over_sha256` are of the texts; `shard` is i/n; `rtol` is 0
-    where the mesh is given.
+    where the mesh is given; `also`: names of further quantities, with commas.
     """
 
     scene_sha256: str
@@ -37,6 +37,7 @@ class Manifest(NamedTuple):
     version: str
     jaxlib: str
     platform: str
+    also: str = ""
 
     @property
     def fingerprint(self) -> str:
@@ -53,6 +54,11 @@ class Manifest(NamedTuple):
         return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self.cases))
 
     @property
+    def quantities(self) -> list[str]:
+        """Names of those that are written beside the results of every sweep."""
+        return [name for name in self.also.split(",") if name]
+
+    @property
     def rows(self) -> int:
         """Number of cases of this shard."""
         return sum(len(self.cases_of(chunk)) for chunk in self.chunks)
@@ -63,7 +69,8 @@ class Manifest(NamedTuple):
     @classmethod
     def of(cls, attributes: Mapping[str, Any], path: Path) -> "Manifest":
         try:
-            manifest = cls(**{name: kind(attributes[name]) for name, kind in cls.__annotations__.items()})
+            known = cls._field_defaults | dict(attributes)
+            manifest = cls(**{name: kind(known[name]) for name, kind in cls.__annotations__.items()})
             index, count = map(int, manifest.shard.split("/"))
         except (KeyError, TypeError, ValueError):
             raise SweepError(f"{path} is not of rodjax sweep, or of another version of it") from None

@@ -1,6 +1,8 @@
 """The file that a sweep gives: written, merged of shards, and summed up."""
 
+import csv
 import dataclasses
+import io
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -10,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from rodjax.atomic_write import seal
+from rodjax.atomic_write import replace_file, seal
 from rodjax.checks import file_path
 from rodjax.io.scene_keys import unit_of
 from rodjax.solving.status import Status
@@ -89,7 +91,7 @@ def arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> dic
 
     with opened(path) as file:
         file.visititems(add)
-    missing = [name for name in ("case", "segments", *RESULTS, *ERRORS) if name not in arrays]
+    missing = [name for name in ("case", "segments", *RESULTS, *ERRORS, *manifest.quantities) if name not in arrays]
     if missing:
         raise SweepError(f"{path} is damaged: it lacks {', '.join(missing)}")
     if not np.array_equal(arrays["case"], cases):
@@ -103,7 +105,7 @@ def arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> dic
 
 def _kind_and_shape(name: str, values: np.ndarray, manifest: Manifest) -> tuple[str, tuple[int, ...]]:
     """What NumPy calls the numbers of a dataset, and their shape for each case."""
-    if name.startswith("parameters/"):
+    if name.startswith("parameters/") or name in manifest.quantities:
         return "f", values.shape[1:]
     kind = "b" if name in ("converged", "stable") else "i" if name in INTEGERS else "f"
     if name == "nodes":
@@ -148,6 +150,32 @@ def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.
     else:
         dataset.attrs["units"], dataset.attrs["description"] = DESCRIPTIONS[name]
     return dataset
+
+
+def write_csv(sweep: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Writes all of a sweep but its `nodes` as comma-separated values, one row a case; components of vectors go by
+    their numbers, as in the keys of scene files. The names of the columns end with their units.
+
+    Raises `SweepError` for what is no sweep, `OSError` where the file cannot be written.
+    """
+    columns: dict[str, np.ndarray] = {}
+
+    def add(name: str, entry: Any) -> None:
+        if isinstance(entry, h5py.Dataset) and name != "nodes":
+            unit, values = entry.attrs["units"], entry[()]
+            for index in np.ndindex(values.shape[1:]):
+                place = "".join(f".{k}" for k in index)
+                columns[f"{name.removeprefix('parameters/')}{place} [{unit}]"] = values[(slice(None), *index)]
+
+    with opened(file_path(sweep, "sweep")) as file:
+        Manifest.of(file.attrs, Path(sweep))
+        file.visititems(add)
+    first = ["case [1]", *(name for name in columns if name != "case [1]")]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(first)
+    writer.writerows(zip(*(columns[name].tolist() for name in first), strict=True))
+    replace_file(file_path(path, "path", ".csv"), text.getvalue().encode())
 
 
 def summary(path: Path) -> Summary:

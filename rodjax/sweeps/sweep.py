@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -22,11 +22,13 @@ from rodjax.file_lock import LockedError, locked
 from rodjax.io.scene_file import SceneFile
 from rodjax.model.scene import check_without_friction
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
-from rodjax.solving.equilibrium import DEFAULT_RTOL, solve
+from rodjax.solving.equilibrium import DEFAULT_RTOL
 from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.solve import solve
 from rodjax.sweeps.cases import MAX_CASES, CaseReader, SweepError
 from rodjax.sweeps.chunk import Arrays, Chunk, solved_chunk
 from rodjax.sweeps.manifest import FORMAT, Manifest, differences, is_sealed, manifest_of, sha256
+from rodjax.sweeps.quantities import checked_quantities
 from rodjax.sweeps.result import Summary, arrays, assemble, summary
 from rodjax.version import __version__
 from rodjax.warn import silenced
@@ -81,6 +83,7 @@ def sweep(
     shard: tuple[int, int] = (1, 1),
     chunk: int | None = None,
     resume: bool = False,
+    also: Sequence[str] = (),
     executor: Executor | None = None,
     threads: int | None = None,
     progress: bool = False,
@@ -99,6 +102,8 @@ def sweep(
         whose machines do not talk to each other.
     - `chunk`: cases solved at a time; `None` for 1024, or as it was where one resumes.
     - `resume`: go on with what an earlier call, which was stopped, left.
+    - `also`: names of further quantities to write, such as `["bend_radius", "clip_forces"]`; `rodjax.sweeps` lists
+        them.
     - `executor`: what solves the chunks, anything with the interface of `concurrent.futures.Executor`, such as
         `client.get_executor()` of Dask; files are read and written here alone. `None`: threads of this process.
     - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core.
@@ -128,6 +133,7 @@ def sweep(
     if resume and chunk is None:
         chunk = _earlier_chunk(output, parts)
     manifest = _manifest(reader, shard, chunk)
+    manifest = manifest._replace(also=",".join(checked_quantities(also, reader.first.scenes[0])))
     if not manifest.chunks:
         raise SweepError(
             f"shard {manifest.shard} would be empty: {_chunks(manifest)}; take fewer shards or a smaller chunk"

@@ -222,6 +222,8 @@ class SceneMaker:
             scene.distributed,
             clips,
             obstacles,
+            scene.potentials,
+            scene.point_couples,
         )
 
     def _part(self, name: str, key: tuple, make: Callable[[], Any]) -> Any:

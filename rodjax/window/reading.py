@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from rodjax.analysis.clearance import places, radius_at
 from rodjax.analysis.curvature import curvature_along, curvature_within
+from rodjax.analysis.samples import framed_at
 from rodjax.discretization.hermite import Curve
-from rodjax.plot import framed_at
 from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium
 

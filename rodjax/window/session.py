@@ -14,7 +14,7 @@ from rodjax.checks import instance, whole_number
 from rodjax.model.scene import Scene, has_potential, slides
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import numpy_first
-from rodjax.solving.equilibrium import MAX_SEGMENTS, solve
+from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -23,6 +23,7 @@ from rodjax.solving.result import (
     OverstretchedWarning,
     describe,
 )
+from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.window.bounds import depths, out_of_reach, reaches, within_obstacle
 from rodjax.window.controls import Controls, SceneMaker, controls_of, handles_of, sliders_of, with_frames

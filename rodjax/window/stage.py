@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rodjax.checks import leaf
 from rodjax.model.along import Along
+from rodjax.model.surfaces import surfaces
 from rodjax.plot import largest_radius, radius_along
-from rodjax.routing.surfaces import surfaces
 from rodjax.window import tube
 from rodjax.window.controls import Pose, center_of
 from rodjax.window.reading import Reading

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.triangle_mesh import Mesh
-from rodjax.plot import quads
 from rodjax.programs.compilation import compiled
 
 # Corners of faces; a triangle has its last one twice.
@@ -24,6 +23,8 @@ BEYOND = 0.08
 FACES_AROUND = 32
 FACES_ALONG = 12
 CELLS = 28
+# A collar, by the radius of the rod: its own, and half of its length.
+COLLAR_RADIUS, COLLAR_LENGTH = 1.7, 1.4
 # What is deeper within a pipe, by its radius, is no flat face of it.
 LEAST_DEPTH = 0.03
 # Triangles of a mesh at most; more are joined.
@@ -53,6 +54,12 @@ def surfaces(obstacles: Sequence[Obstacle], points: Float[np.ndarray, "p 3"]) ->
     for own, faces in zip(parts, near, strict=True):
         faces += [_patch(part, seen, region) for part in own if isinstance(part, Plane)]
     return [np.concatenate([np.zeros((0, 4, 3)), *faces]) for faces in near]
+
+
+def quads(grid: Float[np.ndarray, "p q 3"]) -> Float[np.ndarray, "f 4 3"]:
+    """The faces between neighbours in a grid of points, row by row."""
+    corners = (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1])
+    return np.stack(corners, axis=2).reshape(-1, 4, 3)
 
 
 def parts_of(obstacle: Obstacle) -> list[Obstacle]:
@@ -104,6 +111,13 @@ def round_faces(start, end, radius: float, extent: float, has_caps: bool) -> Fac
     angles = np.linspace(0.0, 2 * np.pi, FACES_AROUND + 1)
     around = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     return quads(start + profile[:, :1, None] * axis + profile[:, 1:, None] * around)
+
+
+def collar(position, axis, radius: float) -> Faces:
+    """What shows a clip: a short cylinder around a rod of this radius [m], about the unit vector `axis`."""
+    reach = COLLAR_LENGTH * radius * np.asarray(axis)
+    position = np.asarray(position)
+    return round_faces(position - reach, position + reach, COLLAR_RADIUS * radius, 1e3 * radius, has_caps=False)
 
 
 def normals_of(axis: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -1,0 +1,134 @@
+"""A harness: a trunk that branches three times to five connectors, under its weight and held by clips; and its cost.
+
+    python experiments/harness.py --out DIR [--repeats N]
+
+Draws all cables, prints one row for each, and times stars of cables of 32 elements against one such cable: the solve
+from the last equilibrium as the ends of the cables move to and fro by 1 mm. Writes `harness.png` and `harness.csv`.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from measuring import conditions, save_rows, set_up
+
+import rodjax as rj
+from rodjax.plot import plot_harness
+
+GRAVITY = (0.0, 0.0, -9.81)
+ALONG = rj.frame((1, 0, 0))
+# Of the cables of the star.
+ELEMENTS = 32
+
+
+class Timed(NamedTuple):
+    """A line of harness.csv."""
+
+    cables: int
+    first_s: float
+    warm_ms: float
+    iterations: int
+
+
+def cable(length: float, radius: float) -> rj.Rod:
+    return rj.Rod.circular(length, radius, 1e7, poisson_ratio=0.5, density=1500.0)
+
+
+def branching() -> rj.Harness:
+    """Fan-outs of 10 g, whose branches leave at 30 degrees to both sides."""
+
+    def leaving(side: float) -> Any:
+        return rj.frame((np.cos(np.pi / 6), side * np.sin(np.pi / 6), 0.0), (0, 0, 1))
+
+    def branch(joint: str, side: float, length: float, position: Sequence[float], tangent: Sequence[float]) -> rj.Scene:
+        end = rj.Clamp(position, rj.frame(tangent, (0, 0, 1)))
+        return rj.Scene(cable(length, 3e-3), rj.Joint(joint, leaving(side)), end, gravity=GRAVITY)
+
+    trunk_clips = [rj.Clip(0.15, (0.15, 0.0, -0.005), (1, 0, 0)), rj.Clip(0.3, (0.29, 0.0, -0.01), (1, 0, 0))]
+    straight = [rj.Joint(name, ALONG) for name in ("first", "second", "third")]
+    cables = {
+        "trunk": rj.Scene(
+            cable(0.42, 8e-3), rj.Clamp((0, 0, 0), ALONG), straight[0], gravity=GRAVITY, clips=trunk_clips
+        ),
+        "middle": rj.Scene(cable(0.25, 6e-3), straight[0], straight[1], gravity=GRAVITY),
+        "tail": rj.Scene(cable(0.25, 5e-3), straight[1], straight[2], gravity=GRAVITY),
+        "A": branch("first", 1, 0.3, (0.6, 0.2, 0.02), (0.3, 1, 0)),
+        "B": branch("first", -1, 0.34, (0.62, -0.22, -0.02), (0.5, -1, 0)),
+        "C": branch("second", 1, 0.3, (0.86, 0.2, 0.05), (0.2, 1, 0.3)),
+        "D": branch("third", 1, 0.26, (1.08, 0.12, 0.0), (1, 0.6, 0)),
+        "E": branch("third", -1, 0.28, (1.08, -0.14, -0.05), (1, -0.6, -0.3)),
+    }
+    bodies = {name: rj.Body(mass=0.01) for name in ("first", "second", "third")}
+    return rj.Harness(cables, bodies)
+
+
+def star(count: int, moved: float) -> rj.Harness:
+    """Cables from a hub, their far ends on a circle that moves."""
+    cables = {}
+    for k in range(count):
+        x, y = np.cos(2 * np.pi * k / count), np.sin(2 * np.pi * k / count)
+        outwards = rj.frame((x, y, 0), (0, 0, 1))
+        hub = rj.Joint("hub", outwards, (0.05 * x, 0.05 * y, 0))
+        end = rj.Clamp((0.45 * x + moved, 0.45 * y, 0), outwards)
+        cables[f"cable {k}"] = rj.Scene(cable(0.5, 5e-3), hub, end, gravity=GRAVITY)
+    return rj.Harness(cables)
+
+
+def one(moved: float) -> rj.Scene:
+    return rj.Scene(cable(0.5, 5e-3), rj.Clamp((0.05, 0, 0), ALONG), rj.Clamp((0.45 + moved, 0, 0), ALONG), GRAVITY)
+
+
+def timed(cables: int, make: Callable[[float], Any], repeats: int) -> Timed:
+    begin = time.perf_counter()
+    found = rj.solve(make(0.0), segments=ELEMENTS)
+    first = time.perf_counter() - begin
+    scenes, seconds = [make(0.001), make(0.0)], []
+    for k in range(repeats + 4):
+        begin = time.perf_counter()
+        found = rj.solve(scenes[k % 2], segments=ELEMENTS, guess=found)
+        jax.block_until_ready(found.energy)
+        seconds.append(time.perf_counter() - begin)
+    assert bool(found.converged)
+    return Timed(cables, first, 1e3 * float(np.median(seconds[4:])), int(found.iterations))
+
+
+def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list[Timed]]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("harness"))
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--cables", type=int, nargs="*", default=[5, 20])
+    parser.add_argument("--rtol", type=float, default=1e-3)
+    arguments = parser.parse_args(argv)
+    set_up()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    print(conditions())
+    with rj.numpy_first(True):
+        result = rj.solve(branching(), rtol=arguments.rtol)
+    print(rj.describe(result))
+    for name, rod in result.items():
+        force, moment = (np.linalg.norm(values) for values in (rod.end_force, rod.end_moment))
+        bend = 1 / float(np.max(rod.curvature))
+        print(
+            f"{name:7} {rod.s.shape[-1] - 1:4} elements, {force:.3f} N, {moment:.4f} N m at its end, bend {bend:.3f} m"
+        )
+    plot_harness(result).savefig(arguments.out / "harness.png", dpi=150)
+    rows = []
+    if arguments.cables:
+        rows.append(timed(1, one, arguments.repeats))
+    rows += [
+        timed(count, lambda moved, count=count: star(count, moved), arguments.repeats) for count in arguments.cables
+    ]
+    for row in rows:
+        print(
+            f"{row.cables:3} cables: first {row.first_s:6.1f} s, then {row.warm_ms:.2f} ms, {row.iterations} iterations"
+        )
+    save_rows(rows, arguments.out / "harness.csv")
+    return result, rows
+
+
+if __name__ == "__main__":
+    main()

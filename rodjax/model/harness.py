@@ -1,0 +1,382 @@
+"""Harnesses: rods whose ends meet in rigid bodies with unknown poses."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
+from rodjax.geometry.rotations import from_frame
+from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
+
+# Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
+ENDS = ("start", "end")
+
+
+class Body(eqx.Module):
+    """What acts on a joint of a harness beside its rods.
+
+    `force`: (3,) [N] at its position, and `moment`: (3,) [N m], both dead, global axes; `mass` [kg] at its position,
+    under the gravity of its rods; `support`: `Clamp`, `Pin`, `Hinge`, `Slider` or `Spring`, which holds the position
+    and the axes of the body as it holds those of an end, or `None`.
+    """
+
+    force: Float[Array, "3"] | None
+    moment: Float[Array, "3"] | None
+    mass: Float[Array, ""] | None
+    support: Support | None
+
+    def __init__(self, force: Any = None, moment: Any = None, mass: Any = 0.0, support: Support | None = None):
+        self.force = None if force is None else leaf(vector(force, "force"))
+        self.moment = None if moment is None else leaf(vector(moment, "moment"))
+        mass = not_negative(0.0 if mass is None else mass, "mass")
+        self.mass = None if is_known(mass) and float(mass) == 0 else leaf(mass)
+        if support is not None:
+            instance(support, "support", (Clamp, Pin, Hinge, Slider, Spring))
+        self.support = support
+
+
+class Harness(eqx.Module):
+    """Rods whose ends are fixed in common rigid bodies: trees and loops.
+
+    **Arguments:**
+
+    - `cables`: `{name: Scene}`; an end that is a `Joint` belongs to the body of that name.
+    - `joints`: `{name: Body}`, for bodies with loads or supports; others need not be named.
+    - `contact`: between rods; only `False` so far.
+
+    Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
+    and for a scene with an obstacle, a potential field, a sliding clip or a load without a potential.
+    """
+
+    scenes: tuple[Scene, ...]
+    bodies: tuple[Body, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self, cables: Mapping[str, Scene], joints: Mapping[str, Body] | None = None, contact: Any = False
+    ) -> None:
+        instance(cables, "cables", Mapping)
+        joints = {} if joints is None else joints
+        instance(joints, "joints", Mapping)
+        if contact is not False:
+            raise ValueError(
+                f"contact must be False: that between the rods of a harness is not computed, got {contact!r}"
+            )
+        for name, scene in cables.items():
+            instance(name, "the name of a cable", str)
+            instance(scene, f"cables[{name!r}]", Scene)
+            _check_scene(scene, f"cables[{name!r}]")
+        found = [end.name for scene in cables.values() for end in (scene.start, scene.end) if isinstance(end, Joint)]
+        for name, body in joints.items():
+            instance(body, f"joints[{name!r}]", Body)
+            if name not in found:
+                known = ", ".join(map(repr, dict.fromkeys(found))) or "none"
+                raise ValueError(f"joints[{name!r}] has no rod: the ends of the cables name {known}")
+        if not found:
+            raise ValueError("a harness must have an end that is a Joint; rodjax.solve takes scenes without one")
+        self.names = tuple(cables)
+        self.scenes = tuple(cables.values())
+        self.joint_names = tuple(dict.fromkeys(found))
+        self.bodies = tuple(joints.get(name, Body()) for name in self.joint_names)
+        _check_held(self)
+        for name, body in zip(self.joint_names, self.bodies, strict=True):
+            if body.mass is not None:
+                _gravity(self, name)
+
+    def __getitem__(self, name: str) -> Scene:
+        return self.scenes[self.names.index(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether all loads have one: a dead moment has none on a body that may turn about more than one axis."""
+        return all(body.moment is None or _motions(body.support).rotations.shape[1] < 2 for body in self.bodies)
+
+
+def _check_scene(scene: Scene, name: str) -> None:
+    if scene.rod.length.ndim:
+        raise ValueError(f"{name} must be a single scene, got a stack of shape {scene.rod.length.shape}")
+    for end in ENDS:
+        support = getattr(scene, end)
+        if isinstance(support, Movable) and not isinstance(support, Joint):
+            raise ValueError(
+                f"{name}.{end} must not be a {type(support).__name__} in a harness: make it a Joint, and give its Body "
+                "that support"
+            )
+    check_movable(scene, name)
+
+
+def check_movable(scene: Scene, name: str) -> None:
+    """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
+    for part, why in (("obstacles", "obstacles"), ("potentials", "fields")):
+        if getattr(scene, part):
+            raise ValueError(f"{name}.{part} must be () where ends have unknown poses: {why} are not computed there")
+    if slides(scene):
+        raise ValueError(f"{name}.clips must not slide where ends of the rod have unknown poses")
+    if not has_potential(scene):
+        raise ValueError(f"{name} must have no load without a potential where ends of the rod have unknown poses")
+    if scene.rod.length.dtype != jnp.float64:
+        raise ValueError(f"{name} must be in double precision: jax.config.update('jax_enable_x64', True) before")
+
+
+def _check_held(harness: Harness) -> None:
+    """Each rod hangs on something that holds a position."""
+    groups = {name: name for name in harness.joint_names}
+
+    def root(name: str) -> str:
+        while groups[name] != name:
+            name = groups[name]
+        return name
+
+    held = {name for name, body in zip(harness.joint_names, harness.bodies, strict=True) if body.support is not None}
+    for scene in harness.scenes:
+        of_rod = [end.name for end in (scene.start, scene.end) if isinstance(end, Joint)]
+        if len(of_rod) == 2:
+            groups[root(of_rod[0])] = root(of_rod[1])
+        elif of_rod and not isinstance(_other(scene), Free):
+            held.add(of_rod[0])
+        if of_rod and scene.clips:
+            held.add(of_rod[0])
+    is_held = {root(name) for name in held}
+    for name in harness.joint_names:
+        if root(name) not in is_held:
+            raise ValueError(f"nothing holds the rods at the joint {name!r}: give an end a support, or its Body")
+
+
+def _other(scene: Scene) -> Support:
+    return scene.end if isinstance(scene.start, Joint) else scene.start
+
+
+def _gravity(harness: Harness, name: str) -> Float[Array, "3"]:
+    """That of the rods at a joint."""
+    found = [
+        scene.gravity
+        for scene in harness.scenes
+        for end in (scene.start, scene.end)
+        if isinstance(end, Joint) and end.name == name and scene.gravity is not None
+    ]
+    if not found:
+        raise ValueError(f"joints[{name!r}].mass needs a rod with gravity at the joint, got none")
+    if is_known(found) and any(np.any(np.asarray(one) != np.asarray(found[0])) for one in found):
+        raise ValueError(f"joints[{name!r}].mass must have rods of one gravity, got several")
+    return found[0]
+
+
+class _Motions(NamedTuple):
+    """How a support lets a body move: from where, along which directions, about which axes, against which springs."""
+
+    position: Any
+    frame: Any
+    translations: Any
+    rotations: Any
+    translation: Any
+    rotation: Any
+
+
+def _motions(support: Support | None) -> _Motions:
+    none, everything = np.zeros((3, 0)), np.eye(3)
+    if isinstance(support, Spring):
+        inner = _motions(support.support)
+        translations, rotations = inner.translations, inner.rotations
+        if support.translation is not None and translations.shape[1] == 0:
+            translations = everything
+        if support.rotation is not None and rotations.shape[1] == 0:
+            rotations = everything
+        return _Motions(inner.position, inner.frame, translations, rotations, support.translation, support.rotation)
+    if isinstance(support, Clamp):
+        return _Motions(support.position, support.frame, none, none, None, None)
+    if isinstance(support, Pin):
+        return _Motions(support.position, None, none, everything, None, None)
+    if isinstance(support, Hinge):
+        return _Motions(support.position, support.frame, none, support.axis[:, None], None, None)
+    if isinstance(support, Slider):
+        rotations = everything if support.frame is None else none
+        return _Motions(support.position, support.frame, support.directions.T, rotations, None, None)
+    return _Motions(None, None, everything, everything, None, None)
+
+
+class Bodies(eqx.Module):
+    """All bodies of a harness, stacked; SI units, global axes.
+
+    `position`, `frame`: of their supports, of free ones zero and the identity; `translations`, `rotations`: columns,
+    the directions and axes along which they move, zero beyond these; springs and loads, `None` where no body has one.
+    """
+
+    position: Float[Array, "j 3"]
+    frame: Float[Array, "j 3 3"]
+    translations: Float[Array, "j 3 3"]
+    rotations: Float[Array, "j 3 3"]
+    force: Float[Array, "j 3"] | None
+    moment: Float[Array, "j 3"] | None
+    translation: Float[Array, "j 3 3"] | None
+    rotation: Float[Array, "j 3 3"] | None
+    has_frame: tuple[bool, ...] = eqx.field(static=True)
+    columns: tuple[int, ...] = eqx.field(static=True)  # those of `motions` that are there
+
+    @staticmethod
+    def of(harness: Harness) -> "Bodies":
+        dtype = harness.scenes[0].rod.length.dtype
+        found = [_motions(body.support) for body in harness.bodies]
+        forces = [_force_on(harness, name) for name in harness.joint_names]
+        columns = [
+            6 * j + first + k
+            for j, motions in enumerate(found)
+            for first, basis in ((0, motions.translations), (3, motions.rotations))
+            for k in range(basis.shape[1])
+        ]
+        return Bodies(
+            position=_stacked([motions.position for motions in found], np.zeros(3), dtype),
+            frame=_stacked([motions.frame for motions in found], np.eye(3), dtype),
+            translations=_stacked([_padded(motions.translations) for motions in found], np.zeros((3, 3)), dtype),
+            rotations=_stacked([_padded(motions.rotations) for motions in found], np.zeros((3, 3)), dtype),
+            force=_stacked_if_any(forces, np.zeros(3), dtype),
+            moment=_stacked_if_any([body.moment for body in harness.bodies], np.zeros(3), dtype),
+            translation=_stacked_if_any([_matrix(motions.translation) for motions in found], np.zeros((3, 3)), dtype),
+            rotation=_stacked_if_any([_matrix(motions.rotation) for motions in found], np.zeros((3, 3)), dtype),
+            has_frame=tuple(motions.frame is not None for motions in found),
+            columns=tuple(columns),
+        )
+
+    @property
+    def motions(self) -> Float[Array, "6j k"]:
+        """The directions (u, r) in which the bodies can move, one column each; rows of body after body."""
+        count = len(self.position)
+        each = jnp.zeros((count, 6, count, 6), self.position.dtype)
+        j = np.arange(count)
+        each = each.at[j, :3, j, :3].set(self.translations).at[j, 3:, j, 3:].set(self.rotations)
+        return each.reshape(6 * count, 6 * count)[:, np.array(self.columns, int)]
+
+    def energies(
+        self, positions: Float[Array, "j 3"], frames: Float[Array, "j 3 3"], turns: Float[Array, "j 3"]
+    ) -> Float[Array, "j"]:
+        """Of springs and dead loads [J]; the work of dead moments is that of `turns`, rotation vectors from where it is
+        counted.
+        """
+        energies = jnp.zeros(len(positions), positions.dtype)
+        if self.force is not None:
+            energies -= jnp.sum(self.force * positions, axis=1)
+        if self.moment is not None:
+            energies -= jnp.sum(self.moment * turns, axis=1)
+        if self.translation is not None:
+            away = positions - self.position
+            energies += jnp.einsum("ji,jik,jk->j", away, self.translation, away) / 2
+        if self.rotation is not None:
+            turned = rotation_vectors(frames, self.frame)
+            energies += jnp.einsum("ji,jik,jk->j", turned, self.rotation, turned) / 2
+        return energies
+
+    def followed(
+        self, others: "Bodies", positions: Float[Array, "j 3"], frames: Float[Array, "j 3 3"]
+    ) -> tuple[Float[Array, "j 3"], Float[Array, "j 3 3"]]:
+        """Poses under these supports, of those under others: displaced and turned from them as before."""
+        away = jnp.einsum("jik,jlk,jl->ji", self.translations, others.translations, positions - others.position)
+        turned = rotation_vectors(frames, others.frame)
+        turned = jnp.einsum("jik,jlk,jl->ji", self.rotations, others.rotations, turned)
+        is_framed = np.array(self.has_frame)[:, None, None]
+        return self.position + away, jnp.where(is_framed, rotated(self.frame, turned), frames)
+
+
+def rotated(frames: Float[Array, "j 3 3"], turns: Float[Array, "j 3"]) -> Float[Array, "j 3 3"]:
+    """Frames turned by rotation vectors, global axes."""
+    return jax.vmap(rotate)(frames, turns)
+
+
+def _padded(basis: Any) -> Any:
+    xp = namespace(basis)
+    return xp.concatenate([basis, np.zeros((3, 3 - basis.shape[1]))], axis=1)
+
+
+def _force_on(harness: Harness, name: str) -> Any:
+    body = harness.bodies[harness.joint_names.index(name)]
+    if body.mass is None:
+        return body.force
+    weight = body.mass * _gravity(harness, name)
+    return weight if body.force is None else weight + body.force
+
+
+def _matrix(stiffness: Any) -> Any:
+    if stiffness is None or stiffness.ndim:
+        return stiffness
+    return stiffness * jnp.eye(3, dtype=stiffness.dtype)
+
+
+def _stacked(values: list[Any], default: np.ndarray, dtype: Any) -> Array:
+    return jnp.stack([jnp.asarray(default, dtype) if value is None else value for value in values])
+
+
+def _stacked_if_any(values: list[Any], default: np.ndarray, dtype: Any) -> Array | None:
+    return None if all(value is None for value in values) else _stacked(values, default, dtype)
+
+
+def rotation_vectors(frames: Float[Array, "j 3 3"], others: Float[Array, "j 3 3"]) -> Float[Array, "j 3"]:
+    """From other frames to frames, global axes, no longer than pi."""
+
+    def one(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        q = from_frame(frame @ other.T)
+        q = jnp.where(q[0] < 0, -q, q)
+        squared = jnp.sum(q[1:] ** 2)
+        # Series near zero, where the derivative of the length is infinite.
+        is_small = squared < 1e-4
+        length = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+        series = 1 + squared / 6 + 3 * squared**2 / 40 + 5 * squared**3 / 112
+        return 2 * jnp.where(is_small, series, jnp.arctan2(length, q[0]) / length) * q[1:]
+
+    return jax.vmap(one)(frames, others)
+
+
+def joint_ends(scene: Scene, joint_names: tuple[str, ...]) -> tuple[tuple[int, int], Any, Any]:
+    """The bodies at both ends of a rod, and frames and offsets in them."""
+    ends = (scene.start, scene.end)
+    numbers = tuple(joint_names.index(end.name) if isinstance(end, Joint) else -1 for end in ends)
+    frames = [end.frame if isinstance(end, Joint) else np.eye(3) for end in ends]
+    offsets = [end.offset if isinstance(end, Joint) else np.zeros(3) for end in ends]
+    return (numbers[0], numbers[1]), frames, offsets
+
+
+def clamped(scene: Scene, harness: Harness, positions: Any, frames: Any) -> Scene:
+    """The scene of a rod with clamps in the place of its joints, at poses of the bodies."""
+    ends = []
+    for end in (scene.start, scene.end):
+        if isinstance(end, Joint):
+            j = harness.joint_names.index(end.name)
+            end = clamp_at(end, positions[j], frames[j])
+        ends.append(end)
+    return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+
+def clamp_at(end: Joint, position: Float[Array, "3"], frame: Float[Array, "3 3"]) -> Clamp:
+    """What holds the end of a rod where its body is at a pose."""
+    return Clamp(position + frame @ end.offset, frame @ end.frame)
+
+
+def has_movable_ends(scene: Scene) -> bool:
+    """Whether the pose of an end is unknown."""
+    return isinstance(scene.start, Movable) or isinstance(scene.end, Movable)
+
+
+def of_one_rod(scene: Scene) -> Harness:
+    """A scene whose ends are a `Hinge`, `Slider` or `Spring`, as a harness with bodies that these support."""
+    check_movable(scene, "scene")
+    ends, joints = [], {}
+    for name in ENDS:
+        end = getattr(scene, name)
+        if isinstance(end, Joint):
+            raise ValueError(f"scene.{name} is a Joint: make a Harness of the scene and solve that")
+        if isinstance(end, Movable):
+            joints[name] = Body(support=end)
+            end = Joint(name)
+        ends.append(end)
+    scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+    return Harness({"rod": scene}, joints)

@@ -1,0 +1,553 @@
+"""Newton's method for rods that meet in rigid bodies: all of them and all poses at once.
+
+Each rod is an ordinary form between clamps, whose poses are those of its bodies. A step solves the linearised
+equilibrium of rods and bodies: the system of each rod is factorised by itself, its columns for the motions of its two
+ends are eliminated with it, and what is left is a small dense system for the motions of the bodies,
+
+    S q = -h - sum B^T K^-1 (g, c),    S = D - sum B^T K^-1 B,
+
+with the system K, gradient g and closure c of a rod, their derivatives B by the motions of its ends, and first and
+second derivatives h, D of L by these. Negative eigenvalues of the whole are those of the rods and those of S
+(Haynsworth 1968). Rods of one structure and mesh are stacked: one after another along an axis of every array.
+
+Steps are judged as those of `newton`: by L with the new forces and the square of the closures. Motions (u, r) of a
+body: displacement in parts of a mean length, and rotation vector about global axes.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.discretization.dead_loads import total_force
+from rodjax.discretization.form import NEUTRAL, Form, Linearization
+from rodjax.discretization.joints import generic_field
+from rodjax.discretization.shape import Shape
+from rodjax.geometry.vectors import components
+from rodjax.linalg.saddle_point import factor
+from rodjax.mechanics.energy import dead_load_energy
+from rodjax.model.harness import Bodies, rotated
+from rodjax.model.scene import held_position, scene_axes
+from rodjax.model.supports import Clamp, rotate
+from rodjax.solving.newton import (
+    CLOSURE_WEIGHT,
+    ENERGY_ROUNDING,
+    FIRST_SHIFT,
+    MAX_FACTORS,
+    MAX_HALVINGS,
+    MAX_PUSHES,
+    MAX_SHIFT,
+    NEAR,
+    PUSH,
+    SHIFT_GROWTH,
+    STAGNATION,
+    SUFFICIENT_DECREASE,
+    Find,
+    Newton,
+)
+from rodjax.solving.status import Status
+from rodjax.units import Units
+
+# A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
+LEAST_STIFFNESS = NEUTRAL
+
+
+class Poses(NamedTuple):
+    """Of the bodies: positions [m] and frames."""
+
+    positions: Float[Array, "j 3"]
+    frames: Float[Array, "j 3 3"]
+
+    def moved(self, motions: Float[Array, "j 6"], length: Float[Array, ""]) -> "Poses":
+        frames = rotated(self.frames, motions[:, 3:])
+        # One step towards orthonormal columns: rounding would grow with every step.
+        frames = frames @ (1.5 * jnp.eye(3, dtype=frames.dtype)[None] - 0.5 * jnp.swapaxes(frames, 1, 2) @ frames)
+        return Poses(self.positions + length * motions[:, :3], frames)
+
+
+class Rods(eqx.Module):
+    """Rods of one structure and mesh, stacked along a first axis of every array.
+
+    `form`: of the nondimensional scene, with clamps where an end belongs to a body; `body`: the number of that, the
+    number of all bodies where an end belongs to none; `frame`, `offset`: of the ends in their bodies.
+    """
+
+    form: Form
+    shape: Shape
+    units: Units
+    body: Int[Array, "k 2"]
+    frame: Float[Array, "k 2 3 3"]
+    offset: Float[Array, "k 2 3"]
+
+    def under(self, poses: Poses) -> tuple[Float[Array, "k 2 3"], Float[Array, "k 2 3 3"]]:
+        """The poses of the bodies at both ends."""
+        positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
+        frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
+        return positions[self.body], frames[self.body]
+
+
+class Rod(NamedTuple):
+    """One of `Rods`, with the poses of the bodies at its ends, `length` the unit of their displacements."""
+
+    form: Form
+    units: Units
+    is_joint: Bool[Array, "2"]
+    frame: Float[Array, "2 3 3"]
+    offset: Float[Array, "2 3"]
+    position_of_body: Float[Array, "2 3"]
+    frame_of_body: Float[Array, "2 3 3"]
+    length: Float[Array, ""]
+
+    def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
+        """The form with its ends at the poses of the bodies, moved."""
+        scene = self.form.scene
+        ends = []
+        for end, support in enumerate((scene.start, scene.end)):
+            if isinstance(support, Clamp):
+                place, frame = self.position_of_body[end], self.frame_of_body[end]
+                if motions is not None:
+                    place += self.length * motions[end, :3]
+                    frame = rotate(frame, motions[end, 3:])
+                place = (place + frame @ self.offset[end] - self.units.origin) / self.units.length
+                place = jnp.where(self.is_joint[end], place, support.position)
+                frame = jnp.where(self.is_joint[end], frame @ self.frame[end], support.frame)
+                support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
+            ends.append(support)
+        scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+        return eqx.tree_at(lambda form: form.scene, self.form, scene)
+
+
+class RodStep(NamedTuple):
+    """Where a rod is, and a step from there."""
+
+    point: Any
+    bases: Float[Array, "3 b m"]
+    rotation: Float[Array, "b m"]
+    force_change: Float[Array, "3 parts"]
+
+    def value(
+        self, rod: Rod, motions: Float[Array, "2 6"], part: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
+        """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans; the
+        point there.
+        """
+        form = rod.moved(motions)
+        there = form.holding(form.moved(self.point, self.bases, part * self.rotation, self.force_change))
+        value, closure = form.lagrangian(there)
+        scene = form.scene
+        return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
+
+
+class Coupling(NamedTuple):
+    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure."""
+
+    first: Float[Array, "12"]
+    second: Float[Array, "12 12"]
+    of_gradient: Float[Array, "b m 12"]
+    of_closure: Float[Array, "k 12"]
+
+
+def coupling(rod: Rod, point: Any, here: Linearization) -> Coupling:
+    layout = rod.form.layout
+
+    def value(rotation: Array, forces: Array, motions: Array) -> Float[Array, ""]:
+        step = RodStep(point, here.bases, rotation, layout.forces(forces))
+        return step.value(rod, motions.reshape(2, 6), jnp.ones((), rotation.dtype))[0]
+
+    def gradients(motions: Float[Array, "12"]) -> tuple[Array, Array, Array]:
+        nothing = jnp.zeros_like(here.gradient), jnp.zeros(layout.size, motions.dtype)
+        return jax.grad(value, argnums=(0, 1, 2))(*nothing, motions)
+
+    nowhere = jnp.zeros(12, here.gradient.dtype)
+
+    def both(motions: Float[Array, "12"]) -> tuple[tuple[Array, Array, Array], Float[Array, "12"]]:
+        found = gradients(motions)
+        return found, found[2]
+
+    (of_gradient, of_closure, second), first = jax.jacfwd(both, has_aux=True)(nowhere)
+    # Before the closures there is a row for the torque, of which nothing is asked.
+    more = len(here.closure) - layout.size
+    return Coupling(first, second, of_gradient, jnp.pad(of_closure, ((more, 0), (0, 0))))
+
+
+class Eliminated(NamedTuple):
+    """A rod's system under a shift: whether it has a minimum, its negative eigenvalues, and the solutions for what is
+    out of balance and for the motions of the ends.
+    """
+
+    is_minimum: Bool[Array, ""]
+    negative: Int[Array, ""]
+    rotation: Float[Array, "b m"]
+    multipliers: Float[Array, "k"]
+    rotations: Float[Array, "b m 12"]
+    multipliers_by_motions: Float[Array, "k 12"]
+
+
+def eliminated(here: Linearization, coupling: Coupling, shift: Float[Array, ""], push: Float[Array, "b m"]):
+    h = 1 / here.gradient.shape[1]
+    factors = factor(here.system.shifted(h * shift), is_regularized=True)
+    rotation, multipliers = factors.solve(push - here.gradient, -here.closure)
+    by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_closure)
+    return Eliminated(factors.is_minimum, factors.negative, rotation, multipliers, *by_motions)
+
+
+class State(NamedTuple):
+    """What a turn leaves to the next one; of each group of rods points and shifts of their systems."""
+
+    points: tuple[Any, ...]
+    poses: Poses
+    shifts: tuple[Float[Array, "k"], ...]
+    damping: Float[Array, ""]
+    residual: Float[Array, ""]
+    residuals: tuple[Float[Array, "k"], ...]
+    pushes: Int[Array, ""]
+    iterations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    status: Int[Array, ""]
+    index: Int[Array, ""]
+
+
+class Assembly(eqx.Module):
+    """All rods and bodies of a harness, with the units of its system: `energy` that of the stiffest rod, `length` the
+    mean of all.
+    """
+
+    groups: tuple[Rods, ...]
+    bodies: Bodies
+    energy: Float[Array, ""]
+    length: Float[Array, ""]
+
+    @staticmethod
+    def of(groups: tuple[Rods, ...], bodies: Bodies) -> "Assembly":
+        energies = jnp.concatenate([rods.units.energy for rods in groups])
+        lengths = jnp.concatenate([rods.units.length for rods in groups])
+        return Assembly(groups, bodies, jnp.max(energies), jnp.mean(lengths))
+
+    @property
+    def count(self) -> int:
+        return len(self.bodies.position)
+
+    def rods(self, group: Rods, poses: Poses) -> Rod:
+        """Stacked."""
+        positions, frames = group.under(poses)
+        length = jnp.broadcast_to(self.length, group.units.length.shape)
+        return Rod(
+            group.form, group.units, group.body < self.count, group.frame, group.offset, positions, frames, length
+        )
+
+    def shares(self, group: Rods) -> Float[Array, "k"]:
+        """The unit of energy of each rod, in that of the assembly."""
+        return group.units.energy / self.energy
+
+    def body_energies(self, poses: Poses, motions: Float[Array, "j 6"]) -> Float[Array, "j"]:
+        there = poses.moved(motions, self.length)
+        return self.bodies.energies(there.positions, there.frames, motions[:, 3:]) / self.energy
+
+    def body_derivatives(self, poses: Poses) -> tuple[Float[Array, "j 6"], Float[Array, "j 6 6"]]:
+        """First and second ones of the energies by the motions of each body."""
+        nowhere = jnp.zeros((self.count, 6), poses.positions.dtype)
+
+        def first(motions: Array) -> Array:
+            return jax.grad(lambda motions: jnp.sum(self.body_energies(poses, motions)))(motions)
+
+        # The energy of a body knows of no other: one direction of all bodies at once.
+        def column(direction: Float[Array, "6"]) -> Float[Array, "j 6"]:
+            return jax.jvp(first, (nowhere,), (jnp.broadcast_to(direction[None], nowhere.shape),))[1]
+
+        second = jax.vmap(column, out_axes=-1)(jnp.eye(6, dtype=nowhere.dtype))
+        return first(nowhere), second
+
+    def begin(self, points: tuple[Any, ...], poses: Poses) -> State:
+        dtype = poses.positions.dtype
+        zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
+        nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
+        status = jnp.full((), Status.RUNNING, int)
+        return State(points, poses, nothing, zero, zero, nothing, count, count, count, status, count)
+
+
+def find_assembly(assembly: Assembly, points: tuple[Any, ...], poses: Poses, solver: Newton, find: Find) -> State:
+    """The equilibrium reached from points of the rods and poses of the bodies."""
+    begin = assembly.begin(points, poses)
+    return jax.lax.while_loop(
+        lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
+    )
+
+
+class _Here(NamedTuple):
+    """Of a group of rods at a state."""
+
+    rods: Rod
+    points: Any
+    linearization: Linearization
+    coupling: Coupling
+    floor: Float[Array, "k"]
+    aside: Float[Array, "k b m"]
+
+
+def _linearized(rod: Rod, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array, Array]:
+    form = rod.moved()
+    point = form.holding(point)
+    here = form.linearized(point)
+    aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
+    return point, here, coupling(rod, point, here), form.rounding_floor(point), aside
+
+
+def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:
+    """One linearisation, the step that follows from it, and the part of it that is taken."""
+    seeks_minimum = find == "minimum"
+    count, poses = assembly.count, state.poses
+    dtype = poses.positions.dtype
+    least = jnp.asarray(NEUTRAL, dtype)
+    all_here = []
+    for group, points in zip(assembly.groups, state.points, strict=True):
+        rods = assembly.rods(group, poses)
+        all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points)))
+
+    # --- what is out of balance ---
+    gradient, stiffness = assembly.body_derivatives(poses)
+    gradient = jnp.pad(gradient, ((0, 1), (0, 0)))
+    scale = jnp.zeros(count + 1, dtype)
+    residual, floor, is_closed = jnp.zeros((), dtype), jnp.zeros((), dtype), jnp.array(True)
+    residuals = []
+    for group, here in zip(assembly.groups, all_here, strict=True):
+        shares = assembly.shares(group)
+        of_ends = shares[:, None, None] * here.coupling.first.reshape(-1, 2, 6)
+        for end in range(2):
+            gradient = gradient.at[group.body[:, end]].add(of_ends[:, end])
+            scale = scale.at[group.body[:, end]].max(shares)
+        residuals.append(here.linearization.residual)
+        residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
+        floor = jnp.maximum(floor, jnp.max(here.floor))
+        closed = jax.vmap(lambda form, closure: form.is_closed(closure, solver.tolerance))
+        is_closed &= jnp.all(closed(group.form, here.linearization.closure))
+    motions = assembly.bodies.motions
+    gradient, scale = gradient[:count], scale[:count]
+    out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
+    residual = jnp.maximum(residual, jnp.max(jnp.abs(out_of_balance), initial=0.0))
+    balanced = jnp.where(residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
+    balanced = jnp.where(residual <= solver.tolerance, Status.CONVERGED, balanced)
+    stagnates = (state.iterations > 0) & (residual > state.residual / 2) & (residual <= STAGNATION * floor)
+    balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
+    is_balanced = is_closed & (balanced != Status.RUNNING)
+
+    # --- the rods eliminated ---
+    all_found, shifts, is_definite, negative, is_pushed = [], [], jnp.array(True), jnp.zeros((), int), jnp.array(False)
+    for here, last in zip(all_here, state.shifts, strict=True):
+        found, shift, pushed = _eliminated(here, last, state, is_balanced, residual, find)
+        all_found.append(found)
+        shifts.append(shift)
+        is_definite &= jnp.all(found.is_minimum & (shift <= least)) if seeks_minimum else True
+        negative += jnp.sum(found.negative)
+        is_pushed |= pushed
+
+    # --- the bodies ---
+    full = jnp.zeros((count + 1, 6, count + 1, 6), dtype)
+    number = np.arange(count)
+    full = full.at[number, :, number, :].add(stiffness)
+    right = -jnp.pad(gradient, ((0, 1), (0, 0)))
+    for group, here, found in zip(assembly.groups, all_here, all_found, strict=True):
+        shares, couple = assembly.shares(group), here.coupling
+        condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
+        condensed -= jnp.einsum("kci,kcj->kij", couple.of_closure, found.multipliers_by_motions)
+        loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
+        loads += jnp.einsum("kci,kc->ki", couple.of_closure, found.multipliers)
+        condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
+        loads = (shares[:, None] * loads).reshape(-1, 2, 6)
+        for a in range(2):
+            right = right.at[group.body[:, a]].add(-loads[:, a])
+            for b in range(2):
+                full = full.at[group.body[:, a], :, group.body[:, b], :].add(condensed[:, a, :, b])
+    matrix = motions.T @ full[:count, :, :count].reshape(6 * count, 6 * count) @ motions
+    right = motions.T @ right[:count].reshape(-1)
+    values, vectors = jnp.linalg.eigh((matrix + matrix.T) / 2)
+    below = jnp.sum(values < -LEAST_STIFFNESS)
+    if seeks_minimum:
+        is_definite &= below == 0
+        may_push = is_balanced & (below > 0) & (state.pushes < MAX_PUSHES)
+        sides = jnp.where(jnp.sum(vectors * _generic(len(values), dtype)[:, None], axis=0) < 0, -1.0, 1.0)
+        aside = jnp.where(may_push & (values < -LEAST_STIFFNESS), PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
+        is_pushed |= may_push
+        stiff = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
+        coordinates = vectors @ ((vectors.T @ right + aside) / stiff)
+    else:
+        stiff = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
+        coordinates = vectors @ ((vectors.T @ right) / stiff)
+    body_motions = (motions @ coordinates).reshape(count, 6)
+
+    # --- the step ---
+    largest = jnp.max(jnp.sum(body_motions[:, 3:] ** 2, axis=1), initial=0.0)
+    all_steps, all_motions = [], []
+    padded = jnp.pad(body_motions, ((0, 1), (0, 0)))
+    for group, here, found in zip(assembly.groups, all_here, all_found, strict=True):
+        of_ends = padded[group.body]
+        flat = of_ends.reshape(-1, 12)
+        rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
+        multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
+        change = jax.vmap(lambda form, y: form.layout.forces(form.closure(y)))(group.form, multipliers)
+        all_steps.append(RodStep(here.points, here.linearization.bases, rotation, change))
+        all_motions.append(of_ends)
+        largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
+    part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
+    all_steps = [step._replace(force_change=part * step.force_change) for step in all_steps]
+    is_finite = jnp.isfinite(residual) & jnp.isfinite(largest)
+
+    is_sought = is_definite if seeks_minimum else jnp.array(True)
+    is_done = is_balanced & is_sought
+
+    def moved_by(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""], tuple[Any, ...]]:
+        """The energy, with L of the rods, half of the squared closures, and the points of the rods."""
+        energy = jnp.sum(assembly.body_energies(poses, part * body_motions))
+        lacking, points = jnp.zeros((), dtype), []
+        for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
+            shares = assembly.shares(group)
+            value, closure, point = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
+                step, here.rods, of_ends
+            )
+            energy += jnp.sum(shares * value)
+            lacking += jnp.sum(shares[:, None] * closure**2) / 2
+            points.append(point)
+        return energy, lacking, tuple(points)
+
+    slope, rate = _slopes(assembly, all_here, all_steps, all_motions, gradient, body_motions)
+    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
+    slope += weight * rate
+
+    def tried(trial: _Trial) -> _Trial:
+        """First where the step begins, under the new forces; then all of it, and ever shorter parts."""
+        tries = trial.tries + 1
+        next_part = jnp.where(tries == 1, part, trial.part / 2)
+        energy, lacking, points = moved_by(jnp.where(tries == 0, 0.0, next_part))
+        merit = energy + weight * lacking
+        bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
+        bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
+        is_better = (tries > 0) & (is_pushed | (merit <= bound) | (not seeks_minimum))
+        return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
+
+    # At the end no step is tried.
+    start = _Trial(part, jnp.full((), -1), jnp.zeros((), dtype), is_done, tuple(here.points for here in all_here))
+    trial = jax.lax.while_loop(lambda trial: ~trial.is_better & (trial.tries <= MAX_HALVINGS), tried, start)
+    part, is_better = trial.part, trial.is_better
+
+    # --- what follows ---
+    status = jnp.where(state.iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
+    fails = ~is_better & (residual <= STAGNATION * floor)
+    status = jnp.where(fails, Status.ROUNDING_FLOOR, status)
+    fails |= ~is_better & (state.damping > MAX_SHIFT)
+    status = jnp.where(fails & (status == Status.RUNNING), Status.LINE_SEARCH_FAILED, status)
+    has_saddle = is_balanced & ~is_sought & (state.pushes >= MAX_PUSHES)
+    status = jnp.where(has_saddle, Status.SADDLE, status)
+    status = jnp.where(is_done, balanced, status)
+    status = jnp.where(is_finite | is_balanced, status, Status.NOT_FINITE)
+    goes = (status == Status.RUNNING) & is_better
+    taken = jnp.where(goes, part, 0.0)
+    there = poses.moved(taken * body_motions, assembly.length)
+    there = jax.tree.map(lambda new, old: jnp.where(goes, new, old), there, poses)
+    points = jax.tree.map(
+        lambda new, old: jnp.where(goes, new, old), trial.points, tuple(here.points for here in all_here)
+    )
+    damping = jnp.where(is_better, state.damping / SHIFT_GROWTH**2, SHIFT_GROWTH * state.damping)
+    damping = jnp.where(is_better, jnp.where(damping < FIRST_SHIFT, 0.0, damping), jnp.maximum(damping, FIRST_SHIFT))
+    return State(
+        points=points,
+        poses=there,
+        shifts=tuple(shifts),
+        damping=damping,
+        residual=residual,
+        residuals=tuple(residuals),
+        pushes=state.pushes + jnp.where(goes & is_pushed, 1, 0),
+        iterations=state.iterations + jnp.where(goes, 1, 0),
+        evaluations=state.evaluations + jnp.maximum(trial.tries, 1),
+        status=status.astype(int),
+        index=(negative + below).astype(int),
+    )
+
+
+class _Trial(NamedTuple):
+    """A part of a step, how many were tried before it, the merit where the step begins, whether this one is better,
+    and the points of the rods.
+    """
+
+    part: Float[Array, ""]
+    tries: Int[Array, ""]
+    first: Float[Array, ""]
+    is_better: Bool[Array, ""]
+    points: tuple[Any, ...]
+
+
+def _slopes(
+    assembly: Assembly,
+    all_here: list[_Here],
+    all_steps: list[RodStep],
+    all_motions: list[Array],
+    gradient: Float[Array, "j 6"],
+    body_motions: Float[Array, "j 6"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How fast L, and half of the squared closures, change as a step begins under the new forces, which L has to first
+    order.
+    """
+    slope, rate = jnp.sum(gradient * body_motions), jnp.zeros((), gradient.dtype)
+    for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
+
+        def of_rod(form: Form, here: Linearization, coupling: Coupling, step: RodStep, motions: Array):
+            nothing = jnp.zeros_like(here.gradient)
+            change = jnp.zeros_like(here.closure)
+            count = len(change)
+            change = change.at[count - form.layout.size :].set(form.layout.components(step.force_change))
+            by_force, lost = here.system.times(nothing, change)
+            _, closing = here.system.times(step.rotation, jnp.zeros_like(change))
+            closing += coupling.of_closure @ motions
+            along = jnp.sum((here.gradient + by_force) * step.rotation) + jnp.sum(
+                change * (coupling.of_closure @ motions)
+            )
+            return along, jnp.sum(form.closure(here.closure + lost) * form.closure(closing))
+
+        along, closing = jax.vmap(of_rod)(group.form, here.linearization, here.coupling, step, of_ends.reshape(-1, 12))
+        shares = assembly.shares(group)
+        slope += jnp.sum(shares * along)
+        rate += jnp.sum(shares * closing)
+    return slope, rate
+
+
+def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
+    """A direction along no other."""
+    return np.cos(1.0 + 2.0 * np.arange(count)).astype(dtype)
+
+
+def _eliminated(
+    here: _Here, last: Float[Array, "k"], state: State, is_balanced: Bool[Array, ""], residual: Array, find: Find
+) -> tuple[Eliminated, Float[Array, "k"], Bool[Array, ""]]:
+    """Under the least shifts with which each rod by itself has a minimum, and those; whether a rod is pushed aside."""
+    least = jnp.asarray(NEUTRAL, last.dtype)
+    h = 1 / here.linearization.gradient.shape[2]
+    nothing = jnp.zeros_like(here.aside)
+    if find == "equilibrium":
+        shift = jnp.full_like(last, least)
+        found = jax.vmap(eliminated)(here.linearization, here.coupling, shift, nothing)
+        return found, shift, jnp.array(False)
+    shift = jnp.where(is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
+    shift = jnp.maximum(shift, state.damping)
+    may_push = state.pushes < MAX_PUSHES
+
+    def pushes(shift: Float[Array, "k"]) -> Float[Array, "k"]:
+        is_near = is_balanced | (residual <= NEAR * shift)
+        pushed = may_push & ((state.pushes == 0) | is_near) & (shift > least) & (state.damping == 0)
+        return jnp.where(pushed, PUSH * h * shift, 0.0)
+
+    def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
+        shift, tries, found = trial
+        larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
+        shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
+        push = pushes(shift)[:, None, None] * here.aside
+        return shift, tries + 1, jax.vmap(eliminated)(here.linearization, here.coupling, shift, push)
+
+    kinds = jax.eval_shape(jax.vmap(eliminated), here.linearization, here.coupling, shift, nothing)
+    blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
+    shift, _, found = jax.lax.while_loop(
+        lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
+        again,
+        (shift, jnp.zeros((), int), blank),
+    )
+    return found, shift, jnp.any(pushes(shift) > 0)

@@ -1,0 +1,504 @@
+"""The equilibrium of a harness: of all its rods, and of the bodies in which they end."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.checks import instance, is_known
+from rodjax.discretization.first_twist import FirstTwist
+from rodjax.discretization.forms import form_of
+from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, joint_ends, of_one_rod, rotated
+from rodjax.model.scene import Scene, nondimensional
+from rodjax.model.supports import Clamp, Joint
+from rodjax.programs.compilation import compiled
+from rodjax.programs.linear import linear
+from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
+from rodjax.solving.equilibrium import (
+    DEFAULT_RTOL,
+    Options,
+    Search,
+    _finer,
+    _fits,
+    check_single,
+    checked_options,
+    checked_strain_limit,
+    first_state,
+    in_units_of,
+    is_here,
+    last_twist,
+)
+from rodjax.solving.first_poses import first_poses
+from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.implicit import differentiable, not_differentiated
+from rodjax.solving.newton import Newton
+from rodjax.solving.refinement import SAFETY, SIZES, error_by_rtol, next_size
+from rodjax.solving.result import (
+    DEFAULT_STRAIN_LIMIT,
+    Equilibrium,
+    Found,
+    NotConvergedWarning,
+    SolverState,
+    equilibrium,
+    estimated_errors,
+    warn_if_coarse,
+    warn_of_outcome,
+)
+from rodjax.solving.status import Outcome, is_converged
+from rodjax.warn import warn
+
+Members = tuple[tuple[int, ...], ...]
+
+
+def solve_harness(
+    harness: Harness,
+    *,
+    segments: int | list[int] | None = None,
+    rtol: float | None = None,
+    discretization: str | None = None,
+    solver: Any = None,
+    guess: HarnessEquilibrium | None = None,
+    planar: bool = False,
+    find: Any = "minimum",
+    strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    shape: Guess | None = None,
+) -> HarnessEquilibrium:
+    """See `rodjax.solving.solve.solve`; `segments` may be those of each rod; `shape`: with which all rods begin where
+    there is no guess.
+    """
+    if discretization not in (None, "hermite"):
+        raise ValueError(f"discretization must be 'hermite' where poses of ends are unknown, got {discretization!r}")
+    if solver is not None:
+        instance(solver, "solver", Newton)
+    if planar:
+        raise ValueError("planar must be False where poses are unknown, in space")
+    if guess is not None:
+        instance(guess, "guess", HarnessEquilibrium)
+        if guess.energy.ndim:
+            raise ValueError(f"guess must be a single equilibrium, got a stack of shape {guess.energy.shape}")
+        if (guess.harness.names, guess.harness.joint_names) != (harness.names, harness.joint_names):
+            raise ValueError("guess must be an equilibrium of a harness with the same cables and joints in this order")
+    fixed, guess = not_differentiated(harness, guess)
+    strain_limit = checked_strain_limit(strain_limit)
+    poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
+    kept = [None] * len(fixed) if guess is None else guess.segments
+    counts = segments if isinstance(segments, list) else [segments] * len(fixed)
+    all_options, tolerance = [], rtol
+    for scene, count, before in zip(_structures(fixed), counts, kept, strict=True):
+        # The mesh of a guess comes first, as of one rod.
+        wanted = before if count is None and rtol is None else count
+        options, tolerance = checked_options(scene, wanted, rtol, "hermite", solver, find=find)
+        if count is None and before is not None:
+            options = dataclasses.replace(options, segments=before)
+        all_options.append(options)
+    result = _solved(fixed, poses, tuple(all_options), guess, strain_limit, shape=shape)
+    if is_known(result.status) and is_here(result.groups[0]):
+        if segments is None:
+            result = _refined(
+                result, tuple(all_options), DEFAULT_RTOL if tolerance is None else tolerance, strain_limit
+            )
+        else:
+            for group in result.groups:
+                warn_if_coarse(group)
+        _warn(result, strain_limit)
+    return result if fixed is harness else differentiable_harness(harness, result)
+
+
+def solve_movable(scene: Scene, *, guess: Guess | Equilibrium | None = None, **options: Any) -> Equilibrium:
+    """The equilibrium of a scene with an end that is a `Hinge`, `Slider` or `Spring`."""
+    harness = of_one_rod(scene)
+    shape, earlier = None, None
+    if isinstance(guess, Guess):
+        shape = guess
+    elif guess is not None:
+        instance(guess, "guess", (Guess, Equilibrium))
+        check_single(guess)
+        earlier = _as_harness(harness, guess)
+    return _of_one_rod(solve_harness(harness, guess=earlier, shape=shape, **options))
+
+
+def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
+    """An equilibrium of its one rod, which ends where the bodies are."""
+    frames = {"start": guess.frames[0], "end": guess.frames[-1]}
+    nodes = {"start": guess.nodes[0], "end": guess.nodes[-1]}
+    return HarnessEquilibrium(
+        groups=(jax.tree.map(lambda leaf: leaf[None], guess),),
+        positions=jnp.stack([nodes[name] for name in harness.joint_names]),
+        frames=jnp.stack([frames[name] for name in harness.joint_names]),
+        energy=guess.energy,
+        converged=guess.converged,
+        stable=guess.stable,
+        index=jnp.zeros((), int),
+        status=guess.status,
+        iterations=guess.iterations,
+        evaluations=guess.evaluations,
+        residual=guess.residual,
+        harness=harness,
+        members=((0,),),
+    )
+
+
+def _of_one_rod(result: HarnessEquilibrium) -> Equilibrium:
+    return dataclasses.replace(
+        result.rod(0),
+        energy=result.energy,
+        converged=result.converged,
+        stable=result.stable,
+        status=result.status,
+        iterations=result.iterations,
+        evaluations=result.evaluations,
+        residual=result.residual,
+        free_index=result.index,
+    )
+
+
+def _warn(result: HarnessEquilibrium, strain_limit: Any) -> None:
+    if not bool(result.converged):
+        warn(result.in_words().splitlines()[0], NotConvergedWarning)
+        return
+    for rod in result.groups:
+        warn_of_outcome(rod, strain_limit)
+
+
+# --- the start -------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _followed(harness: Harness, guess: HarnessEquilibrium) -> Poses:
+    """The poses of an earlier equilibrium, displaced with the supports."""
+    return Poses(*Bodies.of(harness).followed(Bodies.of(guess.harness), guess.positions, guess.frames))
+
+
+def _structures(harness: Harness) -> list[Scene]:
+    """The scenes of the rods with clamps, at no place in particular, where their ends are joints."""
+    clamp = _clamp(harness.scenes[0].rod.length.dtype)
+
+    def structure(scene: Scene) -> Scene:
+        # `eqx.tree_at` would take longer than the solve.
+        new = object.__new__(Scene)
+        for field in dataclasses.fields(Scene):
+            value = getattr(scene, field.name)
+            object.__setattr__(new, field.name, clamp if isinstance(value, Joint) else value)
+        return new
+
+    return [structure(scene) for scene in harness.scenes]
+
+
+@functools.cache
+def _clamp(dtype: Any) -> Clamp:
+    return Clamp(np.zeros(3, dtype), np.eye(3, dtype=dtype))
+
+
+def _members(structures: list[Scene], all_options: tuple[Options, ...]) -> Members:
+    """The numbers of the rods of one structure and mesh."""
+    found: dict[Any, list[int]] = {}
+    for number, (scene, options) in enumerate(zip(structures, all_options, strict=True)):
+        leaves, tree = jax.tree.flatten(scene)
+        key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), options.segments
+        found.setdefault(key, []).append(number)
+    return tuple(map(tuple, found.values()))
+
+
+def _stack(parts: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+
+
+def _solved(
+    harness: Harness,
+    poses: Poses,
+    all_options: tuple[Options, ...],
+    guess: HarnessEquilibrium | None,
+    strain_limit: Any,
+    finer: dict[int, SolverState] | None = None,
+    shape: Guess | None = None,
+) -> HarnessEquilibrium:
+    """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
+    structures = _structures(harness)
+    members = _members(structures, all_options)
+    starts = []
+    for group in members:
+        options = all_options[group[0]]
+        start = None
+        if guess is not None and group in guess.members:
+            start = _as_it_was(structures[group[0]], guess.groups[guess.members.index(group)], options)
+        if start is None:
+            each = []
+            for number in group:
+                rod = shape if guess is None else guess.rod(number)
+                if finer is not None and number in finer:
+                    assert isinstance(rod, Equilibrium)
+                    each.append((finer[number], last_twist(rod)))
+                else:
+                    scene = _at(harness.scenes[number], _bodies_of(harness, number), poses)
+                    each.append(first_state(scene, rod, options))
+            start = _stacked_starts(tuple(each))
+        starts.append(start)
+    options = tuple(all_options[group[0]] for group in members)
+    return _solve(harness, poses, tuple(starts), strain_limit, options, members=members)
+
+
+@compiled
+def _stacked_starts(each: tuple[tuple[SolverState, FirstTwist], ...]) -> tuple[SolverState, FirstTwist]:
+    return _stack(list(each))
+
+
+def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[SolverState, FirstTwist] | None:
+    """The state of stacked equilibria, where it has the unknowns and the mesh of their scenes."""
+    if group.s.shape[-1] - 1 != options.segments or jax.tree.structure(group.scene) != jax.tree.structure(scene):
+        return None
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), group)
+    return (group.state, last_twist(group)) if _fits(scene, one, options) else None
+
+
+def _bodies_of(harness: Harness, number: int) -> tuple[int, int]:
+    return joint_ends(harness.scenes[number], harness.joint_names)[0]
+
+
+@compiled
+def _at(scene: Scene, bodies: tuple[int, int], poses: Poses) -> Scene:
+    """With clamps in the place of joints, which the rod has with these bodies."""
+    ends = []
+    for end, body in zip((scene.start, scene.end), bodies, strict=True):
+        ends.append(clamp_at(end, poses.positions[body], poses.frames[body]) if isinstance(end, Joint) else end)
+    return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+
+# --- the solve -------------------------------------------------------------------------------------------------------
+
+
+@functools.partial(compiled, static_argnames=("members",))
+def _solve(
+    harness: Harness,
+    poses: Poses,
+    starts: tuple[tuple[SolverState, FirstTwist], ...],
+    strain_limit: Float[Array, ""] | float,
+    options: tuple[Options, ...],
+    members: Members,
+) -> HarnessEquilibrium:
+    groups, points = [], []
+    for numbers, (states, firsts), option in zip(members, starts, options, strict=True):
+        stacked = _stack([clamped(harness.scenes[number], harness, *poses) for number in numbers])
+
+        def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
+            return Search.of(*in_units_of(scene, state), first, option)
+
+        searches = jax.vmap(begin)(stacked, states, firsts)
+        body, frame, offset = _ends(harness, numbers)
+        groups.append(Rods(searches.form, searches.shape, searches.units, body, frame, offset))
+        points.append(searches.point)
+    bodies = Bodies.of(harness)
+    assembly = Assembly.of(tuple(groups), bodies)
+    solver = options[0].solver
+    assert isinstance(solver, Newton)
+    end = find_assembly(assembly, tuple(points), poses, solver, options[0].find)
+    is_stable = is_converged(end.status) & (end.index == 0) & harness.has_potential
+    rods = []
+    for number, (rod, numbers) in enumerate(zip(groups, members, strict=True)):
+        now = tuple(clamped(harness.scenes[k], harness, *end.poses) for k in numbers)
+        rods.append(_equilibria(_stack(list(now)), rod, end, number, is_stable, strain_limit))
+    status = end.status
+    for rod in rods:
+        # A strain beyond the limit in one of them is said of the whole.
+        worst = jnp.max(jnp.where(rod.status == end.status, end.status, rod.status))
+        status = jnp.where(is_converged(status), jnp.where(worst == end.status, status, worst), status)
+    return HarnessEquilibrium(
+        groups=tuple(rods),
+        positions=end.poses.positions,
+        frames=end.poses.frames,
+        energy=_energy(rods, bodies, end.poses),
+        converged=is_converged(status),
+        stable=is_stable,
+        index=end.index,
+        status=status,
+        iterations=end.iterations,
+        evaluations=end.evaluations,
+        residual=end.residual,
+        harness=harness,
+        members=members,
+    )
+
+
+def _ends(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Of some rods the bodies, frames and offsets of both ends; the number of all bodies for none."""
+    count, dtype = len(harness.bodies), harness.scenes[0].rod.length.dtype
+    found = [joint_ends(harness.scenes[number], harness.joint_names) for number in numbers]
+    bodies = jnp.array([[count if j < 0 else j for j in body] for body, _, _ in found])
+    frames = jnp.stack([jnp.stack([jnp.asarray(frame, dtype) for frame in two]) for _, two, _ in found])
+    offsets = jnp.stack([jnp.stack([jnp.asarray(offset, dtype) for offset in two]) for _, _, two in found])
+    return bodies, frames, offsets
+
+
+def _equilibria(scenes: Scene, rods: Rods, end: State, group: int, is_stable: Array, strain_limit: Any) -> Equilibrium:
+    def one(scene: Scene, rod: Rods, point: Any, residual: Array) -> Equilibrium:
+        scaled, units = nondimensional(scene)
+        form = form_of(scaled, rod.shape)
+        point = form.settled(form.holding(point))
+        state = SolverState(rod.shape.reached(form, point), point.end_force, units)
+        outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
+        return equilibrium(scene, Found(state, point, outcome, is_stable), jnp.ones((), int), strain_limit)
+
+    return jax.vmap(one)(scenes, rods, end.points[group], end.residuals[group])
+
+
+def _energy(rods: list[Equilibrium], bodies: Bodies, poses: Poses) -> Float[Array, ""]:
+    energies = bodies.energies(*poses, jnp.zeros_like(poses.positions))
+    return jnp.sum(energies) + sum(jnp.sum(rod.energy) for rod in rods)
+
+
+# --- the mesh --------------------------------------------------------------------------------------------------------
+
+
+def _refined(
+    result: HarnessEquilibrium, all_options: tuple[Options, ...], rtol: float, strain_limit: Any
+) -> HarnessEquilibrium:
+    """Solved again with more elements in rods of a structure of which one's estimated error is too large, until none
+    is.
+    """
+    iterations, evaluations = int(result.iterations), int(result.evaluations)
+    while bool(result.converged):
+        counts, worst, all_defects = finer_meshes(result, rtol)
+        options = [dataclasses.replace(old, segments=count) for old, count in zip(all_options, counts, strict=True)]
+        finer = {
+            number: _finer(result.rod(number), all_defects[number], new)
+            for number, (new, old) in enumerate(zip(options, all_options, strict=True))
+            if new.segments != old.segments
+        }
+        if not finer:
+            if worst > rtol:
+                warn(
+                    f"the estimated error {worst:.1e} (of the shape, or a tenth of that of forces, moments or "
+                    f"curvature) of a rod is above rtol = {rtol:g} on the finest mesh",
+                    NotConvergedWarning,
+                )
+            break
+        all_options = tuple(options)
+        poses = Poses(result.positions, result.frames)
+        result = _solved(result.harness, poses, all_options, result, strain_limit, finer)
+        iterations, evaluations = iterations + int(result.iterations), evaluations + int(result.evaluations)
+    counts = jnp.asarray(iterations), jnp.asarray(evaluations)
+    return eqx.tree_at(lambda result: (result.iterations, result.evaluations), result, counts)
+
+
+def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], float, dict[int, Any]]:
+    """How many elements rods of one structure need, at least as many as they have; the largest estimated error, of
+    several equilibria of those that converged; the defects of each rod.
+    """
+    counts, worst, all_defects = result.segments, 0.0, {}
+    axis = result.energy.ndim
+    for numbers, group in zip(result.members, result.groups, strict=True):
+        errors = estimated_errors(group)
+        sizes = np.moveaxis(np.asarray(error_by_rtol(errors)), axis, 0)
+        converged = np.moveaxis(np.asarray(group.converged), axis, 0)
+        error = float(np.max(sizes[converged], initial=0.0))
+        worst = max(worst, error)
+        for place, number in enumerate(numbers):
+            all_defects[number] = None if errors.defects is None or axis else errors.defects[place]
+            # As many as the neediest: each size of mesh would be a larger program.
+            if SAFETY * error > rtol and counts[number] < SIZES["hermite"][-1]:
+                counts[number] = next_size(counts[number], error, rtol, "hermite")
+    return counts, worst, all_defects
+
+
+# --- derivatives -----------------------------------------------------------------------------------------------------
+
+
+def differentiable_harness(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
+    """What a search found, with the derivatives by the harness that the search for it has not."""
+    return result if is_known(harness) else _differentiable(harness, result)
+
+
+@eqx.filter_custom_jvp
+def _differentiable(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
+    return result
+
+
+@_differentiable.def_jvp
+def _(primals, tangents):
+    harness, result = primals
+    change, _ = tangents
+    change = jax.tree.map(
+        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
+        change,
+        harness,
+        is_leaf=lambda change: change is None,
+    )
+    value = _differentiable(harness, result)
+    return value, _change_of_result(*jax.lax.optimization_barrier((harness, value)), change)
+
+
+@linear
+def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harness) -> HarnessEquilibrium:
+    """By the implicit function theorem on the balance of the bodies, as functions of their poses; the rods between
+    clamps at these have derivatives of their own.
+    """
+    fixed = jax.lax.stop_gradient(harness)
+    others = Bodies.of(fixed)
+    count = len(harness.bodies)
+
+    def poses(harness: Harness, motions: Float[Array, "k"]) -> Poses:
+        bodies = Bodies.of(harness)
+        positions, frames = bodies.followed(others, result.positions, result.frames)
+        each = (bodies.motions @ motions).reshape(count, 6)
+        return Poses(positions + each[:, :3], rotated(frames, each[:, 3:]))
+
+    def rods_at(harness: Harness, motions: Float[Array, "k"]) -> list[Equilibrium]:
+        there = poses(harness, motions)
+        return [
+            differentiable(_stack([clamped(harness.scenes[k], harness, *there) for k in numbers]), group)
+            for numbers, group in zip(result.members, result.groups, strict=True)
+        ]
+
+    def out_of_balance(harness: Harness, motions: Float[Array, "k"]) -> Float[Array, "k"]:
+        bodies, there = Bodies.of(harness), poses(harness, motions)
+        forces = body_forces(harness, rods_at(harness, motions), bodies, there, result.members)
+        return bodies.motions.T @ forces.reshape(-1)
+
+    def whole(harness: Harness, motions: Float[Array, "k"]) -> HarnessEquilibrium:
+        rods, there, bodies = rods_at(harness, motions), poses(harness, motions), Bodies.of(harness)
+        return dataclasses.replace(
+            result,
+            groups=tuple(rods),
+            positions=there.positions,
+            frames=there.frames,
+            energy=_energy(rods, bodies, there),
+            harness=harness,
+        )
+
+    nowhere = jnp.zeros(len(others.columns), result.positions.dtype)
+    stiffness = jax.jacfwd(lambda motions: out_of_balance(harness, motions))(nowhere)
+    _, lacking = jax.jvp(lambda harness: out_of_balance(harness, nowhere), (harness,), (change,))
+    motions = -jnp.linalg.solve(stiffness, lacking)
+    _, found = jax.jvp(whole, (harness, nowhere), (change, motions))
+    return jax.tree.map(lambda leaf: None if leaf.dtype == jax.dtypes.float0 else leaf, found)
+
+
+def body_forces(
+    harness: Harness, rods: list[Equilibrium], bodies: Bodies, poses: Poses, members: Members
+) -> Float[Array, "j 6"]:
+    """Forces [N] and moments about their positions [N m] on the bodies, of rods, springs and dead loads, global axes:
+    what supports hold against.
+    """
+    count = len(harness.bodies)
+    total = jnp.zeros((count + 1, 6), poses.positions.dtype)
+    positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
+    frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
+    for numbers, group in zip(members, rods, strict=True):
+        body, _, offset = _ends(harness, numbers)
+        of_ends = (group.start_force, group.start_moment), (group.end_force, group.end_moment)
+        for end, (sign, (force, moment)) in enumerate(zip((1, -1), of_ends, strict=True)):
+            arms = jnp.einsum("kij,kj->ki", frames[body[:, end]], offset[:, end])
+            about = moment + jnp.cross(arms, force)
+            total = total.at[body[:, end]].add(sign * jnp.concatenate([force, about], axis=1))
+    del positions
+
+    def energy(motions: Float[Array, "j 6"]) -> Float[Array, ""]:
+        there = poses.positions + motions[:, :3], rotated(poses.frames, motions[:, 3:])
+        return jnp.sum(bodies.energies(*there, motions[:, 3:]))
+
+    return total[:count] - jax.grad(energy)(jnp.zeros((count, 6), total.dtype))

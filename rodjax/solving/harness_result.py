@@ -1,0 +1,124 @@
+"""What a solve of a harness gives: the equilibria of its rods, and the poses of its bodies."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.checks import is_known, leaf
+from rodjax.model.harness import Harness
+from rodjax.solving.result import Described, Equilibrium, describe
+from rodjax.solving.status import Status
+
+
+class BodyPose(eqx.Module):
+    """`position` [..., 3] m; `frame` [..., 3, 3], columns the axes of the body."""
+
+    position: Float[Array, "... 3"]
+    frame: Float[Array, "... 3 3"]
+
+
+class HarnessEquilibrium(Described):
+    """The equilibrium of a harness, or several of them along a leading axis `...` of every field.
+
+    `result["trunk"]` is the `Equilibrium` of that rod, with clamps at the poses that were found in the place of its
+    joints: its `index`, `critical`, `neutral` and estimated errors are those of the rod between these clamps.
+    Iteration, `len`, `names`, `keys`, `values` and `items` are as of a dict of rods; `joints["y"].position` and
+    `.frame` the pose of a body.
+
+    - `energy` [...] J: of rods, springs and dead loads, zero of height at the origin, without the work of dead moments
+    - `converged` [...] bool, `status` [...] code, in words by `rodjax.describe`
+    - `stable` [...] bool: converged, and no motion of rods and bodies lowers the energy; False with a dead moment on a
+      body that may turn about several axes
+    - `index` [...] int: how many independent motions lower it
+    - `iterations`, `evaluations` [...] of the solver; `residual` [...] largest component of the gradient, in EI/L^2 of
+      each rod, of a body in that of its stiffest rod
+    """
+
+    groups: tuple[Equilibrium, ...]
+    positions: Float[Array, "... j 3"]
+    frames: Float[Array, "... j 3 3"]
+    energy: Float[Array, "..."]
+    converged: Bool[Array, "..."]
+    stable: Bool[Array, "..."]
+    index: Int[Array, "..."]
+    status: Int[Array, "..."]
+    iterations: Int[Array, "..."]
+    evaluations: Int[Array, "..."]
+    residual: Float[Array, "..."]
+    harness: Harness
+    members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.harness.names
+
+    @property
+    def joints(self) -> dict[str, BodyPose]:
+        return {
+            name: BodyPose(self.positions[..., j, :], self.frames[..., j, :, :])
+            for j, name in enumerate(self.harness.joint_names)
+        }
+
+    @property
+    def segments(self) -> list[int]:
+        """Of the mesh of each rod."""
+        found = {
+            number: group.s.shape[-1] - 1
+            for members, group in zip(self.members, self.groups, strict=True)
+            for number in members
+        }
+        return [found[number] for number in range(len(self))]
+
+    def __getitem__(self, name: str) -> Equilibrium:
+        if name not in self.names:
+            known = ", ".join(map(repr, self.names))
+            raise KeyError(f"no rod {name!r} in this harness: its rods are {known}")
+        return self.rod(self.names.index(name))
+
+    def rod(self, number: int) -> Equilibrium:
+        """By its place among the `names`."""
+        for members, group in zip(self.members, self.groups, strict=True):
+            if number in members:
+                return _taken(group, members.index(number), self.energy.ndim)
+        raise IndexError(number)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def keys(self) -> tuple[str, ...]:
+        return self.names
+
+    def values(self) -> list[Equilibrium]:
+        return [self.rod(number) for number in range(len(self))]
+
+    def items(self) -> list[tuple[str, Equilibrium]]:
+        return list(zip(self.names, self.values(), strict=True))
+
+    def in_words(self) -> str:
+        if np.ndim(self.status):
+            codes, counts = np.unique(np.asarray(self.status), return_counts=True)
+            return "\n".join(f"{count} {Status(code).message}" for code, count in zip(codes, counts, strict=True))
+        outcome = Status(int(self.status)).message
+        lines = [f"{outcome}; residual {float(self.residual):.1e} EI/L^2 after {int(self.iterations)} iterations"]
+        if bool(self.converged) and int(self.index) > 0:
+            lines[0] += f"; a saddle: {int(self.index)} motions lower the energy"
+        if bool(self.converged) and not self.harness.has_potential:
+            lines[0] += "; under a dead moment without a potential, so that no energy tells whether it is stable"
+        return "\n".join(lines + [f"{name}: {describe(rod)}" for name, rod in self.items()])
+
+
+def _taken(stacked: Equilibrium, place: int, axis: int) -> Equilibrium:
+    """One of equilibria stacked along an axis."""
+
+    def taken(stack: Array) -> Array:
+        if is_known(stack):
+            return leaf(np.asarray(stack)[(slice(None),) * axis + (place,)])
+        return jax.lax.index_in_dim(stack, place, axis, keepdims=False)
+
+    return jax.tree.map(taken, stacked)

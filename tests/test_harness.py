@@ -1,0 +1,227 @@
+"""Harnesses: rods that meet in rigid bodies, against the uncut rod, an independent code and finite differences."""
+
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from planar_frames import PlanarRod, solve_frame
+
+import rodjax
+from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring
+
+GRAVITY = (0.0, 3.0, -9.81)
+START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
+END = Clamp((0.5, 0.2, 0), rodjax.frame((1, 1, 1)))
+# A body whose axes are not those of the rod, beside it.
+ASIDE = {"frame": rodjax.frame((0, 1, 0), (0, 0, 1)), "offset": (0.1, 0, 0.02)}
+
+
+def plain(length: float) -> Rod:
+    return Rod.circular(length, 0.005, 1e7, shear_modulus=1e7 / 3, density=1200.0)
+
+
+def bent(length: float) -> Rod:
+    rod = plain(length)
+    stiffnesses = (rod.EI, 1.5 * rod.EI), rod.GJ, rod.EA
+    return Rod(length, *stiffnesses, rod.mass_per_length, rest_curvature=(1.0, 0.5), rest_twist=0.3)
+
+
+def cut(rod, end=END) -> Harness:
+    first = Scene(rod(0.5), START, Joint("cut", **ASIDE), gravity=GRAVITY)
+    return Harness({"a": first, "b": Scene(rod(0.5), Joint("cut", **ASIDE), end, gravity=GRAVITY)})
+
+
+@pytest.fixture(scope="module", params=[plain, bent])
+def both(request):
+    """A rod, and the same cut in two and joined."""
+    tight = Newton(tolerance=1e-11)
+    whole = rodjax.solve(Scene(request.param(1.0), START, END, gravity=GRAVITY), segments=8, solver=tight)
+    return whole, rodjax.solve(cut(request.param), segments=4, solver=tight)
+
+
+def test_a_rod_that_is_cut_and_joined_is_the_rod(both):
+    whole, parts = both
+    assert parts.stable
+    assert (parts.index, len(parts)) == (0, 2)
+    nodes = jnp.concatenate([parts["a"].nodes, parts["b"].nodes[1:]])
+    assert jnp.max(jnp.abs(nodes - whole.nodes)) < 1e-9
+    assert jnp.max(jnp.abs(parts["a"].start_force - whole.start_force)) < 1e-9
+    assert jnp.max(jnp.abs(parts["b"].end_moment - whole.end_moment)) < 1e-9
+    assert abs(parts.energy - whole.energy) < 1e-9 * abs(whole.energy)
+    assert abs(parts["a"].total_twist + parts["b"].total_twist - whole.total_twist) < 1e-9
+    body = parts.joints["cut"]
+    assert jnp.max(jnp.abs(body.position + body.frame @ jnp.array(ASIDE["offset"]) - whole.nodes[4])) < 1e-9
+
+
+def test_a_harness_is_a_mapping_of_its_rods(both):
+    _, parts = both
+    assert parts.names == tuple(parts) == parts.keys() == ("a", "b")
+    assert [rod.energy for rod in parts.values()] == [rod.energy for _, rod in parts.items()]
+    with pytest.raises(KeyError, match="no rod 'c' in this harness: its rods are 'a', 'b'"):
+        parts["c"]
+    assert rodjax.describe(parts).count("\n") == 2
+
+
+def test_a_warm_start_of_the_same_harness_takes_no_step(both):
+    _, parts = both
+    again = rodjax.solve(parts.harness, segments=4, guess=parts, solver=Newton(tolerance=1e-10))
+    assert again.iterations == 0
+    assert jnp.max(jnp.abs(again["b"].nodes - parts["b"].nodes)) < 1e-14
+
+
+def test_derivatives_of_a_cut_rod_are_those_of_the_rod():
+    options = {"solver": Newton(tolerance=1e-11)}
+
+    def of_whole(y):
+        end = Clamp(jnp.stack([0.5 + 0 * y, y, 0 * y]), END.frame)
+        return rodjax.solve(Scene(plain(1.0), START, end, gravity=GRAVITY), segments=8, **options).end_force
+
+    def of_parts(y):
+        end = Clamp(jnp.stack([0.5 + 0 * y, y, 0 * y]), END.frame)
+        return rodjax.solve(cut(plain, end), segments=4, **options)["b"].end_force
+
+    at = jnp.array(0.2)
+    expected, found = jax.jacfwd(of_whole)(at), jax.jacfwd(of_parts)(at)
+    assert jnp.max(jnp.abs(found - expected)) < 1e-9 * jnp.max(jnp.abs(expected))
+
+
+# --- a star of three cables ------------------------------------------------------------------------------------------
+
+# Places and angles of the tangents at the clamps, and angles in the body, in which all cables end.
+ANCHORS = ((-0.4, 0.3, -1.14), (0.5, 0.2, math.pi + 0.78), (0.05, -0.45, 1.38))
+ANGLES = (-0.24, math.pi + 0.38, 1.88)
+LENGTHS = (0.505, 0.544, 0.457)  # a little taut, so that they stay in their plane
+LOAD = (0.02, -0.05, 0.001)
+
+
+def planar(angle) -> np.ndarray:
+    """The frame of this tangent in the plane of x and z, d2 along -y, about which angles from x to z are positive."""
+    return rodjax.frame((math.cos(angle), 0.0, math.sin(angle)), (0.0, -1.0, 0.0))
+
+
+def star(load=LOAD, mass=0.0, offset=(0.0, 0.0, 0.0), stiffer=1.0, gravity=None) -> Harness:
+    cables = {}
+    for k, ((x, z, angle), own, length) in enumerate(zip(ANCHORS, ANGLES, LENGTHS, strict=True)):
+        rod = plain(length)
+        rod = Rod(length, (1.0 + 0.2 * k) * stiffer * rod.EI, rod.GJ, rod.EA, rod.mass_per_length)
+        end = Joint("hub", planar(own), offset if k == 1 else (0.0, 0.0, 0.0))
+        cables[f"cable {k}"] = Scene(rod, Clamp((x, 0.0, z), planar(angle)), end, gravity=gravity)
+    # The axis of a positive moment from x to z is -y.
+    return Harness(cables, {"hub": Body((load[0], 0.0, load[1]), (0.0, -load[2], 0.0), mass)})
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return rodjax.solve(star(), segments=32)
+
+
+def test_a_star_is_in_balance(solved):
+    force = sum(-cable.end_force for cable in solved.values())
+    moment = sum(-cable.end_moment for cable in solved.values())
+    assert jnp.max(jnp.abs(force + jnp.array([LOAD[0], 0.0, LOAD[1]]))) < 1e-9
+    assert jnp.max(jnp.abs(moment - jnp.array([0.0, LOAD[2], 0.0]))) < 1e-9
+
+
+def test_a_star_is_that_of_an_independent_code(solved):
+    rods = []
+    for anchor, own, cable in zip(ANCHORS, ANGLES, solved.values(), strict=True):
+        rod = cable.scene.rod
+        rods.append(PlanarRod(float(rod.length), float(rod.EI), float(rod.EA), anchor, ("hub", own)))
+    assert max(jnp.max(jnp.abs(cable.nodes[:, 1])) for cable in solved.values()) < 1e-9
+    body = solved.joints["hub"]
+    angle = math.atan2(body.frame[2, 0], body.frame[0, 0])
+    forces = [(c.start_force[0], c.start_force[2], -c.start_moment[1]) for c in solved.values()]
+    # From a guess that differs in the third digit.
+    places = {"hub": np.array([body.position[0], body.position[2], angle]) + 1e-3}
+    joints, begins = solve_frame(rods, {"hub": LOAD}, np.array(forces) * 1.001, places)
+    # The error of 32 elements, of fourth order.
+    assert abs(joints["hub"][:2] - body.position[jnp.array([0, 2])]).max() < 1e-7
+    assert abs(joints["hub"][2] - angle) < 1e-6
+    for cable, begin in zip(solved.values(), begins, strict=True):
+        largest = np.max(np.abs(begin[3:5]))
+        # Near their ends taut cables bend within a few elements: estimated are 1e-5 of the largest force.
+        assert abs(begin[3] - cable.start_force[0]) < 3e-5 * largest
+        assert abs(begin[4] - cable.start_force[2]) < 3e-5 * largest
+
+
+def test_rtol_chooses_the_mesh_of_each_cable(solved):
+    """The error that is estimated for each cable by itself bounds that of the star."""
+    coarse = rodjax.solve(star(), rtol=1e-4)
+    assert coarse.converged
+    fine = solved.joints["hub"].position
+    assert jnp.max(jnp.abs(coarse.joints["hub"].position - fine)) < 1e-4 * max(LENGTHS)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_star_are_those_of_finite_differences():
+    names = ("load", "mass", "offset", "stiffer")
+    numbers = (jnp.array(LOAD), jnp.array(0.01), jnp.array([0.01, 0.0, 0.02]), jnp.array(1.1))
+
+    def height(numbers):
+        harness = star(**dict(zip(names, numbers, strict=True)), gravity=(0.0, 0.0, -9.81))
+        found = rodjax.solve(harness, segments=8, solver=Newton(tolerance=1e-11))
+        return found.joints["hub"].position[2] + found["cable 1"].start_force[0] + found["cable 0"].nodes[4, 0]
+
+    gradient = jax.grad(height)(numbers)
+    generic = jax.tree.map(lambda x: np.cos(1.0 + np.arange(x.size)).reshape(x.shape) * (0.1 + jnp.abs(x)), numbers)
+    step = 1e-5
+    ahead, behind = (
+        height(jax.tree.map(lambda x, d, sign=sign: x + sign * step * d, numbers, generic)) for sign in (1, -1)
+    )
+    slope = sum(jnp.sum(g * d) for g, d in zip(gradient, generic, strict=True))
+    # Of central differences: the third derivative times 1e-10 / 6, and rounding.
+    assert abs(slope - (ahead - behind) / (2 * step)) < 1e-6 * abs(slope)
+
+
+def test_a_path_carries_turns_and_leaves_no_step_coarse():
+    """The end of a joined rod turned by 1.5 turns in steps of 54 degrees: the twist of both parts follows."""
+
+    def turned(angle: float) -> Harness:
+        end = Clamp((0.9, 0, 0), rodjax.rotate(rodjax.frame((1, 0, 0)), (angle, 0, 0)))
+        straight = Joint("cut", rodjax.frame((1, 0, 0)))
+        first = Scene(plain(0.5), Clamp((0, 0, 0), rodjax.frame((1, 0, 0))), straight, gravity=GRAVITY)
+        return Harness({"a": first, "b": Scene(plain(0.5), straight, end, gravity=GRAVITY)})
+
+    path = rodjax.solve_path([turned(0.3 * k * math.pi) for k in range(11)], rtol=1e-3)
+    assert path.energy.shape == (11,)
+    assert jnp.all(path.converged)
+    twist = path["a"].total_twist + path["b"].total_twist
+    # The curved rod writhes a little too.
+    assert jnp.all(jnp.diff(twist) > 0.5)
+    assert abs(twist[-1] - 3 * math.pi) < 1.5
+    assert max(jnp.max(rod.error_estimate) for rod in path.values()) < 1e-3
+    assert path.joints["cut"].position.shape == (11, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Harness({"a": PART}, {"other": Body()}), "joints['other'] has no rod: the ends of the cables name"),
+        (lambda: Harness({"a": PART}, contact=True), "contact must be False"),
+        (lambda: Harness({"a": Scene(plain(1.0), START, END)}), "a harness must have an end that is a Joint"),
+        (lambda: Harness({"a": HANGING}), "nothing holds the rods at the joint 'j'"),
+        (lambda: Harness({"a": PART}, {"cut": Body(mass=1.0)}), "joints['cut'].mass needs a rod with gravity"),
+        (lambda: Harness({"a": NEAR}), "cables['a'].obstacles must be () where ends have unknown poses"),
+        (lambda: rodjax.solve(PART), "scene.end is a Joint: make a Harness of the scene"),
+        (lambda: rodjax.solve(Harness({"a": PART}), planar=True), "planar must be False"),
+        (lambda: rodjax.solve(Harness({"a": PART}), discretization="finite_difference"), "must be 'hermite'"),
+        (lambda: rodjax.solve_path([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
+        (lambda: rodjax.solve_batch([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
+        (lambda: rodjax.write_scene(SOFT, "soft.toml"), "scene.end must be a Clamp, Swivel, Pin or Free"),
+        (lambda: Spring(Pin((0, 0, 0)), rotation=1.0), "rotation must be None on a Pin without a frame"),
+        (lambda: Slider((0, 0, 0), [(1, 0, 0), (2, 0, 0)]), "directions must not be parallel"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+PART = Scene(plain(0.5), START, Joint("cut"))
+HANGING = Scene(plain(0.5), Free(), Joint("j"), gravity=GRAVITY)
+NEAR = Scene(plain(0.5), START, Joint("j"), obstacles=[rodjax.Plane((0, 0, -9), (0, 0, 1))])
+SOFT = Scene(plain(1.0), START, Spring(END, rotation=1.0), gravity=GRAVITY)

@@ -1,0 +1,113 @@
+"""Scene files of harnesses, and of ends that hinge, slide or give way."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax
+from rodjax import Clamp, Hinge, Joint, SceneFileError, Slider, Spring, cli
+
+ROD = '{ section = "circular", length = "30 cm", radius = "3 mm", youngs_modulus = "10 MPa", poisson_ratio = 0.5 }'
+BRANCHES = f"""
+[cables.trunk]
+rod = {ROD}
+start = {{ support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }}
+end = {{ support = "joint", joint = "y", tangent = [1, 0, 0], d2 = [0, 1, 0], offset = "[-5, 0, 0] mm" }}
+[cables.left]
+rod = {ROD}
+start = {{ support = "joint", joint = "y", tangent = [1, 1, 0], d2 = [0, 0, 1] }}
+end = {{ support = "clamp", position = "[50, 15, 0] cm", tangent = [1, 0, 0], d2 = [0, 0, 1] }}
+[cables.right]
+rod = {ROD}
+start = {{ support = "joint", joint = "y", tangent = [1, -1, 0], d2 = [0, 0, 1] }}
+end = {{ support = "pin", position = "[50, -15, 0] cm" }}
+[joints.y]
+force = "[0, 0, -0.1] N"
+[loads]
+gravity = "[0, 0, -9.81] m/s^2"
+"""
+ONE = f"""
+rod = {ROD}
+start = {{ support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }}
+end = {{ END }}
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text: str):
+        path = tmp_path / "harness.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_a_file_of_cables_is_a_harness(written):
+    harness = rodjax.read_scene(written(BRANCHES))
+    assert isinstance(harness, rodjax.Harness)
+    assert tuple(harness) == ("trunk", "left", "right")
+    assert harness.joint_names == ("y",)
+    assert jnp.allclose(harness.bodies[0].force, jnp.array([0, 0, -0.1]))
+    end = harness["trunk"].end
+    assert isinstance(end, Joint)
+    assert jnp.allclose(end.offset, jnp.array([-0.005, 0, 0]))
+    assert jnp.allclose(end.frame[:, 2], jnp.array([1.0, 0, 0]))
+    assert all(jnp.allclose(scene.gravity, jnp.array([0, 0, -9.81])) for scene in harness.scenes)
+
+
+@pytest.mark.parametrize(
+    ("end", "kind"),
+    [
+        ('support = "hinge", position = "[1, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0], axis = [0, 2, 0]', Hinge),
+        ('support = "slider", position = "[20, 0, 0] cm", directions = [[1, 0, 0], [0, 1, 0]]', Slider),
+        (
+            'support = "clamp", position = "[20, 0, 0] cm", tangent = [1, 0, 0], d2 = [0, 1, 0], '
+            'rotation = "0.5 N m/rad"',
+            Spring,
+        ),
+    ],
+)
+def test_a_file_has_ends_that_move(written, end, kind):
+    if kind is Hinge:
+        end = end.replace("[1, 0, 0] m", "[0.2, 0, 0] m")
+    found = rodjax.read_scene(written(ONE.replace("END", end))).end
+    assert isinstance(found, kind)
+    if kind is Spring:
+        assert isinstance(found.support, Clamp)
+        assert (found.rotation, found.translation) == (0.5, None)
+    elif kind is Hinge:
+        assert np.array_equal(found.axis, [0, 1, 0])
+    else:
+        assert found.frame is None
+        assert found.directions.shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('joint = "y", tangent = [1, 0, 0]', "tangent = [1, 0, 0]", "cables.trunk.end.joint is missing: the name"),
+        ("[joints.y]", "[joints.z]", "joints['z'] has no rod: the ends of the cables name 'y'"),
+        ('force = "[0, 0, -0.1] N"', 'mass = "-1 g"', "joints.y.mass must not be negative"),
+        ("tangent = [1, 1, 0], d2 = [0, 0, 1]", "tangent = [1, 1, 0]", "cables.left.start.d2 or start.frame is needed"),
+        ("[loads]", "[load]", "load is not allowed here; allowed are cables, joints, loads, solve"),
+    ],
+)
+def test_mistakes_in_a_file_are_told_in_one_line(written, old, new, message):
+    assert old in BRANCHES
+    with pytest.raises(SceneFileError, match=re.escape(message)):
+        rodjax.read_scene(written(BRANCHES.replace(old, new)))
+
+
+@pytest.mark.slow
+def test_the_command_solves_and_draws_a_harness(written, tmp_path, capsys):
+    picture = tmp_path / "harness.png"
+    assert cli.main(["solve", str(written(BRANCHES)), "--plot", str(picture)]) == 0
+    told = capsys.readouterr().out
+    assert "3 cables, 1 joints" in told
+    assert "trunk: converged" in told
+    assert picture.stat().st_size > 10_000
+    assert cli.main(["solve", str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf")]) == 2
+    assert "-o is not allowed for a harness" in capsys.readouterr().err

@@ -262,6 +262,13 @@ class NodalForm(Form):
         contacts = self.contacts_on_elements(point)
         return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
 
+    def shares(self, point: Any) -> Float[Array, "n+1 3"]:
+        """What contacts within elements apply to the rod, half at each node."""
+        if not self.smooth:
+            return jnp.zeros_like(point.nodal.places)
+        halves = -self.contacts_on_elements(point).by_place
+        return (jnp.pad(halves[:, 0], ((0, 0), (0, 1))) + jnp.pad(halves[:, 1], ((0, 0), (1, 0)))).T
+
     def contacts_on_elements(self, point: Any) -> OnElements:
         middles, _, normals = self.within_elements(point)
         forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[len(self.scene.obstacles) :, :-1], normals)
@@ -282,9 +289,11 @@ class NodalForm(Form):
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         start, end = super().end_forces(point)
-        if not self.scene.potentials:
+        if not self.scene.potentials and not self.smooth:
             return start, end
-        loads = -potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
+        loads = self.shares(point) if self.smooth else 0.0
+        if self.scene.potentials:
+            loads = loads - potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
         # Of those that are held; a given force is one.
         start = start + loads[0] if isinstance(self.scene.start, Held) else start
         return start, end - loads[-1] if isinstance(self.scene.end, Held) else end

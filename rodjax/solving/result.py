@@ -512,7 +512,8 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     assert isinstance(form, NodalForm)
     forces = form.applied(point).T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
-    return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
+    shares = form.shares(point) * equilibrium.state.units.force
+    return (forces - shares)[clips], jnp.where(form.is_held[:, None], shares, forces)
 
 
 class _Contacts(eqx.Module):

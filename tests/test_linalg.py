@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 import rodjax as rj
-from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, LoadRows
+from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.solving.result import form_and_point
 
@@ -230,6 +230,32 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
     )
 
 
+def with_inner_contacts(system: ChainSystem) -> ChainSystem:
+    """And with a third obstacle that touches every second element, itself as soft as 0.05, and what couples both nodes
+    of each element beside it.
+    """
+    rng = np.random.default_rng(3)
+    elements = system.across.shape[-1]
+    free = np.where(system.held, 0.0, 1.0)
+    places = rng.normal(size=(1, 3, 2, elements)) * np.stack([free[:-1], free[1:]])
+    inner = InnerRows(
+        jnp.asarray(rng.normal(size=(1, 2, 2, elements))), jnp.asarray(places), jnp.full(elements, 0.05), 2
+    )
+    contacts = system.contacts
+    is_closed = np.append(np.arange(elements) % 2 == 0, False)[None]
+    contacts = ContactRows(
+        jnp.pad(contacts.normals, ((0, 1), (0, 0), (0, 0))),
+        contacts.softness,
+        jnp.concatenate([contacts.is_closed, jnp.asarray(is_closed)]),
+        inner=inner,
+    )
+    blocks = rng.normal(size=(10, 10, elements)) / 10
+    moves = np.concatenate([np.ones((2, elements)), np.tile(free[:-1], (3, 1))])
+    moves = np.concatenate([moves, np.ones((2, elements)), np.tile(free[1:], (3, 1))])
+    blocks = (blocks + blocks.transpose(1, 0, 2)) * moves[:, None] * moves[None]
+    return dataclasses.replace(system, contacts=contacts).with_elements(jnp.asarray(blocks))
+
+
 def random_loads(elements: int) -> LoadRows:
     rng = np.random.default_rng(7)
     shapes = ((2, 3, 2, 3, elements), (3, 2, 3, elements), (2, 3, 2, 3, elements))
@@ -239,9 +265,12 @@ def random_loads(elements: int) -> LoadRows:
 @pytest.mark.parametrize("elements", [4, 7])
 @pytest.mark.parametrize("is_backward", [False, True])
 @pytest.mark.parametrize("loads", [None, random_loads])
-def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads):
-    """Also with loads that have no potential, without symmetry."""
+@pytest.mark.parametrize("has_inner", [False, True])
+def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads, has_inner):
+    """Also with loads that have no potential, without symmetry, and with contacts within elements."""
     system = dataclasses.replace(random_chain(elements), is_backward=is_backward, loads=loads and loads(elements))
+    if has_inner:
+        system = with_inner_contacts(system)
     pressures = system.contacts.is_closed.size
     m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 
@@ -250,7 +279,7 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads)
         return jnp.concatenate([f.reshape(-1), c])
 
     matrix = np.array(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
-    assert np.array_equal(matrix, matrix.T) == (loads is None)
+    assert np.allclose(matrix, matrix.T, rtol=1e-13, atol=1e-13) == (loads is None)  # roundings
     right = np.random.default_rng(1).normal(size=len(matrix))
     factors = factor(system)
     assert isinstance(factors, ChainFactors)
@@ -258,7 +287,8 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads)
     places = np.arange(2 * m + 1, 2 * m + 1 + pressures)
     # As soft as 1e-5, and as if they were hard.
     hard = np.array(matrix)
-    hard[places, places] += np.where(np.ravel(system.contacts.is_closed), 1e-5, 0.0)
+    of_nodes = np.where(np.ravel(system.contacts.is_closed[:2]), 1e-5, 0.0)
+    hard[places[: of_nodes.size], places[: of_nodes.size]] += of_nodes
     for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
         found, truth = np.concatenate([np.ravel(x) for x in solve(*given)]), np.linalg.solve(full, right)
         is_pressure = np.isin(np.arange(len(found)), places)

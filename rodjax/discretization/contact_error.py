@@ -1,4 +1,4 @@
-"""What contacts at nodes alone add to the error of a mesh, and how deep the rod lies within obstacles between them."""
+"""What contacts at a few places add to the error of a mesh, and how deep the rod lies within obstacles between them."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from rodjax.discretization.form_results import positions_between_nodes
 from rodjax.discretization.nodal import NodalForm
 from rodjax.geometry.vectors import dot, root
 
-# A force F that acts half an element aside of its place bends the rod as a moment of F h/8 on an element does, and
-# displaces it by about half of that.
+# A force F that acts aside of its place by half of the distance h to the next one where contacts act bends the rod as a
+# moment of F h/8 on an element does, and displaces it by about half of that.
 CONTACT_REACH = 16.0
 CONTACT_MOMENT = 8.0
 # Where it is looked at how deep a rod lies within obstacles, as parts of elements.
@@ -19,7 +19,8 @@ DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
-    """With what it adds that contacts act at nodes: where one lies by itself, it may be anywhere beside its node.
+    """With what it adds that contacts act at nodes and middles of elements, with friction at nodes alone: where one
+    lies by itself, it may be anywhere beside these.
 
     And how deep the rod lies between the nodes.
     """
@@ -27,7 +28,7 @@ def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
     forces = jnp.where(form.is_held[None], 0.0, form.applied(point))
     beside = jnp.pad(forces, ((0, 0), (1, 1)))
     alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
-    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / 2
+    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / (2 if form.rough else 4)
     misplaced = alone * (spacing**2 / CONTACT_REACH)[None]
     sizes = root(dot(misplaced, misplaced))
     defects = errors.defects

@@ -12,6 +12,7 @@ Newton's method.
 The same solution changes forces, moments and curvatures: so much are these off.
 """
 
+import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from rodjax.discretization.results import clip_moments, resultants, with_fields_
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
 from rodjax.linalg.blocks import partial_sums, short_sum
+from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor_and_solve
 from rodjax.mechanics.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.mechanics.strain import swept_angle
@@ -43,6 +45,9 @@ COUPLE_REACH = 12.0
 # vanishes no part can be told. Of curvatures [1/L] as of moments.
 LEAST_FORCE = 1.0
 LEAST_MOMENT = 0.1
+# Contacts within elements count as so much softer, about as soft as an element: how much of a force they bear, and how
+# much the nodes beside them, is no error of the rod.
+SOFTENED = 1e3
 # A correction of less stiffness [EI/L^2 per rad and length] than this may be mostly a turn that nothing resists; the
 # softest motion of a clamped rod has pi^2.
 SOFT = 1.0
@@ -133,7 +138,10 @@ def correction(
     turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
     turn the rod far. The turn about the given axis, zero for none, is taken out.
     """
-    motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
+    system = here.system
+    if isinstance(system, ChainSystem):
+        system = dataclasses.replace(system, contacts=system.contacts.softened(SOFTENED))
+    motion = Motion(*factor_and_solve(form.regular(system), -gradient, -closure)[1:])
     if not form.has_potential:
         return motion, jnp.array(False)
     places = motion.rotation.shape[1]
@@ -204,7 +212,8 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
-    last, passed = _integrated(form, field, forces, torque, first)
+    has_fields = form.fields_on_elements(point) is not None
+    last, passed = _integrated(form, field, forces, torque, first, has_fields)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
     # a twist.
@@ -282,9 +291,16 @@ def _axial_error(
 
 
 def _integrated(
-    form: MixedForm, field: HermiteElements, forces: Float[Array, "3 3 n"], torque: Float[Array, ""], first: Section
+    form: MixedForm,
+    field: HermiteElements,
+    forces: Float[Array, "3 3 n"],
+    torque: Float[Array, ""],
+    first: Section,
+    has_fields: bool,
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
-    """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta."""
+    """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta.
+    `has_fields`: the forces are parabolas, else those at the start less the weight.
+    """
     scene, rod = form.scene, form.scene.rod
     start, middle, end = (forces[:, k] for k in range(3))
     weight = jnp.zeros(3, start.dtype) if scene.gravity is None else scene.gravity
@@ -293,7 +309,7 @@ def _integrated(
     def slope(section: Section, s: Float[Array, "n"]) -> Section:
         """Derivatives by arclength, at s from the first node."""
         n = start - weight[:, None] * s[None]
-        if scene.potentials:
+        if has_fields:
             x = (s / field.h)[None]
             n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]

@@ -5,8 +5,9 @@ The force F through an element is the multiplier of its way from node to node, a
 unknowns of their own: so what acts on an element depends on what is local, the system is a chain, and a step of
 Newton's method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
 
-No node is nearer to an obstacle than the rod is thick: gap g >= 0. The pressure p >= 0 [a force, for each obstacle and
-node] is the multiplier of that:
+No node is nearer to an obstacle than the rod is thick: gap g >= 0, and no middle of an element (`inner_contacts`) to
+an obstacle without friction. The pressure p >= 0 [a force, for each obstacle and node or middle] is the multiplier of
+that:
 
     L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
 
@@ -34,12 +35,13 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization import potentials
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential, within
+from rodjax.discretization.inner_contacts import Middles
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import NodeEnergy, OnElements
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
-from rodjax.linalg.chain import ChainSystem, ContactRows
+from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
@@ -49,7 +51,10 @@ from rodjax.model.supports import Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
-SOFTNESS = 1e-4
+SOFTNESS = 1e-5
+# Of a contact in the middle of an element, as a part of h^3/EI: it gives way by so much times its pressure, which both
+# nodes beside it would bear else. Harder ones leave all but undetermined who of the three does where the rod lies on.
+INNER_SOFTNESS = 1e-3
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
@@ -73,15 +78,26 @@ LIES_ON = 1e-9
 TOUCHES = 1e-3
 
 
+class InnerStiffness(NamedTuple):
+    """What contacts within elements add: moments out of balance at the points, and second derivatives by the rotation
+    and the place of the first node of each element, then of the last one.
+    """
+
+    gradient: Float[Array, "b m"]
+    blocks: Float[Array, "2b+6 2b+6 n"]
+
+
 class Contacts(NamedTuple):
-    """At a point: gaps, their gradients with those of slips below, and the second derivatives of what L has of gaps by
-    the places of nodes; with friction the ways of nodes since the last equilibrium.
+    """At a point: gaps at nodes, below them those within elements; their gradients with those of slips below, and the
+    second derivatives of what L has of gaps by the places of nodes; with friction the ways of nodes since the last
+    equilibrium; of contacts within elements what else they add, `None` without such.
     """
 
     gaps: Float[Array, "k n+1"]
     rows: ContactRows
     stiffness: Float[Array, "n+1 3 3"]
     ways: Float[Array, "n+1 3"] | None
+    inner: InnerStiffness | None
 
 
 class NodalForm(Form):
@@ -128,7 +144,7 @@ class NodalForm(Form):
         return super().is_closed(self.closure(closure), tolerance)
 
     def others(self, multipliers: Float[Array, "k"]) -> NodalChange:
-        nodes, rows = len(self.field.s), len(self.scene.obstacles) + 3 * len(self.rough)
+        nodes, rows = len(self.field.s), pressure_rows(self.scene.obstacles) + 3 * len(self.rough)
         pressures, displacements = jnp.split(
             multipliers[-3 * (2 * nodes - 1) - rows * nodes : -3 * (nodes - 1)], [rows * nodes]
         )
@@ -149,13 +165,17 @@ class NodalForm(Form):
         gaps, normals = self.gaps_and_normals(nodal.places)
         beyond, there = self.gaps_and_normals(moved.places)
         beyond -= gaps + jnp.einsum("knc,nc->kn", normals, others.displacements)
-        pushes = (moved.pressures > 0) & ~self.is_held[None]
+        pushes = (moved.pressures[: len(gaps)] > 0) & ~self.is_held[None]
         places = moved.places - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
         return dataclasses.replace(moved, places=places)
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
         depths = -jnp.min(gaps, axis=1, initial=jnp.inf)
+        if self.smooth:
+            smooth, count = np.array(self.smooth), len(self.scene.obstacles)
+            deepest = jnp.maximum(depths[smooth], depths[count:])
+            depths = jnp.concatenate([depths[:count].at[smooth].set(deepest), deepest])
         return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
@@ -181,7 +201,7 @@ class NodalForm(Form):
         friction: Friction | None,
     ) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
-        nothing = jnp.zeros((len(self.scene.obstacles), len(nodes)), nodes.dtype)
+        nothing = jnp.zeros((pressure_rows(self.scene.obstacles), len(nodes)), nodes.dtype)
         if self.rough and friction is None:
             friction = Friction.from_rest(len(self.rough), nodes)
         nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0], friction if self.rough else None))
@@ -194,8 +214,13 @@ class NodalForm(Form):
         gaps, normals = self.gaps_and_normals(nodal.places)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
+        pushing = jnp.concatenate([pushing, nothing[len(pushing) :]])
         known = nothing + jnp.nan if pressures is None else pressures
+        # Files until format 12 have those at nodes only.
+        known = jnp.concatenate([known, nothing[len(known) :] + jnp.nan])
         pressures = jnp.where(jnp.isnan(known), pushing, known)
+        _, inner_gaps, _ = self.within_elements(point)
+        gaps = jnp.concatenate([gaps, inner_gaps])
         nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=self.led_out(gaps))
         return dataclasses.replace(point, nodal=nodal)
 
@@ -228,9 +253,29 @@ class NodalForm(Form):
         return potentials.at_nodes(self.scene, self.field.s, *self._node_lines(point), self.node_axes(point))
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
-        if not self.scene.potentials:
-            return None
-        return potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
+        """With the contacts in their middles, whose forces count as if spread along them."""
+        fields = None
+        if self.scene.potentials:
+            fields = potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
+        if not self.smooth:
+            return fields
+        contacts = self.contacts_on_elements(point)
+        return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
+
+    def shares(self, point: Any) -> Float[Array, "n+1 3"]:
+        """What contacts within elements apply to the rod, half at each node."""
+        if not self.smooth:
+            return jnp.zeros_like(point.nodal.places)
+        halves = -self.contacts_on_elements(point).by_place
+        return (jnp.pad(halves[:, 0], ((0, 0), (0, 1))) + jnp.pad(halves[:, 1], ((0, 0), (1, 0)))).T
+
+    def contacts_on_elements(self, point: Any) -> OnElements:
+        middles, _, normals = self.within_elements(point)
+        forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[len(self.scene.obstacles) :, :-1], normals)
+        halves = -jnp.stack([forces, forces], axis=1) / 2
+        by_tangent = jnp.einsum("cn,cdn->dn", forces, middles.by_difference)
+        by_tangent = jnp.stack([-by_tangent, by_tangent], axis=1)
+        return OnElements(halves, by_tangent, jnp.zeros_like(halves))
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
         fields = self.fields_on_elements(point)
@@ -244,9 +289,11 @@ class NodalForm(Form):
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         start, end = super().end_forces(point)
-        if not self.scene.potentials:
+        if not self.scene.potentials and not self.smooth:
             return start, end
-        loads = -potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
+        loads = self.shares(point) if self.smooth else 0.0
+        if self.scene.potentials:
+            loads = loads - potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
         # Of those that are held; a given force is one.
         start = start + loads[0] if isinstance(self.scene.start, Held) else start
         return start, end - loads[-1] if isinstance(self.scene.end, Held) else end
@@ -285,6 +332,18 @@ class NodalForm(Form):
         h = jnp.diff(self.field.s)
         return SOFTNESS * h[jnp.argmin(h)] ** 3
 
+    @property
+    def inner_softness(self) -> Float[Array, "n"]:
+        """Of the contacts within elements [L^3/EI]."""
+        return INNER_SOFTNESS * jnp.diff(self.field.s) ** 3
+
+    def with_cushions(self, gaps: Float[Array, "r n+1"], pressures: Float[Array, "r n+1"]) -> Float[Array, "r n+1"]:
+        """The gaps less what contacts within elements give way by."""
+        if not self.smooth:
+            return gaps
+        inner = slice(len(self.scene.obstacles), None)
+        return gaps.at[inner, :-1].add(self.inner_softness[None] * pressures[inner, :-1])
+
     def distances_and_normals(
         self, places: Float[Array, "n+1 3"]
     ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
@@ -298,6 +357,23 @@ class NodalForm(Form):
             return jnp.zeros((0, len(places)), places.dtype), jnp.zeros((0, *places.shape), places.dtype)
         distances, normals = self.distances_and_normals(places)
         return jnp.where(self.is_held[None], 1.0, distances - self.radius[None]), normals
+
+    @property
+    def smooth(self) -> tuple[int, ...]:
+        """The numbers of the obstacles without friction: those that elements touch in their middles too."""
+        return tuple(k for k, obstacle in enumerate(self.scene.obstacles) if _friction(obstacle) is None)
+
+    def within_elements(self, point: Any) -> tuple[Middles, Float[Array, "q n+1"], Float[Array, "q n 3"]]:
+        """The middles of the elements, their gaps, and the directions in which these grow."""
+        s = self.field.s
+        free = jnp.where(self.is_held, 0.0, 1.0).astype(s.dtype)
+        middles = Middles.of(point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, jnp.diff(s))
+        if not self.smooth:
+            return middles, jnp.zeros((0, len(s)), s.dtype), jnp.zeros((0, len(s) - 1, 3), s.dtype)
+        distances, normals = self.distances_and_normals(middles.points)
+        smooth = np.array(self.smooth)
+        gaps = distances[smooth] - self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[None, :, 0]
+        return middles, jnp.pad(gaps, ((0, 0), (0, 1)), constant_values=1.0), normals[smooth]
 
     @property
     def rough(self) -> tuple[int, ...]:
@@ -324,15 +400,35 @@ class NodalForm(Form):
         gaps, normals = self.gaps_and_normals(nodal.places)
         is_free = jnp.where(self.is_held, 0.0, 1.0).astype(normals.dtype)[:, None]
         normals *= is_free[None]
+        curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures[: len(gaps)])
+        inner, inner_rows, across = None, None, self._across(normals) if nodal.friction is not None else None
+        if self.smooth:
+            inner_gaps, inner_rows, inner = self._inner(point, nodal.pressures[len(gaps) :, :-1])
+            gaps = jnp.concatenate([gaps, inner_gaps])
+            normals = jnp.concatenate([normals, jnp.zeros((len(inner_gaps), *normals.shape[1:]), normals.dtype)])
         is_closed, ways = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]), None
-        if nodal.friction is not None:
+        if nodal.friction is not None and across is not None:
             ways = self.travelled(nodal.places, nodal.friction)
             sticks = self.sticks(nodal, normals, ways)
             is_closed = jnp.concatenate([is_closed, jnp.repeat(sticks, 3, axis=0)])
-            normals = jnp.concatenate([normals, self._across(normals)])
-        rows = ContactRows(normals, self.softness, is_closed)
-        curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures)
-        return Contacts(gaps, rows, curving, ways)
+            normals = jnp.concatenate([normals, across])
+        rows = ContactRows(normals, self.softness, is_closed, inner=inner_rows)
+        return Contacts(gaps, rows, curving, ways, inner)
+
+    def _inner(
+        self, point: Any, pressures: Float[Array, "q n"]
+    ) -> tuple[Float[Array, "q n+1"], InnerRows, InnerStiffness]:
+        """Gaps in the middles of the elements, their gradients, and what pressures there add to L."""
+        middles, gaps, normals = self.within_elements(point)
+        rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
+        b = rates.shape[1] - 3
+        rows = InnerRows(rates[:, :b], rates[:, b:], self.inner_softness, first=len(self.scene.obstacles))
+        curved = self._curving(middles.points, pressures, self.smooth)
+        by_moves = middles.rates.reshape(3, 2 * (b + 3), -1)
+        blocks = jnp.einsum("cin,ncd,djn->ijn", by_moves, curved, by_moves)
+        blocks -= middles.second(jnp.einsum("qn,qnc->cn", pressures, normals))
+        gradient = -rows.turned(jnp.pad(pressures, ((0, 0), (0, 1))))
+        return gaps, rows, InnerStiffness(gradient, blocks)
 
     def _across(self, normals: Float[Array, "k n+1 3"]) -> Float[Array, "3f n+1 3"]:
         """The gradients of slips, the rows of projections on tangent planes."""
@@ -355,7 +451,7 @@ class NodalForm(Form):
     def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
         """The contacts of the model of a step from a point, to gaps and ways."""
         nodal = point.nodal
-        gaps = gaps + nodal.relaxed[:, None]
+        gaps = self.with_cushions(gaps + nodal.relaxed[:, None], nodal.pressures)
         if nodal.friction is None or ways is None:
             return Unilateral(gaps, nodal.pressures)
         _, normals = self.gaps_and_normals(nodal.places)
@@ -363,10 +459,15 @@ class NodalForm(Form):
         bounds = self.bounds(nodal.pressures, nodal.friction)
         return Unilateral(jnp.concatenate([gaps, slips]), nodal.contact_forces, bounds)
 
-    def _curving(self, places: Float[Array, "n+1 3"], pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3 3"]:
-        """Second derivatives of what L has of the contacts, by the places of the nodes."""
+    def _curving(
+        self, places: Float[Array, "p 3"], pressures: Float[Array, "k p"], which: tuple[int, ...] | None = None
+    ) -> Float[Array, "p 3 3"]:
+        """Second derivatives of what L has of the contacts, by the places of nodes or middles; `which`: obstacles, if
+        not all.
+        """
         total = jnp.zeros((len(places), 3, 3), places.dtype)
-        for obstacle, pressure in zip(self.scene.obstacles, pressures, strict=True):
+        obstacles = self.scene.obstacles if which is None else [self.scene.obstacles[k] for k in which]
+        for obstacle, pressure in zip(obstacles, pressures, strict=True):
             # Where the rod touches nothing of an obstacle, its curvature is not computed.
             total = jax.lax.cond(
                 jnp.any(pressure != 0),
@@ -380,7 +481,7 @@ class NodalForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        nodal, gaps = point.nodal, contacts.gaps
+        nodal, gaps = point.nodal, self.with_cushions(contacts.gaps, point.nodal.pressures)
         pressures, forces = nodal.pressures, nodal.contact_forces
         balance = self.applied(point).T - contacts.rows.pushed(forces)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
@@ -405,11 +506,21 @@ class NodalForm(Form):
     # --- friction ----------------------------------------------------------------------------------------------------
 
     def exerted(self, point: Any) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1 3"], Int[Array, "k n+1"]]:
-        """What each obstacle does at each node: push, drag, and whether it is not touched, sticks or slips."""
+        """What each obstacle does at each node: push, drag, and whether it is not touched, sticks or slips. Of a push
+        within an element each of its nodes has half.
+        """
         nodal = point.nodal
         _, normals = self.distances_and_normals(nodal.places)
-        pushes = nodal.pressures[..., None] * normals
-        states = jnp.where(nodal.pressures > 0, SLIPS, OPEN)
+        k = len(normals)
+        pushes = nodal.pressures[:k, :, None] * normals
+        pressures = nodal.pressures[:k]
+        if self.smooth:
+            _, _, normals_within = self.within_elements(point)
+            in_middles = nodal.pressures[k:, :-1, None]
+            smooth = np.array(self.smooth)
+            pushes = pushes.at[smooth].add(_shared(in_middles * normals_within))
+            pressures = pressures.at[smooth].add(_shared(in_middles)[..., 0])
+        states = jnp.where(pressures > 0, SLIPS, OPEN)
         if nodal.friction is None:
             return pushes, jnp.zeros_like(pushes), states
         rough = np.array(self.rough)
@@ -464,7 +575,8 @@ class NodalForm(Form):
         free = jnp.where(self.is_held, 0.0, 1.0).astype(forces.dtype)[:, None]
         pushes = contacts.normals.at[rough].add(dragging * free[None])
         rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.places.shape) * free[None]
-        rows = ContactRows(jnp.concatenate([contacts.normals[:k], rows]), contacts.softness, contacts.is_closed, pushes)
+        normals = jnp.concatenate([contacts.normals[:k], rows])
+        rows = ContactRows(normals, contacts.softness, contacts.is_closed, pushes, contacts.inner)
         stiffness = system.stiffness - free[..., None] * jnp.einsum("dfnc->ncd", forces)
         return dataclasses.replace(system, contacts=rows, stiffness=stiffness)
 
@@ -473,8 +585,9 @@ class NodalForm(Form):
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
         """L with the contacts as of the model, with the pressures of a point."""
         assert here.gaps is not None
-        softness, model = self.softness, self.model(point, here.gaps, here.ways)
-        return here.energy + softness / 2 * model.energy(model.pressures - model.gaps / softness)
+        assert isinstance(here.system, ChainSystem)
+        softness, model = here.system.contacts.softnesses, self.model(point, here.gaps, here.ways)
+        return here.energy + model.energy(model.pressures - model.gaps / softness, softness) / 2
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -490,6 +603,7 @@ class NodalForm(Form):
         first, _, balance, gaps = system.parted(-here.closure)
         forces = nodal.contact_forces
         balance -= system.contacts.pushed(forces)  # which the model has
+        moments = -system.contacts.turned(forces, here.gradient)
         c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(forces), balance, gaps)])
         if not self.scene.obstacles:
             return super().sought(here, point, system, push)
@@ -501,10 +615,11 @@ class NodalForm(Form):
         else:
             k = len(here.gaps)
             # What slips, and by how much, is a matter of the model.
-            sticks = contacts.is_closed(contacts.pressures - contacts.gaps / self.softness)[k:]
+            trial = contacts.pressures - contacts.gaps / system.contacts.softnesses
+            sticks = contacts.is_closed(trial)[k:]
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
-        found = minimized(system, push - here.gradient, c, contacts)
+        found = minimized(system, push + moments, c, contacts)
         return found.is_minimum, found.x, found.y
 
     def under_force(
@@ -537,8 +652,13 @@ class NodalForm(Form):
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         model = self.model(point, here.gaps, here.ways)
-        pushing = model.allowed(model.pressures - model.gaps / self.softness)
-        rate -= jnp.sum(pushing * here.system.contacts.rates(others.displacements))
+        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.softnesses)
+        rows = here.system.contacts
+        rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
+        if rows.inner is not None:
+            # The gradient by rotations has the pressures as they are.
+            at_rest = rows.rates(rotation, jnp.zeros_like(others.displacements))
+            rate += jnp.sum(point.nodal.contact_forces * at_rest)
         if self.scene.potentials:
             by_place = potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
             rate += jnp.sum(by_place * others.displacements)
@@ -625,6 +745,17 @@ class NodalForm(Form):
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
 
 
+def pressure_rows(obstacles: tuple[Obstacle, ...]) -> int:
+    """Of all obstacles at nodes, and of those without friction within elements."""
+    return len(obstacles) + sum(_friction(obstacle) is None for obstacle in obstacles)
+
+
 def _friction(obstacle: Obstacle) -> Any:
     """The coefficient of friction of an obstacle of a nondimensional scene."""
     return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction
+
+
+def _shared(of_elements: Float[Array, "q n c"]) -> Float[Array, "q n+1 c"]:
+    """What belongs to elements at their nodes, half at each."""
+    halves = of_elements / 2
+    return jnp.pad(halves, ((0, 0), (0, 1), (0, 0))) + jnp.pad(halves, ((0, 0), (1, 0), (0, 0)))

@@ -55,7 +55,7 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
     moments += torque * nodes
     forces = form.end_forces(point)
     tension = form.edge_tension(point)[::2]
-    if scene.potentials:
+    if form.fields_on_elements(point) is not None:
         sections = form.with_fields(point, form.forces(point))[:, ::2] * field.h[None, None]
         beside = jnp.pad(sections[:, 0], ((0, 0), (0, 1))) + jnp.pad(sections[:, 1], ((0, 0), (1, 0)))
         tension = dot(beside, nodes) / (jnp.pad(field.h, (0, 1)) + jnp.pad(field.h, (1, 0)))

@@ -1,16 +1,17 @@
 """Saddle-point systems of a rod whose nodes have positions of their own, by block elimination from node to node.
 
 The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in
-`saddle_point`, and the positions of the nodes, and the pressures of contacts there. The force of an element is the
-multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first, each by itself,
-then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the element before it and
-displacement, coupled with those of its neighbours only: O(n).
+`saddle_point`, and the positions of the nodes, and the pressures of contacts at nodes and within elements. The force of
+an element is the multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first,
+each by itself, then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the
+element before it and displacement, coupled with those of its neighbours only: O(n).
 
-    rotation     H theta + B F + T u + border y = f
+    rotation     H theta + B F + T u + border y - M q = f
     gap          B^T theta - C F + u_after - u_before = gap,       for each element
-    balance      S u + T^T theta - N p + F_before - F_after = balance,   for each node that is not held
+    balance      S u + T^T theta - N p - K q + F_before - F_after = balance,   for each node that is not held
     border       border^T theta - compliance y = c
     pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
+    within       -M^T theta - K^T u - softness q = d, the same
 
 Loads without a potential add rows of their own to the first three, without symmetry (`LoadRows`).
 """
@@ -25,33 +26,102 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
 
-# Solutions with soft contacts, before that which is told.
+# Solutions with soft contacts, after the first one.
 HARDENINGS = 5
+
+
+class InnerRows(eqx.Module):
+    """The gradients of q gaps within each element, by the rotations (M) and the places (K) of its first and last node.
+
+    `first`: the number of the first of q rows among those of all contacts; a row has the elements in turn, and a last
+    number that stands for nothing. `softness`: of the contact itself, not of a model of it.
+    """
+
+    by_rotation: Float[Array, "q b 2 n"]
+    by_place: Float[Array, "q 3 2 n"]
+    softness: Float[Array, "n"]
+    first: int = eqx.field(static=True)
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.first, self.first + len(self.by_place))
+
+    def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "q n+1"]:
+        nodes, places = _at_ends(x[:, ::2]), _at_ends(u.T)
+        rates = jnp.einsum("qben,ben->qn", self.by_rotation, nodes) + jnp.einsum("qcen,cen->qn", self.by_place, places)
+        return jnp.pad(rates, ((0, 0), (0, 1)))
+
+    def turned(self, pressures: Float[Array, "q n+1"]) -> Float[Array, "b m"]:
+        """The moments on the points of the rod."""
+        start, end = jnp.moveaxis(jnp.einsum("qben,qn->ben", self.by_rotation, pressures[:, :-1]), 1, 0)
+        nodes = jnp.pad(start, ((0, 0), (0, 1))) + jnp.pad(end, ((0, 0), (1, 0)))
+        return jnp.zeros((len(nodes), 2 * nodes.shape[1] - 1), nodes.dtype).at[:, ::2].set(nodes)
+
+    def pushed(self, pressures: Float[Array, "q n+1"]) -> Float[Array, "n+1 3"]:
+        """The forces on the nodes."""
+        start, end = jnp.einsum("qcen,qn->enc", self.by_place, pressures[:, :-1])
+        return _on_nodes(start, end)
+
+    def condensed(self, weights: Float[Array, "q n"]) -> Float[Array, "2b+6 2b+6 n"]:
+        """What contacts of these stiffnesses add, by rotation and place of the first node of each element, then of the
+        last one.
+        """
+        rates = jnp.concatenate([self.by_rotation, self.by_place], axis=1)
+        rates = jnp.swapaxes(rates, 1, 2).reshape(len(rates), -1, rates.shape[-1])
+        return jnp.einsum("qin,qn,qjn->ijn", rates, weights, rates)
 
 
 class ContactRows(eqx.Module):
     """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held. `softness`: of the
     pressures; `is_closed`: where there is one. `pushes`: along what a pressure pushes, where that is not N, as where it
-    brings friction with it, without symmetry then.
+    brings friction with it, without symmetry then. `inner`: of the rows that belong to elements, whose N are zero;
+    `None` without such.
     """
 
     normals: Float[Array, "k n+1 3"]
     softness: Float[Array, ""]
     is_closed: Bool[Array, "k n+1"]
     pushes: Float[Array, "k n+1 3"] | None = None
+    inner: InnerRows | None = None
 
-    def rates(self, u: Float[Array, "n+1 3"]) -> Float[Array, "k n+1"]:
-        """Of the gaps, as nodes move."""
-        return jnp.einsum("knc,nc->kn", self.normals, u)
+    def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "k n+1"]:
+        """Of the gaps, as the rod turns and nodes move."""
+        rates = jnp.einsum("knc,nc->kn", self.normals, u)
+        return rates if self.inner is None else rates.at[self.inner.rows].set(self.inner.rates(x, u))
 
     def pushed(self, pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3"]:
         """The forces of pressures on the nodes."""
-        return jnp.einsum("knc,kn->nc", self._pushes, pressures)
+        pushed = jnp.einsum("knc,kn->nc", self._pushes, pressures)
+        return pushed if self.inner is None else pushed + self.inner.pushed(pressures[self.inner.rows])
 
-    def condensed(self) -> Float[Array, "n+1 3 3"]:
-        """What closed contacts add to the stiffness."""
-        weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
-        return jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
+    def turned(self, pressures: Float[Array, "k n+1"], moments: Float[Array, "b m"]) -> Float[Array, "b m"]:
+        """Moments on the rod with those of pressures."""
+        return moments if self.inner is None else moments + self.inner.turned(pressures[self.inner.rows])
+
+    @property
+    def softnesses(self) -> Float[Array, "#k #n+1"]:
+        """Of all rows: of those within elements at least their own."""
+        if self.inner is None:
+            return self.softness[None, None]
+        own = jnp.pad(self.inner.softness, (0, 1), constant_values=1.0)
+        softness = jnp.broadcast_to(self.softness, self.is_closed.shape)
+        return softness.at[self.inner.rows].set(jnp.maximum(self.softness, own)[None])
+
+    def softened(self, factor: float) -> "ContactRows":
+        """With contacts within elements softer by a factor."""
+        if self.inner is None:
+            return self
+        inner = dataclasses.replace(self.inner, softness=factor * self.inner.softness)
+        return dataclasses.replace(self, inner=inner)
+
+    def condensed(self, system: "ChainSystem") -> "ChainSystem":
+        """The system with what closed contacts add to its stiffness."""
+        weights = jnp.where(self.is_closed, 1 / self.softnesses, 0.0)
+        stiffness = jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
+        system = dataclasses.replace(system, stiffness=system.stiffness + stiffness)
+        if self.inner is None:
+            return system
+        return system.with_elements(self.inner.condensed(weights[self.inner.rows, :-1]))
 
     @property
     def _pushes(self) -> Float[Array, "k n+1 3"]:
@@ -83,8 +153,9 @@ class ChainSystem(eqx.Module):
     start, middle and end of each element; `cell_compliance`: C; `stiffness`: S; `contacts`: N; `held`: the nodes whose
     place is given; `turning`: T, of what a field of forces has of both the place and the rotation of a node, `None` for
     none. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
-    `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or touches has no
-    pivot. `loads`: `None` where all have a potential.
+    `between`: what rotations and place (b, 3) of the last node of an element have by those of its first, beside H;
+    `None` for none. `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or
+    touches has no pivot. `loads`: `None` where all have a potential.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -99,6 +170,7 @@ class ChainSystem(eqx.Module):
     held: Bool[Array, "n+1"]
     loads: LoadRows | None = None
     turning: Float[Array, "b 3 n+1"] | None = None
+    between: Float[Array, "b+3 b+3 n"] | None = None
     is_backward: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> "ChainSystem":
@@ -118,6 +190,7 @@ class ChainSystem(eqx.Module):
             held=self.held[::-1],
             loads=None if self.loads is None else self.loads.mirrored(),
             turning=None if self.turning is None else self.turning[..., ::-1],
+            between=None if self.between is None else jnp.swapaxes(self.between, 0, 1)[..., ::-1],
         )
 
     def shifted(self, shift: Float[Array, ""] | Float[Array, "m"]) -> "ChainSystem":
@@ -146,6 +219,8 @@ class ChainSystem(eqx.Module):
         is_closed = self.contacts.is_closed
         pushed = jnp.einsum("nij,nj->ni", self.stiffness, moved)
         pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
+        if self.contacts.inner is not None:
+            f -= self.contacts.inner.turned(jnp.where(is_closed, pressures, 0.0)[self.contacts.inner.rows])
         none = jnp.zeros_like(force[:1])
         balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
         if self.loads is not None:
@@ -159,8 +234,15 @@ class ChainSystem(eqx.Module):
         if self.turning is not None:
             f = f.at[:, ::2].add(jnp.einsum("icn,nc->in", self.turning, moved))
             balance += jnp.einsum("icn,in->nc", self.turning, x[:, ::2])
+        if self.between is not None:
+            b = len(f)
+            at_nodes = jnp.concatenate([x[:, ::2], moved.T])
+            after = jnp.einsum("ijn,jn->in", self.between, at_nodes[:, :-1])
+            before = jnp.einsum("jin,jn->in", self.between, at_nodes[:, 1:])
+            f = f.at[:, 2::2].add(after[:b]).at[:, :-1:2].add(before[:b])
+            balance += _on_nodes(before[b:].T, after[b:].T)
         balance = jnp.where(self.held[:, None], u, balance)
-        gaps = -jnp.where(is_closed, self.contacts.rates(moved) + self.contacts.softness * pressures, pressures)
+        gaps = -jnp.where(is_closed, self.contacts.rates(x, moved) + self.contacts.softnesses * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
         return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
 
@@ -170,9 +252,23 @@ class ChainSystem(eqx.Module):
         first, contacts, places, forces = jnp.split(y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes]))
         return first, contacts.reshape(is_closed.shape), places.reshape(nodes, 3), forces.reshape(nodes - 1, 3)
 
+    def with_elements(self, blocks: Float[Array, "2b+6 2b+6 n"]) -> "ChainSystem":
+        """With what elements have beside H and S by rotation and place of their first node, then of their last one."""
+        b, half = len(self.diagonal), len(blocks) // 2
+        at_nodes = jnp.pad(blocks[:half, :half], ((0, 0), (0, 0), (0, 1)))
+        at_nodes += jnp.pad(blocks[half:, half:], ((0, 0), (0, 0), (1, 0)))
+        turning, between = at_nodes[:b, b:], blocks[half:, :half]
+        return dataclasses.replace(
+            self,
+            diagonal=self.diagonal.at[..., ::2].add(at_nodes[:b, :b]),
+            stiffness=self.stiffness + at_nodes[b:, b:].transpose(2, 0, 1),
+            turning=turning if self.turning is None else self.turning + turning,
+            between=between if self.between is None else self.between + between,
+        )
+
     def condensed(self) -> "ChainSystem":
         """Without the pressures, as elimination goes along the rod."""
-        system = dataclasses.replace(self, stiffness=self.stiffness + self.contacts.condensed())
+        system = self.contacts.condensed(self)
         return system.mirrored() if self.is_backward else system
 
 
@@ -196,10 +292,12 @@ class _Middles(eqx.Module):
 class ChainFactors(eqx.Module):
     """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`, 0 without symmetry.
 
-    `system`: that without pressures. Where elimination begins at the end, it and all else is mirrored.
+    `whole`: the system; `system`: that without pressures. Where elimination begins at the end, it and all below is
+    mirrored.
     """
 
     contacts: ContactRows
+    whole: ChainSystem
     system: ChainSystem
     middles: _Middles
     inverses: Float[Array, "n+1 c c"]
@@ -215,24 +313,20 @@ class ChainFactors(eqx.Module):
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        """As if no contact were soft: what their softness gives way by is asked for again, by which it becomes less by
-        softness times stiffness of the rod each time.
+        """As if no contact were softer than it is: what the softness of the model gives way by is asked for again, by
+        which it becomes less by softness times stiffness of the rod each time, and with it what rounding has left.
         """
-        contacts = self.contacts
-        if not contacts.is_closed.size:
+        if not self.contacts.is_closed.size:
             return self.solve_softly(f, c)
-        first, given, nodes, gaps = self.system.parted(c)
+        hard = dataclasses.replace(self.contacts, softness=jnp.zeros_like(self.contacts.softness))
+        hard = dataclasses.replace(self.whole, contacts=hard)
 
-        def harder(given: Float[Array, "k p"], _) -> tuple[Float[Array, "k p"], None]:
-            pressures = self.system.parted(self.solve_softly(f, whole(given))[1])[1]
-            return jnp.where(contacts.is_closed, asked - contacts.softness * pressures, asked), None
+        def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
+            left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
+            return jax.tree.map(jnp.add, found, self.solve_softly(*left)), None
 
-        def whole(given: Float[Array, "k p"]) -> Float[Array, "j"]:
-            return jnp.concatenate([part.reshape(-1) for part in (first, given, nodes, gaps)])
-
-        asked = given
-        given, _ = jax.lax.scan(harder, given, None, length=HARDENINGS)
-        return self.solve_softly(f, whole(given))
+        found, _ = jax.lax.scan(nearer, self.solve_softly(f, c), None, length=HARDENINGS)
+        return found
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -240,8 +334,10 @@ class ChainFactors(eqx.Module):
         """With the softness of the contacts."""
         system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
-        pressing = -contacts.pushed(jnp.where(contacts.is_closed, given / contacts.softness, 0.0))
-        nodes += pressing
+        softnesses = contacts.softnesses
+        pulling = -jnp.where(contacts.is_closed, given / softnesses, 0.0)
+        nodes += contacts.pushed(pulling)
+        f = contacts.turned(pulling, f)
         if system.is_backward:
             f, nodes, gaps = f[:, ::-1], nodes[::-1], -gaps[::-1]
         x, displacements, forces = self._without_border(f[:, None], nodes[None], gaps[None])
@@ -253,7 +349,8 @@ class ChainFactors(eqx.Module):
         forces -= jnp.tensordot(multipliers, force_by_border, 1)
         if system.is_backward:
             x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
-        pressures = jnp.where(contacts.is_closed, -(given + contacts.rates(displacements)) / contacts.softness, -given)
+        rates = contacts.rates(x, displacements)
+        pressures = jnp.where(contacts.is_closed, -(given + rates) / softnesses, -given)
         parts = (multipliers, pressures, displacements, forces)
         return x, jnp.concatenate([part.reshape(-1) for part in parts])
 
@@ -297,7 +394,7 @@ class ChainFactors(eqx.Module):
 
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
-    contacts, system = system.contacts, system.condensed()
+    whole, contacts, system = system, system.contacts, system.condensed()
     b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
     middles, elements, negative = _eliminated(system)
@@ -328,6 +425,16 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
         blocks = blocks.at[1:, place, pull].add(after[..., gap])
         below = below.at[:, place, turn].set(after[..., start])
         above = above.at[:, place, turn].set(before[..., end]).at[:, place, pull].add(before[..., gap])
+    if system.between is not None:
+        between = system.between.transpose(2, 0, 1)
+        for rows, columns, part in (
+            (turn, turn, between[:, :b, :b]),
+            (turn, place, between[:, :b, b:]),
+            (place, turn, between[:, b:, :b]),
+            (place, place, between[:, b:, b:]),
+        ):
+            below = below.at[:, rows, columns].add(part)
+            above = above.at[:, columns, rows].add(part.transpose(0, 2, 1))
 
     # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
     stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
@@ -356,7 +463,9 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     k = len(system.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    factors = ChainFactors(contacts, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative)
+    factors = ChainFactors(
+        contacts, whole, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative
+    )
     if not k:
         return factors
     solution = factors._without_border(system.border, *nothing)
@@ -364,7 +473,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     if is_symmetric:
         negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
     complement = jnp.linalg.inv(matrix)
-    return ChainFactors(contacts, system, middles, inverses, below, above, solution, complement, negative)
+    return ChainFactors(contacts, whole, system, middles, inverses, below, above, solution, complement, negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:
@@ -411,3 +520,8 @@ def _on_nodes(before: Float[Array, "n *c"], after: Float[Array, "n *c"]) -> Floa
     """What elements have for the nodes at their start and their end."""
     none = jnp.zeros_like(before[:1])
     return jnp.concatenate([before, none]) + jnp.concatenate([none, after])
+
+
+def _at_ends(of_nodes: Float[Array, "c n+1"]) -> Float[Array, "c 2 n"]:
+    """At the start and the end of each element."""
+    return jnp.stack([of_nodes[:, :-1], of_nodes[:, 1:]], axis=1)

@@ -25,7 +25,7 @@ from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed
 from rodjax.discretization.hermite import Curve, HermiteElements
 from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import NodalForm, pressure_rows
 from rodjax.discretization.nodal_point import Friction
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
@@ -325,7 +325,7 @@ def _pressures(scene: Scene, options: Options, state: SolverState | None = None)
     """Those of a state, on its mesh, or no numbers where they are not known."""
     if not scene.obstacles:
         return None
-    shape = (len(scene.obstacles), options.segments + 1)
+    shape = (pressure_rows(scene.obstacles), options.segments + 1)
     if state is not None and state.pressures is not None and state.pressures.shape == shape:
         return state.pressures
     return jnp.full(shape, jnp.nan, scene.rod.length.dtype)

@@ -46,9 +46,12 @@ from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.passage import Before, Passage, passage
+from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
+from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional, slid, slides
 from rodjax.model.summaries import value_text
+from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
 from rodjax.solving.sliding import slide
 from rodjax.solving.stability import examined
@@ -62,6 +65,8 @@ MOST_PENETRATION = 1e-4
 DEFAULT_STRAIN_LIMIT = 0.05
 # Of several rods that came through obstacles, so many are named.
 MOST_NAMED = 3
+# A rod is called too short where it lacks this part of its length.
+LEAST_LACKING = 1e-3
 
 
 # An element, or an edge of finite differences, along which the rod turns by more than this [rad] is too coarse for any
@@ -152,7 +157,8 @@ class Equilibrium(eqx.Module):
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
       when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain at a clip are
       those just beyond it, and tension the mean of both sides
-    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node; `obstacle_forces` [..., obstacles,
+    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node, and half of what they apply in the
+      middle of each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
       not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
@@ -506,7 +512,8 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     assert isinstance(form, NodalForm)
     forces = form.applied(point).T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
-    return forces[clips], jnp.where(form.is_held[:, None], 0.0, forces)
+    shares = form.shares(point) * equilibrium.state.units.force
+    return (forces - shares)[clips], jnp.where(form.is_held[:, None], shares, forces)
 
 
 class _Contacts(eqx.Module):
@@ -744,9 +751,41 @@ def _outcome(equilibrium: Equilibrium) -> str:
     if equilibrium.status.ndim == 0:
         return (
             f"{messages[codes[0]]}; residual {float(equilibrium.residual):.1e} EI/L^2 "
-            f"after {int(equilibrium.iterations)} iterations"
+            f"after {int(equilibrium.iterations)} iterations{_too_short(equilibrium)}"
         )
     return "\n".join(f"{count} {messages[code]}" for code, count in zip(codes, counts, strict=True))
+
+
+def _too_short(equilibrium: Equilibrium) -> str:
+    """By how much a rod that found no equilibrium, or a far too strained one, is shorter than a string that is pulled
+    taut around the obstacles on the side where the rod last was sound.
+    """
+    scene, before = equilibrium.scene, equilibrium.state.before
+    start, end = scene.start, scene.end
+    if before is None or not isinstance(start, Held) or not isinstance(end, Held) or scene.clips:
+        return ""
+    if bool(equilibrium.converged) and not bool(_is_overstretched(equilibrium)):
+        return ""
+    radius, length = float(np.min(_radii(scene.rod))), float(scene.rod.length)
+    ends = np.asarray(start.position), np.asarray(end.position)
+    points = np.asarray(before.points).copy()
+    points[0], points[-1] = ends
+    distances = np.min([np.asarray(obstacle.distance(points[1:-1])) for obstacle in scene.obstacles], axis=0)
+    if not np.all(distances > 0):  # it began on no side
+        return ""
+    needed, touched = taut(leaf(points), scene.obstacles, leaf(np.asarray(radius)))
+    lacking = float(needed) - length
+    if lacking < LEAST_LACKING * length:
+        return ""
+    names = [f"obstacles[{k}] ({type(scene.obstacles[k]).__name__})" for k in np.flatnonzero(np.asarray(touched))]
+    where = f" to pass {' and '.join(names)} on the side where it was" if names else " to reach from end to end"
+    return f"; the rod is at least {lacking:.2g} m too short{where}"
+
+
+def _radii(rod: Rod) -> Float[np.ndarray, "k"]:
+    """All numbers of the radius along a rod: those between which it varies are not smaller."""
+    assert rod.radius is not None
+    return np.atleast_1d(np.asarray(getattr(rod.radius, "values", rod.radius)))
 
 
 def _passages(equilibrium: Equilibrium) -> str:
@@ -846,6 +885,7 @@ def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | f
     count = int(np.sum(is_overstretched))
     rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
     warn(
-        f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}",
+        f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {_largest_strain(equilibrium)}"
+        f"{'' if status.ndim else _too_short(equilibrium)}",
         OverstretchedWarning,
     )

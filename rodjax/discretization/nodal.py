@@ -291,7 +291,7 @@ class NodalForm(Form):
         start, end = super().end_forces(point)
         if not self.scene.potentials and not self.smooth:
             return start, end
-        loads = self.shares(point) if self.smooth else 0.0
+        loads = self.shares(point) if self.smooth else jnp.zeros((), start.dtype)
         if self.scene.potentials:
             loads = loads - potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
         # Of those that are held; a given force is one.

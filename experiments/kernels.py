@@ -45,7 +45,7 @@ from rodjax.model.plane import plane
 from rodjax.model.scene import nondimensional
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.equilibrium import Options, first_state
-from rodjax.solving.result import Found, SolverState, equilibrium
+from rodjax.solving.result import Found, SolverState, build_result
 from rodjax.solving.status import Outcome
 
 LOOPS = 300
@@ -184,7 +184,7 @@ def at_nodes(form: MixedForm, point: MixedPoint):
 
 
 def in_units(scene: Scene, found: Found):
-    return equilibrium(scene, found, jnp.ones((), int))
+    return build_result(scene, found, jnp.ones((), int))
 
 
 def written_out(form: MixedForm, point: MixedPoint):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Status, Swivel, frame, problems
-from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.model.scene import nondimensional
@@ -161,7 +161,7 @@ def with_point_forces(*places: float, slenderness: float = 200.0) -> Scene:
 )
 def test_a_node_lies_at_every_point_force_away_from_others_and_ends(places, segments):
     scaled, _ = nondimensional(with_point_forces(*places))
-    s = np.asarray(HermiteElements.of(scaled, jnp.linspace(0.0, 1.0, segments + 1)).s)
+    s = np.asarray(QuadraticRotationElements.of(scaled, jnp.linspace(0.0, 1.0, segments + 1)).s)
     assert len(s) == segments + 1
     assert s[0] == 0.0
     assert s[-1] == 1.0
@@ -203,7 +203,7 @@ def test_fourth_order_with_two_point_forces():
 
 def test_an_element_stiffens_without_bound_towards_a_fold():
     """Along the circle the energy is that of an arc to the tenth power of half the angle, and grows on to infinity."""
-    elements = HermiteElements(jnp.array([0.0, 1.0]))
+    elements = QuadraticRotationElements(jnp.array([0.0, 1.0]))
     scene, _ = nondimensional(problems.cantilever())
 
     def energy(angle: float, bend: float) -> float:
@@ -481,7 +481,7 @@ def test_without_torsion_no_angle_is_traced():
         scaled, _ = nondimensional(scene)
 
         def moved_and_linearized(scaled, point, rotation):
-            form = MixedForm.of(scaled, HermiteElements.of(scaled, jnp.linspace(0.0, 1.0, 5)))
+            form = MixedForm.of(scaled, QuadraticRotationElements.of(scaled, jnp.linspace(0.0, 1.0, 5)))
             here = form.linearized(point)
             return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
 

@@ -13,7 +13,7 @@ from rodjax import Clamp, Free, PointForce, Scene, Swivel, frame, problems
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist
-from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import transport_along, twist_under_moment
@@ -30,7 +30,9 @@ KINDS = ["edges", "elements"]
 
 def field(scene: Scene, kind: str = "edges") -> TangentField:
     """Four edges, or three elements of different lengths."""
-    return EdgeTangents.of(scene, N) if kind == "edges" else HermiteElements(jnp.array([0.0, 0.25, 0.65, 1.0]))
+    return (
+        EdgeTangents.of(scene, N) if kind == "edges" else QuadraticRotationElements(jnp.array([0.0, 0.25, 0.65, 1.0]))
+    )
 
 
 def begin(name: str, kind: str = "edges") -> tuple[MixedForm, MixedPoint]:

@@ -18,10 +18,10 @@ from rodjax.analysis.reactions import axes_of
 from rodjax.model import surfaces as routing_surfaces
 from rodjax.model.surfaces import MOST_TRIANGLES, surfaces
 from rodjax.plot import AZIMUTH, seen_axes
-from rodjax.routing import web_page, words
-from rodjax.routing.findings import Gradients
+from rodjax.routing import report_text, web_page
+from rodjax.routing.cable_report import Gradients
 from rodjax.routing.report import FILES
-from rodjax.routing.sights import azimuth, coloring, extent, sight
+from rodjax.routing.view_data import azimuth, coloring, extent, sight
 
 RADIUS = 0.006
 GRAVITY = (0.0, 0.0, -9.81)
@@ -172,7 +172,7 @@ def test_verdicts(report):
     infinite = with_margins(report, [np.inf])
     assert infinite.verdict.startswith("kept: the one limit; tightest: bend radius")
     assert "unlimited" in str(infinite)
-    assert words.amount(np.inf, "m") == "infinite"
+    assert report_text.amount(np.inf, "m") == "infinite"
     assert json.loads(json.dumps(infinite.as_dict(), allow_nan=False))["margins"] == {"bend radius": None}
     many = with_margins(report, [-0.5, -0.4, -0.3, -0.2, -0.1])
     assert many.verdict.endswith("and 2 more")
@@ -193,9 +193,9 @@ def test_what_did_not_converge_or_is_not_stable_is_told(report, equilibrium, mon
 
 
 def test_a_limit_of_zero_has_a_margin_in_its_unit():
-    assert words.percent(0.0123, 0.0, "m") == "+12.3 mm"
-    assert words.percent(-0.0123, 0.0, "m") == "-12.3 mm"
-    assert words.percent(0.25, 4.0, "N") == "+25.0 %"
+    assert report_text.percent(0.0123, 0.0, "m") == "+12.3 mm"
+    assert report_text.percent(-0.0123, 0.0, "m") == "-12.3 mm"
+    assert report_text.percent(0.25, 4.0, "N") == "+25.0 %"
 
 
 def test_without_limits_it_describes(equilibrium):

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rodjax.geometry.rotations import (
+    align_tangent,
     carried,
     columns,
     continuous,
@@ -12,10 +13,9 @@ from rodjax.geometry.rotations import (
     inverse,
     nearer,
     product,
+    rotate_about_tangent,
     rotated,
     screw,
-    spun,
-    swung,
     tangent,
     turned,
 )
@@ -58,10 +58,12 @@ def test_turns_spins_and_swings():
     expected = rotations * Rotation.from_rotvec((angle / size * vector).T)
     np.testing.assert_allclose(matrices(turned(q, jnp.asarray(vector))), expected.as_matrix(), rtol=0, atol=1e-14)
     spin = rotations * Rotation.from_rotvec(angle[:, None] * np.array([0, 0, 1]))
-    np.testing.assert_allclose(matrices(spun(q, jnp.asarray(angle))), spin.as_matrix(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        matrices(rotate_about_tangent(q, jnp.asarray(angle))), spin.as_matrix(), rtol=0, atol=1e-14
+    )
     # The smallest rotation to a new tangent has its axis at right angles to both.
     new = vector / size
-    swing = swung(q, jnp.asarray(new))
+    swing = align_tangent(q, jnp.asarray(new))
     np.testing.assert_allclose(tangent(swing), new, rtol=0, atol=1e-14)
     axis = np.asarray(product(swing, inverse(q)))[1:]
     np.testing.assert_allclose(np.sum(axis * np.asarray(tangent(q)), axis=0), np.zeros(20), rtol=0, atol=1e-14)

@@ -43,7 +43,7 @@ from rodjax.analysis.shooting import (
 )
 from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.geometry.vectors import root
 from rodjax.mechanics.energy import (
     axial_strain_under,
@@ -412,7 +412,7 @@ def _equilibrium(
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
     equal = jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)
-    s = HermiteElements.of(scaled, equal).places
+    s = QuadraticRotationElements.of(scaled, equal).places
     station = jnp.searchsorted(start.s, s, side="right") - 1
     before = jax.tree.map(lambda leaf: leaf[station], sections)
     length = s - start.s[station]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.checks import Numbers, namespace
 from rodjax.discretization.element_strains import ElementStrains
-from rodjax.discretization.hermite import SIMPSON, assembled, interleaved, of_elements, parts_before
+from rodjax.discretization.hermite import SIMPSON, interleaved, of_elements, parts_before, scatter_add
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
 from rodjax.geometry.rotations import inverse, product, unit
 from rodjax.linalg.blocks import short_sum
@@ -71,13 +71,13 @@ class Cells(Protocol):
         """Arclengths of the strain points."""
         ...
 
-    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c p n"]: ...
+    def gather(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c p n"]: ...
 
     def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 nodes"]:
         """The frames at the nodes."""
         ...
 
-    def assembled(self, by_cell: Float[Array, "... p n"]) -> Float[Array, "... m"]:
+    def scatter_add(self, by_cell: Float[Array, "... p n"]) -> Float[Array, "... m"]:
         """Sums over the cells at each frame."""
         ...
 
@@ -210,7 +210,7 @@ class JointCells(eqx.Module):
     def strain_places(self) -> Float[Array, "2 n+1"]:
         return jnp.stack([self.places[:-1], self.places[1:]])
 
-    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
+    def gather(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
         return jnp.stack([by_frame[:, :-1], by_frame[:, 1:]], axis=1)
 
     def at_nodes(self, quaternions: Float[Array, "4 n+2"]) -> Float[Array, "4 n+1"]:
@@ -218,7 +218,7 @@ class JointCells(eqx.Module):
         between = unit(quaternions[:, 1:-2] + quaternions[:, 2:-1])
         return jnp.concatenate([quaternions[:, :1], between, quaternions[:, -1:]], axis=1)
 
-    def assembled(self, by_cell: Float[Array, "... 2 n"]) -> Float[Array, "... m"]:
+    def scatter_add(self, by_cell: Float[Array, "... 2 n"]) -> Float[Array, "... m"]:
         none = jnp.zeros_like(by_cell[..., 0, :1])
         before, after = by_cell[..., 0, :], by_cell[..., 1, :]
         return jnp.concatenate([before, none], axis=-1) + jnp.concatenate([none, after], axis=-1)
@@ -262,7 +262,7 @@ class JointCells(eqx.Module):
         return jnp.stack([jnp.concatenate([none, of_edges]), jnp.concatenate([of_edges, none])])
 
     def couplings(self, blocks: Float[Array, "2 3 2 3 n"]) -> tuple[Array, Array, None]:
-        diagonal = self.assembled(jnp.stack([blocks[0, :, 0], blocks[1, :, 1]], axis=-2))
+        diagonal = self.scatter_add(jnp.stack([blocks[0, :, 0], blocks[1, :, 1]], axis=-2))
         return diagonal, blocks[1, :, 0], None
 
 
@@ -305,20 +305,20 @@ class ElementCells(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        return self.assembled(self.lengths)
+        return self.scatter_add(self.lengths)
 
     @property
     def strain_places(self) -> Float[Array, "3 n"]:
         return jnp.stack([self.s[:-1], (self.s[:-1] + self.s[1:]) / 2, self.s[1:]])
 
-    def of_cells(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
+    def gather(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
         return jnp.stack(of_elements(by_frame), axis=1)
 
     def at_nodes(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "4 n+1"]:
         return quaternions[:, ::2]
 
-    def assembled(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
-        return assembled(*(by_cell[..., k, :] for k in range(3)))
+    def scatter_add(self, by_cell: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
+        return scatter_add(*(by_cell[..., k, :] for k in range(3)))
 
     def seen(self, quaternions: Float[Array, "4 3 n"]) -> Float[Array, "4 2 n"]:
         middle = inverse(quaternions[:, 1])
@@ -349,7 +349,7 @@ class ElementCells(eqx.Module):
         return parts_before(self.s, at)
 
     def couplings(self, blocks: Float[Array, "3 3 3 3 n"]) -> tuple[Array, Array, Array]:
-        diagonal = self.assembled(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))
+        diagonal = self.scatter_add(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))
         between = jnp.stack([blocks[1, :, 0], blocks[2, :, 1]], axis=-1)
         return diagonal, between.reshape(*between.shape[:2], -1), blocks[2, :, 0]
 
@@ -390,4 +390,4 @@ SAME_PLACE = 1e-12
 
 def strains_between(cells: Cells, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 p n"]:
     """Curvature along d1 and d2, and twist, at the strain points of cells between these frames."""
-    return cells.strains(cells.seen(cells.of_cells(quaternions))[cells.coordinates]).values
+    return cells.strains(cells.seen(cells.gather(quaternions))[cells.coordinates]).values

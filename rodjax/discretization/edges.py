@@ -8,10 +8,10 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.dead_loads import forces_beyond_edges, forces_on_nodes
 from rodjax.discretization.joints import (
     Joints,
-    assembled,
     bending_derivatives,
     joints,
     of_edges,
+    scatter_add,
     tangent_bases,
     twist_derivatives,
     with_held_tangents,
@@ -58,10 +58,10 @@ class EdgeTangents(eqx.Module):
     def finest(self) -> Float[Array, ""]:
         return self.weights[0] if self.places is None else jnp.min(self.weights)
 
-    def with_held(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 k"]:
+    def append_prescribed(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 k"]:
         return with_held_tangents(scene, tangents)
 
-    def as_held(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    def apply_prescribed(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return tangents
 
     def basis(self, scene: Scene, bases: Float[Array, "3 b k"]) -> Float[Array, "3 b n"]:
@@ -117,10 +117,10 @@ class EdgeTangents(eqx.Module):
         between = self.joints(scene, tangents)
         derivatives = bending_derivatives(scene.rod, between, (bases[..., :-1], bases[..., 1:]))
         if self.clip_nodes is None:
-            return between.bending_energy(scene.rod), self._blocks(*assembled(scene, derivatives, self.segments))
+            return between.bending_energy(scene.rod), self._blocks(*scatter_add(scene, derivatives, self.segments))
         parted = self._is_parted(scene)
         derivatives = jax.tree.map(lambda derivative: jnp.where(parted, 0.0, derivative), derivatives)
-        gradient, diagonal, lower = assembled(scene, derivatives, self.segments)
+        gradient, diagonal, lower = scatter_add(scene, derivatives, self.segments)
         of_edges = self.basis(scene, bases)
         for edge, halves in self.halves(scene, tangents):
             # The tangent of the clip does not turn.
@@ -133,12 +133,12 @@ class EdgeTangents(eqx.Module):
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 n"], bases: Float[Array, "3 b k"]) -> Blocks:
         derivatives = twist_derivatives(self.joints(scene, tangents), (bases[..., :-1], bases[..., 1:]))
-        return self._blocks(*assembled(scene, derivatives, self.segments))
+        return self._blocks(*scatter_add(scene, derivatives, self.segments))
 
     def _blocks(
         self, gradient: Float[Array, "b n"], diagonal: Float[Array, "b b n"], lower: Float[Array, "b b n-1"]
     ) -> Blocks:
-        return Blocks(self.of_sides(gradient), self.of_sides(diagonal), lower)
+        return Blocks(self.gather(gradient), self.gather(diagonal), lower)
 
     def swept(self, scene: Scene, old: Float[Array, "3 n"], new: Float[Array, "3 n"]) -> Float[Array, ""]:
         return swept_twist(with_held_tangents(scene, old), with_held_tangents(scene, new))
@@ -153,7 +153,7 @@ class EdgeTangents(eqx.Module):
         return angle_about(held[:, -1], carried, scene.end.frame[:, 0])
 
     @property
-    def side_weights(self) -> Float[Array, "1 n"]:
+    def quadrature_weights(self) -> Float[Array, "1 n"]:
         return self.weights[None]
 
     def tangents_at_nodes(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n-1"]:
@@ -171,10 +171,10 @@ class EdgeTangents(eqx.Module):
         assert self.clip_nodes is not None
         return self.tangents_at_nodes(scene, tangents)[:, self.clip_nodes - 1]
 
-    def of_sides(self, by_point: Float[Array, "... n"]) -> Float[Array, "... 1 n"]:
+    def gather(self, by_point: Float[Array, "... n"]) -> Float[Array, "... 1 n"]:
         return by_point[..., None, :]
 
-    def of_points(self, by_side: Float[Array, "... 1 n"]) -> Float[Array, "... n"]:
+    def scatter_add(self, by_side: Float[Array, "... 1 n"]) -> Float[Array, "... n"]:
         return by_side[..., 0, :]
 
     def loads_beyond(self, scene: Scene) -> Float[Array, "3 1 n"]:

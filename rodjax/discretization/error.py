@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import Form, Linearization, Point
-from rodjax.discretization.hermite import HermiteElements, interleaved
+from rodjax.discretization.hermite import QuadraticRotationElements, interleaved
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
 from rodjax.discretization.results import clip_moments, resultants, with_fields_by_tangent
@@ -152,7 +152,7 @@ def correction(
 
 def on_elements(form: MixedForm, point: MixedPoint, at_nodes: Float[Array, "3 n+1"]) -> tuple[MixedForm, MixedPoint]:
     """A polyline with these tangents at its nodes on elements, whose middles have those of its edges."""
-    elements = MixedForm.of(form.scene, HermiteElements(form.field.s, form.field.clip_nodes))
+    elements = MixedForm.of(form.scene, QuadraticRotationElements(form.field.s, form.field.clip_nodes))
     tangents = interleaved(at_nodes, point.tangents)
     return elements, MixedPoint(tangents, point.end_force, elements.twist_near(tangents, point.total_twist))
 
@@ -187,7 +187,7 @@ def errors_of_differences(
 
 def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3"]) -> Errors:
     field, scene, tangents = form.field, form.scene, point.tangents
-    assert isinstance(field, HermiteElements)
+    assert isinstance(field, QuadraticRotationElements)
     rod, h = scene.rod, field.h
     torque = torque_at(rod, point.total_twist)
     nodes, middles = tangents[:, ::2], tangents[:, 1::2]
@@ -292,7 +292,7 @@ def _axial_error(
 
 def _integrated(
     form: MixedForm,
-    field: HermiteElements,
+    field: QuadraticRotationElements,
     forces: Float[Array, "3 3 n"],
     torque: Float[Array, ""],
     first: Section,

@@ -19,10 +19,10 @@ from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, Form
 from rodjax.discretization.joints import (
-    assembled,
     bending_derivatives,
     joints,
     of_edges,
+    scatter_add,
     tangent_bases,
     with_held_tangents,
 )
@@ -211,7 +211,7 @@ class FiniteDifference(eqx.Module):
         bases = of_edges(scene, all_bases, n)
         beside = (all_bases[..., :-1], all_bases[..., 1:])
         derivatives = bending_derivatives(rod, joints(scene, tangents), beside, gauss_newton=True)
-        _, diagonal, lower = assembled(scene, derivatives, n)
+        _, diagonal, lower = scatter_add(scene, derivatives, n)
         per_tension = axial_strain_under(rod, jnp.ones_like(lengths)) / n
         if held_at_both_ends(scene):
             border = -lengths[None, None] * jnp.swapaxes(bases, 0, 1)

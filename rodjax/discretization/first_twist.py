@@ -66,13 +66,13 @@ def twist_on(
         return nearest_twist(principal, first.total_twist, scene.turns)
     before = eqx.tree_at(lambda scene: (scene.start.frame, scene.end.frame), scene, (last.start_frame, last.end_frame))
     shape = begin if last.shape is None else last.shape
-    old = field.with_held(before, shape.tangents)
+    old = field.append_prescribed(before, shape.tangents)
     # A shape from another mesh meets the frames only nearly.
     number = jnp.arange(old.shape[1])
     old = jnp.where(number == 0, last.start_frame[:, 2:], old)
     old = jnp.where(number == old.shape[1] - 1, last.end_frame[:, 2:], old)
     reference = TwistReference(FramedTangents(old, last.start_frame[:, 0], last.end_frame[:, 0]), first.total_twist)
-    new = FramedTangents(field.with_held(scene, tangents), start.frame[:, 0], end.frame[:, 0])
+    new = FramedTangents(field.append_prescribed(scene, tangents), start.frame[:, 0], end.frame[:, 0])
     carried = total_twist(reference, new)
     more = more_turns(scene, last)
     if more is not None:

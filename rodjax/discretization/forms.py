@@ -4,7 +4,7 @@ from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve, cells_of
-from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.nodal_forms import NodalFrames, NodalTangents
 from rodjax.discretization.shape import Shape
@@ -24,5 +24,5 @@ def form_of(scene: Scene, shape: Shape) -> Form:
 
 def field_of(scene: Scene, shape: Shape) -> TangentField:
     if isinstance(shape, Curve):
-        return HermiteElements.of(scene, shape.s)
+        return QuadraticRotationElements.of(scene, shape.s)
     return EdgeTangents.of(scene, len(shape.nodes) - 1)

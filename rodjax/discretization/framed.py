@@ -30,7 +30,18 @@ from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.rest_ways import RestWays, part
-from rodjax.geometry.rotations import columns, from_frame, inverse, nearer, rotated, spun, swung, tangent, turned, unit
+from rodjax.geometry.rotations import (
+    align_tangent,
+    columns,
+    from_frame,
+    inverse,
+    nearer,
+    rotate_about_tangent,
+    rotated,
+    tangent,
+    turned,
+    unit,
+)
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.blocks import product as block_product
 from rodjax.linalg.blocks import short_sum
@@ -63,12 +74,12 @@ class FramePoint(eqx.Module):
         tangents = self.tangents
         in_plane = tangents - normal[:, None] * (normal @ tangents)[None]
         sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
-        swung_into = swung(self.quaternions, in_plane / jnp.where(sizes > 0, sizes, 1.0))
+        swung_into = align_tangent(self.quaternions, in_plane / jnp.where(sizes > 0, sizes, 1.0))
         seen = rotated(inverse(swung_into), jnp.broadcast_to(normal[:, None], tangents.shape))
         turn = jnp.arctan2(seen[1], seen[0]) - jnp.arctan2(across[1], across[0])
         force = self.end_force - normal[:, None] * (normal @ self.end_force)[None]
         nodal = None if self.nodal is None else self.nodal.without(normal)
-        return FramePoint(spun(swung_into, turn), force, jnp.zeros_like(self.total_twist), nodal)
+        return FramePoint(rotate_about_tangent(swung_into, turn), force, jnp.zeros_like(self.total_twist), nodal)
 
 
 class Strained(eqx.Module):
@@ -224,7 +235,7 @@ class FrameForm(Form):
         """The point with the frames and tangents that supports hold."""
         q = point.quaternions
         for k, direction, frame in self.held_frames:
-            held = swung(q[:, k], direction) if frame is None else nearer(from_frame(frame), q[:, k])
+            held = align_tangent(q[:, k], direction) if frame is None else nearer(from_frame(frame), q[:, k])
             q = q.at[:, k].set(held)
         return FramePoint(q, point.end_force, point.total_twist, self.nodal_held(point.nodal))
 
@@ -268,7 +279,7 @@ class FrameForm(Form):
 
     def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
         """The force through the cells besides that of the loads."""
-        return self.layout.of_cells(end_force)[:, None]
+        return self.layout.gather(end_force)[:, None]
 
     def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> Float[Array, "3 k n"]:
         """The force through the rod at the strain points."""
@@ -286,7 +297,7 @@ class FrameForm(Form):
 
     def strained(self, point: FramePoint) -> Strained:
         forces = self.forces(point.quaternions, point.end_force)
-        return self._strained(self._kinematics(self.field.of_cells(point.quaternions)), forces)
+        return self._strained(self._kinematics(self.field.gather(point.quaternions)), forces)
 
     def _kinematics(self, quaternions: Float[Array, "4 p n"]) -> Kinematics:
         field = self.field
@@ -319,14 +330,14 @@ class FrameForm(Form):
 
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)
-        of_cells = self.field.of_cells(quaternions)
-        return CellStates(self.field, self.sections, of_cells, forces, self.rest_strains, self.rest_ways)
+        gather = self.field.gather(quaternions)
+        return CellStates(self.field, self.sections, gather, forces, self.rest_strains, self.rest_ways)
 
     def edges(self, point: Any) -> Float[Array, "segments 3"]:
         """From node to node."""
-        of_cells = self.field.of_cells(point.quaternions)
+        gather = self.field.gather(point.quaternions)
         ways = self.strained(point).ways
-        return self.field.ways(ways, self._rest_of_ways(of_cells, jnp.zeros_like(ways[:, 0]))).T
+        return self.field.ways(ways, self._rest_of_ways(gather, jnp.zeros_like(ways[:, 0]))).T
 
     def _rest_of_ways(self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return nothing if self.rest_ways is None else rotated(quaternions[:, REFERENCE], self.rest_ways.turning)
@@ -343,7 +354,7 @@ class FrameForm(Form):
         """The potential of dead forces, zero at the origin, where the rod is held; other loads have none."""
         here = self.strained(point)
         work = jnp.sum(here.work(self.loads))
-        rest = self._rest_of_ways(self.field.of_cells(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
+        rest = self._rest_of_ways(self.field.gather(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work
 
@@ -357,7 +368,7 @@ class FrameForm(Form):
 
     def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         """What is out of balance at the frames, in their axes, and what the rod lacks of its spans."""
-        gradient = self.field.assembled(self.by_rotations(point.quaternions, point.end_force))
+        gradient = self.field.scatter_add(self.by_rotations(point.quaternions, point.end_force))
         closure = jnp.zeros(0, gradient.dtype)
         if self.layout.size:
             closure = self.layout.components(self.spans - self.layout.sums(self.edges(point).T))
@@ -386,7 +397,7 @@ class FrameForm(Form):
             lower = block_product(block_product(projection[..., 1:], lower), projection[..., :-1])
             if across is not None:
                 across = block_product(block_product(projection[..., 2::2], across), projection[..., 0:-1:2])
-        return cells, self.projected(field.assembled(cells.first)), (diagonal, lower, across)
+        return cells, self.projected(field.scatter_add(cells.first)), (diagonal, lower, across)
 
     def linearized(self, point: FramePoint) -> Linearization:
         layout = self.layout
@@ -398,7 +409,7 @@ class FrameForm(Form):
         if layout.size:
             value += jnp.sum(point.end_force * self.spans)
             closure = layout.components(self.spans - layout.sums(cells.way))
-            border = self._projected_columns(self.field.assembled(layout.columns(cells.by_force)))
+            border = self._projected_columns(self.field.scatter_add(layout.columns(cells.by_force)))
             compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),
@@ -412,7 +423,7 @@ class FrameForm(Form):
     def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         layout = self.layout
         assert isinstance(layout, SpanForces)
-        value, ways = self.in_cells(self._kinematics(self.field.of_cells(point.quaternions)), point.end_force)
+        value, ways = self.in_cells(self._kinematics(self.field.gather(point.quaternions)), point.end_force)
         if not layout.size:
             return value, jnp.zeros(0, value.dtype)
         closure = layout.components(self.spans - layout.sums(ways))
@@ -455,7 +466,7 @@ class FrameForm(Form):
 
     def turning(self, point: FramePoint, rotation: Float[Array, "3 m"]) -> tuple[Kinematics, Kinematics]:
         """What follows from the frames of the cells alone, and its rates as they begin to turn."""
-        frames, turns = self.field.of_cells(point.quaternions), self.field.of_cells(rotation)
+        frames, turns = self.field.gather(point.quaternions), self.field.gather(rotation)
         zero = jnp.zeros((), rotation.dtype)
         return jax.jvp(lambda part: self._kinematics(turned(frames, part * turns)), (zero,), (jnp.ones_like(zero),))
 

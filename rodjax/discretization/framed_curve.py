@@ -16,7 +16,18 @@ from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.rotations import carried, from_frame, inverse, nearer, product, rotated, spun, swung, tangent, unit
+from rodjax.geometry.rotations import (
+    align_tangent,
+    carried,
+    from_frame,
+    inverse,
+    nearer,
+    product,
+    rotate_about_tangent,
+    rotated,
+    tangent,
+    unit,
+)
 from rodjax.geometry.vectors import dot
 from rodjax.model.scene import Scene, held_at_both_ends, scene_axes
 from rodjax.model.supports import Clamp, Directed, Held, Swivel
@@ -91,7 +102,7 @@ class FramedCurve(Shape):
         for end, k, part in ((scene.start, 0, 1.0 - places), (scene.end, -1, places)):
             if isinstance(end, Directed):
                 here = q[:, k]
-                held = swung(here, end.tangent)
+                held = align_tangent(here, end.tangent)
                 if isinstance(end, Clamp):
                     held = nearer(from_frame(end.frame), reference[:, k])
                 change = product(held, inverse(here))
@@ -122,7 +133,7 @@ def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], first: First
         here = jnp.sum(cells.lengths * strains_between(cells, q)[2])
         principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
         turns = jnp.round((nearest_twist(principal, first.total_twist, scene.turns) - here) / (2 * jnp.pi))
-    return jnp.where(turns != 0, spun(q, 2 * jnp.pi * turns * cells.places), q)
+    return jnp.where(turns != 0, rotate_about_tangent(q, 2 * jnp.pi * turns * cells.places), q)
 
 
 def _turned_to_supports(
@@ -159,7 +170,7 @@ def _turned_to_supports(
     held = [nearer(from_frame(frame), nearby[:, number]) for frame, number in spinning]
     spins = jnp.stack([_spin_between(q[:, number], q_held) for q_held, (_, number) in zip(held, spinning, strict=True)])
     spins = spins[order]
-    q = jnp.where(jnp.any(spins != 0), spun(q, jnp.interp(places, at, spins)), q)
+    q = jnp.where(jnp.any(spins != 0), rotate_about_tangent(q, jnp.interp(places, at, spins)), q)
     if is_carried or len(spinning) == 1:
         return q
     # Between two of them: the cells from the one to the other, and by how much they are twisted.
@@ -170,7 +181,7 @@ def _turned_to_supports(
     more = (first.total_twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
     wanted = jnp.sum(jnp.where(is_between, (jnp.sum(had - here, axis=0) + more)[None], 0.0), axis=1)
     turns = jnp.concatenate([jnp.zeros_like(spins[:1]), jnp.cumsum(jnp.round(wanted / (2 * jnp.pi)))])
-    return jnp.where(jnp.any(turns != 0), spun(q, 2 * jnp.pi * jnp.interp(places, at, turns)), q)
+    return jnp.where(jnp.any(turns != 0), rotate_about_tangent(q, 2 * jnp.pi * jnp.interp(places, at, turns)), q)
 
 
 def _swung_partly(
@@ -222,7 +233,7 @@ def framed_through(
     places = _cells(s, of_joints).places
     if last is not None:
         frame, total_twist = last
-        return FramedCurve(nodes, spun(carried(from_frame(frame), tangents), total_twist * places), s)
+        return FramedCurve(nodes, rotate_about_tangent(carried(from_frame(frame), tangents), total_twist * places), s)
     start, end = scene.start, scene.end
     if isinstance(shape, Curve):
         # As a rod without frames begins.
@@ -235,10 +246,10 @@ def framed_through(
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-    q = spun(carried(first, tangents), _twist_at_rest(scene, places))
+    q = rotate_about_tangent(carried(first, tangents), _twist_at_rest(scene, places))
     if isinstance(end, Clamp):
         spin = _spin_between(q[:, -1], nearer(from_frame(end.frame), q[:, -1]))
-        q = spun(q, spin * places if isinstance(start, Clamp) else jnp.broadcast_to(spin, places.shape))
+        q = rotate_about_tangent(q, spin * places if isinstance(start, Clamp) else jnp.broadcast_to(spin, places.shape))
     return FramedCurve(nodes, q, s)
 
 
@@ -276,7 +287,7 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     if isinstance(support, Clamp):
         held = from_frame(support.frame)
     elif isinstance(support, Swivel):
-        held = swung(held, support.tangent)
+        held = align_tangent(held, support.tangent)
     turn = product(held, inverse(q[:, k]))
     nodes = support.position[:, None] + rotated(
         jnp.broadcast_to(turn[:, None], (4, len(s))), positions - positions[:, k, None]

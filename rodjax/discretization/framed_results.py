@@ -82,10 +82,10 @@ def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
     couples = form.couples_along(q)
     if couples is not None:
         by_cells -= couples
-    own, fields = rotated(form.field.of_cells(q), by_cells), form.fields_on_elements(point)
+    own, fields = rotated(form.field.gather(q), by_cells), form.fields_on_elements(point)
     if fields is None:
         return own
-    ends = tangent(form.field.of_cells(q)[:, ::2])
+    ends = tangent(form.field.gather(q)[:, ::2])
     return own.at[:, ::2].add(cross(ends, fields.by_tangent))
 
 
@@ -154,7 +154,7 @@ def _strains_at_ends(
 ) -> tuple[Float[Array, "3 2 n"], Float[Array, "2 n"]]:
     """Curvature along d1 and d2 and twist at both ends of each element under these moments, and axial strain."""
     field = form.field
-    q = field.of_cells(point.quaternions)[:, ::2]
+    q = field.gather(point.quaternions)[:, ::2]
     tension = dot(section_forces(form, point)[:, ::2], tangent(q))
     sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], _arrays(form.sections))
     sections = eqx.combine(sections, form.sections)
@@ -172,7 +172,7 @@ def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "
     assert nodes is not None
     jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
     if form.scene.point_couples and isinstance(form.field, ElementCells):
-        q = form.field.of_cells(point.quaternions)
+        q = form.field.gather(point.quaternions)
         couples = point_couples(form.scene, form.field, q)
         assert couples is not None
         jumps -= rotated(q[:, 0], couples)[:, nodes]
@@ -346,7 +346,7 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
     rest = form.scene.rod.rest_shape
     couples = form.couples_along(point.quaternions)
     if couples is not None:
-        couples = rotated(field.of_cells(point.quaternions), couples) / field.lengths[None]
+        couples = rotated(field.gather(point.quaternions), couples) / field.lengths[None]
 
     def parabola(x: Float[Array, ""], by_point: Float[Array, "... 3 n"]) -> Float[Array, "... n"]:
         weights = ((1 - x) * (1 - 2 * x), 4 * x * (1 - x), x * (2 * x - 1))

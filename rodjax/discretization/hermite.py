@@ -42,7 +42,7 @@ PAIRS = ((0, 1), (1, 2), (0, 2))
 ARC_WEIGHTS = (4 / 3, 4 / 3, -1 / 3)
 
 
-class HermiteElements(eqx.Module):
+class QuadraticRotationElements(eqx.Module):
     """n elements between nodes at the arclengths `s` in units of L: 0, ..., 1. Points are nodes and middles in turn.
 
     `clip_nodes`: the numbers of the nodes at which clips hold the rod, where there are clips.
@@ -52,12 +52,12 @@ class HermiteElements(eqx.Module):
     clip_nodes: Int[Array, "clips"] | None = None
 
     @staticmethod
-    def of(scene: Scene, s: Float[Array, "n+1"]) -> "HermiteElements":
+    def of(scene: Scene, s: Float[Array, "n+1"]) -> "QuadraticRotationElements":
         """On these nodes, moved so that one lies at each clip and point force: the moment has a kink there."""
         places = [load.at for load in scene.point_forces]
         if scene.clips:
-            return HermiteElements(*with_nodes_at_clips(scene, s, places))
-        return HermiteElements(with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
+            return QuadraticRotationElements(*with_nodes_at_clips(scene, s, places))
+        return QuadraticRotationElements(with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
 
     @property
     def points(self) -> int:
@@ -69,7 +69,7 @@ class HermiteElements(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        return assembled(*(weight * self.h for weight in SIMPSON))
+        return scatter_add(*(weight * self.h for weight in SIMPSON))
 
     @property
     def places(self) -> Float[Array, "m"]:
@@ -81,10 +81,10 @@ class HermiteElements(eqx.Module):
         """The shortest distance between points."""
         return jnp.min(self.h) / 2
 
-    def with_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+    def append_prescribed(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
         return tangents
 
-    def as_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+    def apply_prescribed(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
         for is_there, tangent in self._directed(scene):
             tangents = jnp.where(is_there, tangent[:, None], tangents)
         return tangents
@@ -209,18 +209,18 @@ class HermiteElements(eqx.Module):
     # --- points by elements ------------------------------------------------------------------------------------------
 
     @property
-    def side_weights(self) -> Float[Array, "3 n"]:
+    def quadrature_weights(self) -> Float[Array, "3 n"]:
         return jnp.array(SIMPSON, self.s.dtype)[:, None] * self.h[None]
 
     def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 clips"]:
         assert self.clip_nodes is not None
         return tangents[:, 2 * self.clip_nodes]
 
-    def of_sides(self, by_point: Float[Array, "... m"]) -> Float[Array, "... 3 n"]:
+    def gather(self, by_point: Float[Array, "... m"]) -> Float[Array, "... 3 n"]:
         return jnp.stack(of_elements(by_point), axis=-2)
 
-    def of_points(self, by_side: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
-        return assembled(by_side[..., 0, :], by_side[..., 1, :], by_side[..., 2, :])
+    def scatter_add(self, by_side: Float[Array, "... 3 n"]) -> Float[Array, "... m"]:
+        return scatter_add(by_side[..., 0, :], by_side[..., 1, :], by_side[..., 2, :])
 
     # --- places and loads --------------------------------------------------------------------------------------------
 
@@ -350,7 +350,7 @@ def interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) 
     return pairs.reshape(*nodes.shape[:-1], -1)[..., :-1]
 
 
-def assembled(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
+def scatter_add(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
     """Sums over the elements at each point."""
     return interleaved(_padded(start, 0, 1) + _padded(end, 1, 0), middle)
 

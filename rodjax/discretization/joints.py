@@ -185,7 +185,7 @@ def by_edges(
     return of_edges(scene, by_point, segments)
 
 
-def assembled(
+def scatter_add(
     scene: Scene, derivatives: JointDerivatives, segments: int
 ) -> tuple[Float[Array, "b n"], Float[Array, "b b n"], Float[Array, "b b n-1"]]:
     """Gradient, and the blocks on and below the diagonal of the second derivatives, by the rotations of the edges."""

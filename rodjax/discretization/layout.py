@@ -58,7 +58,7 @@ class SpanForces(eqx.Module):
         """The number of unknown components."""
         return (3 if self.axes is None else self.axes.shape[1]) * (self.stop - self.first)
 
-    def of_cells(self, forces: Float[Array, "3 parts"]) -> Float[Array, "3 n"] | Float[Array, "3 1"]:
+    def gather(self, forces: Float[Array, "3 parts"]) -> Float[Array, "3 n"] | Float[Array, "3 1"]:
         """The force through each cell; one column where all have the same."""
         return forces if self.members is None else forces @ self.members
 
@@ -125,7 +125,7 @@ class CellForces(eqx.Module):
     def size(self) -> int:
         return 3 * self.parts
 
-    def of_cells(self, forces: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    def gather(self, forces: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return forces
 
     def sums(self, by_cell: Float[Array, "3 n"]) -> Float[Array, "3 n"]:

@@ -140,7 +140,7 @@ class MixedForm(Form):
 
     def bases_at(self, point: MixedPoint) -> Float[Array, "3 b n"]:
         """Those along which the tangents of a point may turn: none where a support holds one."""
-        return self.field.basis(self.scene, self.bases(self.field.with_held(self.scene, point.tangents)))
+        return self.field.basis(self.scene, self.bases(self.field.append_prescribed(self.scene, point.tangents)))
 
     def turn(self, point: MixedPoint, bases: Float[Array, "3 b n"], axis: Float[Array, "3"]) -> Float[Array, "b n"]:
         """The rotations that turn the whole rod about an axis."""
@@ -148,7 +148,7 @@ class MixedForm(Form):
 
     def holding(self, point: MixedPoint) -> MixedPoint:
         """The point with the tangents that supports hold, and the total twist of the scene."""
-        tangents = self.field.as_held(self.scene, point.tangents)
+        tangents = self.field.apply_prescribed(self.scene, point.tangents)
         twist = self.twist_near(tangents, point.total_twist)
         return MixedPoint(tangents, point.end_force, twist, self.nodal_held(point.nodal))
 
@@ -170,16 +170,16 @@ class MixedForm(Form):
 
     def forces(self, point: MixedPoint) -> Float[Array, "3 p n"]:
         """The force through the rod at the points of each cell."""
-        return self.layout.of_cells(point.end_force)[:, None] + self.loads_beyond
+        return self.layout.gather(point.end_force)[:, None] + self.loads_beyond
 
     def forces_and_tensions(self, point: MixedPoint) -> tuple[Float[Array, "3 p n"], Float[Array, "p n"]]:
         forces = self.forces(point)
-        return forces, dot(forces, self.field.of_sides(point.tangents))
+        return forces, dot(forces, self.field.gather(point.tangents))
 
     def edge_tension(self, point: MixedPoint) -> Float[Array, "m"]:
         """At the points, of a force that jumps there the mean."""
         _, tension = self.forces_and_tensions(point)
-        return self.field.of_points(self.field.side_weights * tension) / self.field.weights
+        return self.field.scatter_add(self.field.quadrature_weights * tension) / self.field.weights
 
     def slopes(self, point: MixedPoint) -> Float[Array, "3 m"]:
         """The derivative of the centerline by arclength."""
@@ -189,8 +189,8 @@ class MixedForm(Form):
     def ways(self, point: MixedPoint) -> Float[Array, "3 p n"]:
         """What the points of each cell add to the way from node to node."""
         _, tension = self.forces_and_tensions(point)
-        lengths = self.field.side_weights * (1 + axial_strain_under(self.scene.rod, tension))
-        return lengths[None] * self.field.of_sides(point.tangents)
+        lengths = self.field.quadrature_weights * (1 + axial_strain_under(self.scene.rod, tension))
+        return lengths[None] * self.field.gather(point.tangents)
 
     def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
         """From node to node."""
@@ -216,7 +216,7 @@ class MixedForm(Form):
         _, tension = self.forces_and_tensions(point)
         stretching = density(rod, axial_strain=axial_strain_under(rod, tension))
         bending = self.field.bending_energy(self.scene, point.tangents)
-        return bending + jnp.sum(self.field.side_weights * stretching) + density(rod, twist=point.total_twist)
+        return bending + jnp.sum(self.field.quadrature_weights * stretching) + density(rod, twist=point.total_twist)
 
     # --- twist -------------------------------------------------------------------------------------------------------
 
@@ -260,7 +260,7 @@ class MixedForm(Form):
         border = [self.layout.columns(cells.by_force)] if self.layout.size else []
         if torque_column is not None:
             border = [torque_column, *border]
-        by_point = map(self.field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *border))
+        by_point = map(self.field.scatter_add, (cells.gradient, cells.diagonal, cells.lengths, *border))
         gradient, diagonal, lengths, *border = by_point
         energy += cells.energy
         columns, closure, compliance, rows = border, [], [], None
@@ -307,7 +307,7 @@ class MixedForm(Form):
 
     def _elastic(self, point: MixedPoint) -> Elastic:
         scene, rod, field, tangents = self.scene, self.scene.rod, self.field, point.tangents
-        all_bases = self.bases(field.with_held(scene, tangents))
+        all_bases = self.bases(field.append_prescribed(scene, tangents))
         bases = field.basis(scene, all_bases)
         energy, blocks = field.bending(scene, tangents, all_bases)
         if not self.has_torsion and self.has_potential:
@@ -323,13 +323,13 @@ class MixedForm(Form):
     def _by_cells(self, point: MixedPoint, bases: Float[Array, "3 b m"], blocks: Blocks) -> ByCells:
         """With what stretch and the forces through the cells add to the derivatives of bending and torsion."""
         rod, field = self.scene.rod, self.field
-        weights = field.side_weights
+        weights = field.quadrature_weights
         forces, tension = self.forces_and_tensions(point)
         strain, softness = jax.jvp(
             lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
         )
         lengths, softness = weights * (1 + strain), weights * softness
-        along, directions = field.of_sides(point.tangents), field.of_sides(bases)
+        along, directions = field.gather(point.tangents), field.gather(bases)
         across = short_sum(directions * forces[:, None], axis=0)
         gradient = blocks.gradient - lengths[None] * across
         identity = np.eye(bases.shape[1], dtype=gradient.dtype)[..., None, None]
@@ -346,7 +346,9 @@ class MixedForm(Form):
         _, tension = self.forces_and_tensions(point)
         strain = axial_strain_under(rod, tension)
         stretching = density(rod, axial_strain=strain) - tension * (1 + strain)
-        energy = self.field.bending_energy(self.scene, point.tangents) + jnp.sum(self.field.side_weights * stretching)
+        energy = self.field.bending_energy(self.scene, point.tangents) + jnp.sum(
+            self.field.quadrature_weights * stretching
+        )
         if self.has_torsion:
             energy += density(rod, twist=point.total_twist)
         if not layout.size:
@@ -367,20 +369,20 @@ class MixedForm(Form):
         change: Float[Array, "3 parts"],
         others: Any,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        rod, weights, layout = self.scene.rod, self.field.side_weights, self.layout
+        rod, weights, layout = self.scene.rod, self.field.quadrature_weights, self.layout
         assert isinstance(layout, SpanForces)
         zero = jnp.zeros((), change.dtype)
         if not layout.size:
             return zero[None][:0], zero[None][:0], zero, zero
         spans = self.spans
-        along = self.field.of_sides(point.tangents)
-        turning = self.field.of_sides(short_sum(here.bases * rotation[None], axis=1))
+        along = self.field.gather(point.tangents)
+        turning = self.field.gather(short_sum(here.bases * rotation[None], axis=1))
 
         def stretched(force: Float[Array, "3 parts"]):
             """Strains with their rates as the rod begins to turn, and by points what they add to L and to its rate,
             which knows nothing of the strains' own, as L is stationary by them.
             """
-            forces = self.layout.of_cells(force)[:, None] + self.loads_beyond
+            forces = self.layout.gather(force)[:, None] + self.loads_beyond
             tension, rate = dot(forces, along), dot(forces, turning)
             strain, strain_rate = jax.jvp(lambda tension: axial_strain_under(rod, tension), (tension,), (rate,))
             added = density(rod, axial_strain=strain) - tension * (1 + strain)

@@ -227,7 +227,7 @@ class NodalForm(Form):
     def _in_elements(self, point: Any) -> Float[Array, "3 n"]:
         """The forces through the elements, of those in the spans, as files until format 10 have them."""
         members = SpanForces.of(self.scene, self.clip_nodes, len(self.field.s) - 1)
-        forces = jnp.broadcast_to(members.of_cells(point.end_force), (3, len(self.field.s) - 1))
+        forces = jnp.broadcast_to(members.gather(point.end_force), (3, len(self.field.s) - 1))
         loads = self.loads_on_nodes(point)
         if loads is None:
             return forces

@@ -15,7 +15,7 @@ from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
 from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm, FramePoint, Kinematics
 from rodjax.discretization.framed_parts import parts_of
-from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodal import NodalForm
@@ -52,7 +52,7 @@ class NodalTangents(NodalForm, MixedForm):
 
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
-        assert isinstance(field, HermiteElements)
+        assert isinstance(field, QuadraticRotationElements)
         bases, energy, blocks, torque_column, softness = self._elastic(point)
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
@@ -63,7 +63,7 @@ class NodalTangents(NodalForm, MixedForm):
         closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
         columns = [] if torque_column is None else [torque_column]
-        by_point = map(field.of_points, (cells.gradient, cells.diagonal, cells.lengths, *columns))
+        by_point = map(field.scatter_add, (cells.gradient, cells.diagonal, cells.lengths, *columns))
         gradient, diagonal, lengths, *columns = by_point
         fields, stiffness = self.at_nodes(point), contacts.stiffness
         if fields is not None:
@@ -119,9 +119,11 @@ class NodalTangents(NodalForm, MixedForm):
         there = MixedPoint(elements, point.end_force + change, point.total_twist)
         _, tension = self.forces_and_tensions(there)
         strain = axial_strain_under(self.scene.rod, tension)
-        lengths = self.field.side_weights * (1 + strain)
-        energy = jnp.sum(self.field.side_weights * density(self.scene.rod, axial_strain=strain) - lengths * tension)
-        return energy, short_sum(lengths[None] * self.field.of_sides(elements), axis=1).T
+        lengths = self.field.quadrature_weights * (1 + strain)
+        energy = jnp.sum(
+            self.field.quadrature_weights * density(self.scene.rod, axial_strain=strain) - lengths * tension
+        )
+        return energy, short_sum(lengths[None] * self.field.gather(elements), axis=1).T
 
 
 class NodalFrames(NodalForm, FrameForm):
@@ -134,10 +136,10 @@ class NodalFrames(NodalForm, FrameForm):
 
     def node_slopes(self, point: FramePoint) -> Float[Array, "n+1 3"]:
         here = self.strained(point)
-        strain = self.field.assembled(self.field.lengths * here.stretched) / self.field.weights
+        strain = self.field.scatter_add(self.field.lengths * here.stretched) / self.field.weights
         slopes = (1 + strain)[None] * point.tangents
         if here.sideways is not None:
-            slopes += self.field.assembled(self.field.lengths[None] * here.sideways) / self.field.weights[None]
+            slopes += self.field.scatter_add(self.field.lengths[None] * here.sideways) / self.field.weights[None]
         return slopes[:, ::2].T
 
     def node_axes(self, point: FramePoint) -> Float[Array, "3 3 n+1"]:
@@ -146,16 +148,16 @@ class NodalFrames(NodalForm, FrameForm):
     # --- loads without a potential -----------------------------------------------------------------------------------
 
     def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
-        return nonconservative.following(self.scene, self._elements, self.field.of_cells(quaternions))
+        return nonconservative.following(self.scene, self._elements, self.field.gather(quaternions))
 
     def couples_along(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 3 n"] | None:
-        return nonconservative.couples_along(self.scene, self._elements, self.field.of_cells(quaternions))
+        return nonconservative.couples_along(self.scene, self._elements, self.field.gather(quaternions))
 
     def loads_on_nodes(self, point: FramePoint) -> Float[Array, "3 n+1"] | None:
         of_fields = super().loads_on_nodes(point)
         if self.has_potential:
             return of_fields
-        loads = nonconservative.on_nodes(self.scene, self._elements, self.field.of_cells(point.quaternions))
+        loads = nonconservative.on_nodes(self.scene, self._elements, self.field.gather(point.quaternions))
         total = jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
         return total if of_fields is None else total + of_fields
 
@@ -180,12 +182,12 @@ class NodalFrames(NodalForm, FrameForm):
         """The derivative of L by the rotations, less couples."""
         gradient = self.by_rotations(point.quaternions, point.end_force)
         if not self.has_potential:
-            gradient -= nonconservative.couples(self.scene, self._elements, self.field.of_cells(point.quaternions))
-        return self.projected(self.field.assembled(gradient))
+            gradient -= nonconservative.couples(self.scene, self._elements, self.field.gather(point.quaternions))
+        return self.projected(self.field.scatter_add(gradient))
 
     def _load_rows(self, point: FramePoint) -> LoadRows:
         field, scene = self._elements, self.scene
-        q = field.of_cells(point.quaternions)
+        q = field.gather(point.quaternions)
         cells, base = self._cells(point.quaternions, point.end_force), self.through(point.end_force) + self.loads
         kinematics, couples = self._kinematics(q), nonconservative.couples(scene, field, q)
 
@@ -200,7 +202,7 @@ class NodalFrames(NodalForm, FrameForm):
             ways = short_sum(self._strained(kinematics, forces).ways, axis=1)
             return moments, -ways, -nonconservative.on_nodes(scene, field, there)
 
-        along = field.of_cells(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
+        along = field.gather(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
         alone = jnp.eye(q.shape[1], dtype=q.dtype)[None, :, None, :, None]
         zero, turns = jnp.zeros_like(q[1:]), (along[:, None] * alone).reshape(-1, *q[1:].shape)
         derivatives = jax.vmap(lambda turn: jax.jvp(rows, (zero,), (turn,))[1])(turns)
@@ -260,7 +262,7 @@ class NodalFrames(NodalForm, FrameForm):
         )
 
     def _by_force(self, cells: CellDerivatives) -> Float[Array, "3 3 3 n"]:
-        by_force = cells.by_force * self.field.of_cells(self.is_free)[:, None]
+        by_force = cells.by_force * self.field.gather(self.is_free)[:, None]
         if self.across is None:
             return by_force
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]

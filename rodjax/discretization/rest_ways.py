@@ -44,7 +44,7 @@ class RestWays(NamedTuple):
     ) -> "RestWays":
         """Of a rod at rest with these frames and strains; `edges`: from node to node; `middles`: frames half way."""
         own_lengths = cells.lengths if rest_axial is None else cells.lengths * (1 + rest_axial)
-        tangents, axes = tangent(cells.of_cells(frames)), tangent(middles)
+        tangents, axes = tangent(cells.gather(frames)), tangent(middles)
 
         def ways(lengths: Float[Array, "p n"]) -> Float[Array, "3 segments"]:
             by_point = lengths[None] * tangents

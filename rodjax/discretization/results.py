@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.edges import EdgeTangents
-from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.joints import Joints, bending_derivatives, tangent_bases, twist_derivatives
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodes import held_nodes
@@ -36,14 +36,14 @@ class Resultants(eqx.Module):
 
 def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
     """Of an equilibrium."""
-    if isinstance(form.field, HermiteElements):
+    if isinstance(form.field, QuadraticRotationElements):
         return _on_elements(form, form.field, point)
     assert isinstance(form.field, EdgeTangents)
     tension, forces = form.edge_tension(point), form.end_forces(point)
     return _on_edges(form.scene, form.field, point.tangents, tension, forces, point.total_twist)
 
 
-def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> Resultants:
+def _on_elements(form: MixedForm, field: QuadraticRotationElements, point: MixedPoint) -> Resultants:
     """Moments are the derivatives of the energy of the element beside by the tangent of a node: of fourth order too."""
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
@@ -77,7 +77,7 @@ def _on_elements(form: MixedForm, field: HermiteElements, point: MixedPoint) -> 
 
 
 def _by_ends(
-    form: MixedForm, field: HermiteElements, point: MixedPoint, torque: Float[Array, ""]
+    form: MixedForm, field: QuadraticRotationElements, point: MixedPoint, torque: Float[Array, ""]
 ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
     """The derivatives of L of each element by the tangents of its nodes."""
     by_ends = field.by_end_tangents(form.scene, point.tangents, form.forces(point)[:, ::2], torque)
@@ -87,7 +87,7 @@ def _by_ends(
 def element_end_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "3 2 n"]:
     """The section moments at both ends of each element, on its side of the node."""
     tangents, torque = point.tangents, torque_at(form.scene.rod, point.total_twist)
-    assert isinstance(form.field, HermiteElements)
+    assert isinstance(form.field, QuadraticRotationElements)
     by_start, by_end = _by_ends(form, form.field, point, torque)
     start, end = tangents[:, 0:-1:2], tangents[:, 2::2]
     return jnp.stack([torque * start - cross(start, by_start), torque * end + cross(end, by_end)], axis=1)
@@ -109,7 +109,7 @@ def positions_between(
     second derivative, which force and moment give on each side of a node.
     """
     field, scene = form.field, form.scene
-    assert isinstance(field, HermiteElements)
+    assert isinstance(field, QuadraticRotationElements)
     rod, tangents = scene.rod, point.tangents
     torque = torque_at(rod, point.total_twist)
     by_start, by_end = _by_ends(form, field, point, torque)
@@ -154,7 +154,7 @@ def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
     scene, field, tangents = form.scene, form.field, point.tangents
     moments = [jnp.zeros(3, tangents.dtype)] * len(scene.clips)
     directed = held_nodes(scene, field.clip_nodes)
-    if isinstance(field, HermiteElements):
+    if isinstance(field, QuadraticRotationElements):
         by_ends = _by_ends(form, field, point, torque_at(scene.rod, point.total_twist))
         for k, node, _ in directed:
             moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])

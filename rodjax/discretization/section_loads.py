@@ -9,14 +9,14 @@ from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import end_moments, section_forces
-from rodjax.discretization.hermite import HermiteElements
+from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import element_end_moments
 
 
 def is_known_along(form: Form) -> bool:
     """Whether `section_loads` takes a form: one on elements."""
-    return isinstance(form.field, HermiteElements | ElementCells)
+    return isinstance(form.field, QuadraticRotationElements | ElementCells)
 
 
 def section_loads(form: Form, point: Any) -> tuple[Float[Array, "3 2 n"], Float[Array, "3 2 n"]]:

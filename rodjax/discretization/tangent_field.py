@@ -25,7 +25,7 @@ class Blocks(eqx.Module):
 class TangentField(Protocol):
     """Unit tangents at m points along the rod, and the strains, places and loads that belong to them.
 
-    `bases` in the arguments are those of `with_held`; what comes back belongs to the m points.
+    `bases` in the arguments are those of `append_prescribed`; what comes back belongs to the m points.
     """
 
     @property
@@ -48,11 +48,11 @@ class TangentField(Protocol):
         """The shortest distance between points."""
         ...
 
-    def with_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 k"]:
+    def append_prescribed(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 k"]:
         """With the tangents that supports hold beyond the points."""
         ...
 
-    def as_held(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+    def apply_prescribed(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
         """With those at the points that supports hold in their place."""
         ...
 
@@ -85,17 +85,17 @@ class TangentField(Protocol):
         ...
 
     @property
-    def side_weights(self) -> Float[Array, "p n"]:
+    def quadrature_weights(self) -> Float[Array, "p n"]:
         """The length of rod that each of the p points of a cell stands for; a cell lies between two nodes."""
         ...
 
     def tangents_in_clips(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, "3 clips"]: ...
 
-    def of_sides(self, by_point: Float[Array, "*c m"]) -> Float[Array, "*c p n"]:
+    def gather(self, by_point: Float[Array, "*c m"]) -> Float[Array, "*c p n"]:
         """What belongs to the points of each cell."""
         ...
 
-    def of_points(self, by_side: Float[Array, "*c p n"]) -> Float[Array, "*c m"]:
+    def scatter_add(self, by_side: Float[Array, "*c p n"]) -> Float[Array, "*c m"]:
         """Sums over the cells at each point."""
         ...
 

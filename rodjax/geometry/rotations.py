@@ -96,14 +96,14 @@ def columns(q: Float[Array, "4 *k"]) -> Float[Array, "3 3 *k"]:
     )
 
 
-def spun(q: Float[Array, "4 *k"], angle: Float[Array, "*k"]) -> Float[Array, "4 *k"]:
+def rotate_about_tangent(q: Float[Array, "4 *k"], angle: Float[Array, "*k"]) -> Float[Array, "4 *k"]:
     """Turned about its tangent."""
     cosine, sine = jnp.cos(angle / 2), jnp.sin(angle / 2)
     w, x, y, z = jnp.unstack(q)
     return jnp.stack([w * cosine - z * sine, x * cosine + y * sine, y * cosine - x * sine, z * cosine + w * sine])
 
 
-def swung(q: Float[Array, "4 *k"], new: Float[Array, "3 *k"]) -> Float[Array, "4 *k"]:
+def align_tangent(q: Float[Array, "4 *k"], new: Float[Array, "3 *k"]) -> Float[Array, "4 *k"]:
     """Turned by the smallest rotation that takes the tangent to a new one, not opposite to it."""
     old = tangent(q)
     swing = jnp.concatenate([1 + dot(old, new)[None], cross(old, new)])
@@ -114,7 +114,7 @@ def carried(q: Float[Array, "4"], tangents: Float[Array, "3 k"]) -> Float[Array,
     """A frame carried from one tangent to the next without twist, each not opposite to the last."""
 
     def onward(q, tangent):
-        q = swung(q, tangent)
+        q = align_tangent(q, tangent)
         return q, q
 
     return jax.lax.scan(onward, q, tangents.T)[1].T

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
 from rodjax.checks import leaf
-from rodjax.identification.lanes import LANES
+from rodjax.identification.batch_slots import LANES
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import Loss
 from rodjax.identification.measurements import Experiment

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.identification.lanes import in_lanes
+from rodjax.identification.batch_slots import in_lanes
 from rodjax.identification.least_squares import Coordinates, NormalEquations, Residuals, least_squares
 from rodjax.identification.loss import Loss, influence, robust
 from rodjax.identification.measurements import Experiment

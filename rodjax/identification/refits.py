@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import number_list, whole_number
-from rodjax.identification.lanes import LANES
+from rodjax.identification.batch_slots import LANES
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.measurements import Experiment, Measurement
 from rodjax.identification.problem import Found, Problem, Structure, looked_at, search, values

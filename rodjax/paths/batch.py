@@ -48,7 +48,7 @@ from rodjax.solving.result import (
     Equilibrium,
     Found,
     SolverState,
-    equilibrium,
+    build_result,
     warn_of_outcome,
 )
 
@@ -275,7 +275,7 @@ def _solve_here(
         return Search.of(*in_units_of(scene, start[0]), start[1], options)
 
     def result(scene: Scene, found: Found) -> Equilibrium:
-        return equilibrium(scene, found, jnp.ones((), int), strain_limit)
+        return build_result(scene, found, jnp.ones((), int), strain_limit)
 
     starts = jax.vmap(state, in_axes)(scenes, guess)
     if not isinstance(options.solver, Newton) or slides(scenes) or has_node_places(scenes):

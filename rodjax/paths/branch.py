@@ -29,7 +29,7 @@ from rodjax.model.supports import Clamp, rotate
 from rodjax.paths.modes import Mode, mode_of
 from rodjax.programs.compilation import compiled
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
+from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to
 from rodjax.solving.status import Outcome, Status
 
@@ -41,13 +41,13 @@ MAX_ROTATION = 1.0
 # Stiffness of the spring against a neutral turn [EI/L], that of a softly held rod.
 SPRING = 10.0
 # Stiffness of the springs that hold a rod while its system is factorised [EI/L], and the parts it is held in.
-HOLD = 100.0
+SPRING_STIFFNESS = 100.0
 PARTS = 4
 # Inverse iterations for the motion whose stiffness is nearest to zero: where it is near, one gains six digits.
 INVERSE_ITERATIONS = 4
 
 
-class Along(eqx.Module):
+class BranchTangent(eqx.Module):
     """A direction in which equilibria change: a motion, and the change of the parameter that goes with it."""
 
     motion: Motion
@@ -66,7 +66,7 @@ class Station(eqx.Module):
 
     parameter: Float[Array, ""]
     equilibrium: Equilibrium
-    along: Along
+    along: BranchTangent
     alignment: Float[Array, ""]
     index: Int[Array, ""]
     stiffness: Float[Array, ""]
@@ -169,7 +169,7 @@ def added(motion: Motion, other: Motion, share: Float[Array, ""]) -> Motion:
     return jax.tree.map(lambda x, y: x + share * y, motion, other)
 
 
-class Firm(eqx.Module):
+class Regularized(eqx.Module):
     """The factors of a linearisation that has its springs."""
 
     factors: AnyFactors
@@ -185,7 +185,7 @@ class Firm(eqx.Module):
         return Motion(rotation, multipliers[: len(motion.multipliers)])
 
 
-def firm(form: Form, here: Linearization, neutral: Motion) -> Firm:
+def regularized(form: Form, here: Linearization, neutral: Motion) -> Regularized:
     """The factors of a linearisation with a spring against its neutral turn, where this turns a tangent most.
 
     What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
@@ -209,14 +209,14 @@ def firm(form: Form, here: Linearization, neutral: Motion) -> Firm:
     border = jnp.asarray(border.reshape(b, holds, m), system.border.dtype)
     held = jnp.sum(border, axis=1)
     identity = jnp.eye(b, dtype=held.dtype)[..., None]
-    diagonal = system.diagonal.at[:, :, place].add(spring) + HOLD * identity * held[None]
+    diagonal = system.diagonal.at[:, :, place].add(spring) + SPRING_STIFFNESS * identity * held[None]
     k = len(system.compliance)
     compliance = jnp.zeros((k + holds, k + holds), held.dtype).at[:k, :k].set(system.compliance)
-    compliance = compliance.at[k:, k:].set(-jnp.eye(holds, dtype=held.dtype) / HOLD)
+    compliance = compliance.at[k:, k:].set(-jnp.eye(holds, dtype=held.dtype) / SPRING_STIFFNESS)
     system = SaddlePointSystem(
         diagonal, system.lower, jnp.concatenate([system.border, border], axis=1), compliance, across=system.across
     )
-    return Firm(factor(system), holds)
+    return Regularized(factor(system), holds)
 
 
 def nearest_to_zero(
@@ -225,7 +225,7 @@ def nearest_to_zero(
     """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
     weights = mass(form, here)
     nothing = jnp.zeros_like(here.closure)
-    factors = firm(form, here, neutral)
+    factors = regularized(form, here, neutral)
 
     def unit(motion: Motion) -> Motion:
         for other in (neutral, *others):
@@ -267,7 +267,7 @@ def stepped(
     segment: Int[Array, ""],
     parameter: Float[Array, ""],
     result: Equilibrium,
-    along: Along,
+    along: BranchTangent,
     distance: Float[Array, ""],
     target: Float[Array, ""],
 ) -> Station:
@@ -287,7 +287,7 @@ def stepped(
         form, point, here, change = problem.linearized(state.parameter, state.point)
         weights = mass(form, here)
         neutral = neutral_motion(form, point, here)
-        factors = firm(form, here, neutral)
+        factors = regularized(form, here, neutral)
         back = less(factors.solve(Motion(-here.gradient, -here.closure)), neutral, weights)
         follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, weights)
         across = Motion(components(here.bases, normal), here.closure)
@@ -330,7 +330,7 @@ def stepped(
     size = jnp.sqrt(inner(weights, state.follows, state.follows) + 1 / problem.scale**2)
     cosine = (inner(weights, before, state.follows) + along.rate / problem.scale**2) / size
     sign = jnp.where(cosine < 0, -1.0, 1.0).astype(size.dtype) / size
-    tangent = Along(jax.tree.map(lambda x: sign * x, state.follows), sign)
+    tangent = BranchTangent(jax.tree.map(lambda x: sign * x, state.follows), sign)
     stiffness, motion = nearest_to_zero(form, point, here, neutral_motion(form, point, here))
 
     scene = scene_at(scenes, segment, state.parameter)
@@ -341,7 +341,7 @@ def stepped(
     found = Found(SolverState(shape, point.end_force, units), point, outcome, state.index == 0)
     return Station(
         parameter=state.parameter,
-        equilibrium=equilibrium(scene, found, jnp.ones((), int)),
+        equilibrium=build_result(scene, found, jnp.ones((), int)),
         along=tangent,
         alignment=jnp.abs(cosine),
         index=state.index,

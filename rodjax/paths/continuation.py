@@ -15,11 +15,11 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.checks import instance, is_known, number_array, positive, whole_number
 from rodjax.model.scene import Scene, has_potential, slides
-from rodjax.paths.branch import Along, mode_at, scene_at
+from rodjax.paths.branch import BranchTangent, mode_at, scene_at
 from rodjax.paths.critical import differentiable_parameter
 from rodjax.paths.modes import Mode
 from rodjax.paths.path import stack_scenes
-from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, Steps, begun, towards, trace
+from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, StepControl, begun, towards, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, Solver
@@ -226,7 +226,7 @@ def switch_branch(
     if side not in (1, -1):
         raise ValueError(f"side must be 1 or -1, got {side!r}")
     segment, station = begun(stacked, float(point.parameter), point.equilibrium, 1.0)
-    along = Along(station.motion, jnp.zeros_like(station.parameter))
+    along = BranchTangent(station.motion, jnp.zeros_like(station.parameter))
     there = towards(stacked, segment, station.parameter, station.equilibrium, along, side * distance)
     return there.parameter, there.equilibrium
 
@@ -300,11 +300,11 @@ def _checked(scenes: Any, name: str) -> Scene:
     return stacked
 
 
-def _checked_steps(step: Any, max_step: Any, max_points: Any) -> Steps:
+def _checked_steps(step: Any, max_step: Any, max_points: Any) -> StepControl:
     step, max_step = float(positive(step, "step")), float(positive(max_step, "max_step"))
     if step > max_step:
         raise ValueError(f"step must be at most max_step = {max_step:g}, got {step:g}")
-    return Steps(step, max_step, whole_number(max_points, "max_points", 1, 10**6))
+    return StepControl(step, max_step, whole_number(max_points, "max_points", 1, 10**6))
 
 
 def _checked_start(scenes: Scene, start: Any, direction: Any) -> tuple[float, float]:

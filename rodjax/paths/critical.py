@@ -17,7 +17,17 @@ from jaxtyping import Array, Float
 from rodjax.discretization.form import Linearization
 from rodjax.discretization.motion import Motion
 from rodjax.model.scene import Scene
-from rodjax.paths.branch import Firm, Problem, added, firm, less, mass, nearest_to_zero, neutral_motion, times
+from rodjax.paths.branch import (
+    Problem,
+    Regularized,
+    added,
+    less,
+    mass,
+    nearest_to_zero,
+    neutral_motion,
+    regularized,
+    times,
+)
 from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium, form_and_point
 
@@ -79,7 +89,7 @@ def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, i
         second = jax.tree.map(lambda x: jnp.where(jnp.abs(stiffness) < DOUBLE, x, 0.0), second)
         nothing = jax.tree.map(jnp.zeros_like, critical)
         by_motion = jax.grad(lambda motion: eigenvalue(linearized(scenes, parameter, motion)))(nothing)
-        followed = _solved(firm(form, here, neutral), here, by_motion, weights, (critical, second, neutral))
+        followed = _solved(regularized(form, here, neutral), here, by_motion, weights, (critical, second, neutral))
         weight = jax.tree.map(jnp.negative, followed)
 
     def stays_zero(scenes: Scene, parameter: Float[Array, ""]) -> Float[Array, ""]:
@@ -92,7 +102,7 @@ def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, i
 
 
 def _solved(
-    factors: Firm, here: Linearization, right: Motion, mass: Float[Array, "m"], without: tuple[Motion, ...]
+    factors: Regularized, here: Linearization, right: Motion, mass: Float[Array, "m"], without: tuple[Motion, ...]
 ) -> Motion:
     """The solution of the linearised system at right angles to motions that have no stiffness, of length 1 or none."""
 

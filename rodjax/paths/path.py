@@ -43,7 +43,7 @@ from rodjax.solving.result import (
     Equilibrium,
     Found,
     SolverState,
-    equilibrium,
+    build_result,
     warn_of_outcome,
 )
 from rodjax.solving.status import Outcome, is_converged
@@ -230,7 +230,7 @@ def _solve_path(
     (_, _, bar), (found, substeps) = jax.lax.scan(step, (start, start, bar), (jnp.arange(count), scenes))
     if meter is not None and bar is not None:
         meter.close(bar)
-    return jax.vmap(equilibrium, (0, 0, 0, None))(scenes, found, substeps, strain_limit)
+    return jax.vmap(build_result, (0, 0, 0, None))(scenes, found, substeps, strain_limit)
 
 
 def path_from(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.form import NEUTRAL
 from rodjax.model.scene import Scene
-from rodjax.paths.branch import Along, Station, no_motion, stepped
+from rodjax.paths.branch import BranchTangent, Station, no_motion, stepped
 from rodjax.solving.result import Equilibrium
 
 # A step that turns the tangent of the branch by more than 26 degrees is halved, and one of 14 is not made longer.
@@ -41,7 +41,7 @@ class BranchEnd(enum.Enum):
     NOT_CONVERGED = "no equilibrium was found to begin with"
 
 
-class Steps(NamedTuple):
+class StepControl(NamedTuple):
     """How long the first step is, and the longest [rad of a rod that turns as a whole, or the whole path of scenes]."""
 
     first: float
@@ -49,7 +49,7 @@ class Steps(NamedTuple):
     most: int
 
 
-DEFAULT_STEPS = Steps(first=0.02, longest=0.1, most=1000)
+DEFAULT_STEPS = StepControl(first=0.02, longest=0.1, most=1000)
 
 
 class Crossing(NamedTuple):
@@ -86,7 +86,7 @@ def towards(
     segment: int,
     parameter: Float[Array, ""],
     result: Equilibrium,
-    along: Along,
+    along: BranchTangent,
     distance: float,
     target: float = math.nan,
 ) -> Station:
@@ -101,12 +101,12 @@ def begun(scenes: Scene, parameter: float, result: Equilibrium, direction: float
     segment = math.floor(parameter) if direction > 0 else math.ceil(parameter) - 1
     segment = min(max(segment, 0), last - 1)
     dtype = result.s.dtype
-    along = Along(no_motion(result), jnp.asarray(direction, dtype))
+    along = BranchTangent(no_motion(result), jnp.asarray(direction, dtype))
     return segment, towards(scenes, segment, jnp.asarray(parameter, dtype), result, along, 0.0, parameter)
 
 
 def trace(
-    scenes: Scene, start: float, first: Equilibrium, direction: float, steps: Steps, only_first: bool = False
+    scenes: Scene, start: float, first: Equilibrium, direction: float, steps: StepControl, only_first: bool = False
 ) -> Trace:
     """The branch from an equilibrium under the scene of the parameter `start`, or that as far as a critical point."""
     last = scenes.rod.length.shape[0] - 1

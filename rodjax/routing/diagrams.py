@@ -15,7 +15,7 @@ from rodjax.analysis.samples import Samples, samples_at
 from rodjax.model.obstacles import Obstacle
 from rodjax.plot import PALETTE
 from rodjax.programs.compilation import compiled
-from rodjax.routing.findings import Cable
+from rodjax.routing.cable_report import Cable
 
 LIMIT_COLOR = "#c0271c"
 CABLE_COLORS = ("#225ea8", "#b3641e", "#3f7f3f", "#7a4f9a", "#555555")

@@ -10,8 +10,8 @@ from rodjax.atomic_write import replace_file
 from rodjax.io.files import save
 from rodjax.io.scene_writing import write_scene
 from rodjax.routing.records import plain
+from rodjax.routing.report_text import TOLD, table
 from rodjax.routing.route import Route
-from rodjax.routing.words import TOLD, table
 
 # Starts with a row in the table; of more the best.
 MOST_ROWS = 20

@@ -26,7 +26,7 @@ from rodjax.plot import (
     set_view,
     tube_faces,
 )
-from rodjax.routing.sights import (
+from rodjax.routing.view_data import (
     Sight,
     azimuth,
     clip_faces,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rodjax.routing.findings import Cable, Gradients
-from rodjax.routing.words import inputs
+from rodjax.routing.cable_report import Cable, Gradients
+from rodjax.routing.report_text import inputs
 from rodjax.solving.status import Status
 from rodjax.version import __version__
 

@@ -17,8 +17,8 @@ from rodjax.checks import file_path, instance, is_known, sequence, shown
 from rodjax.model.obstacles import Obstacle, checked_obstacles
 from rodjax.notes import note
 from rodjax.programs.answers import one_answer
-from rodjax.routing import records, words
-from rodjax.routing.findings import Cable, Gradients, cable
+from rodjax.routing import records, report_text
+from rodjax.routing.cable_report import Cable, Gradients, cable
 from rodjax.routing.limits import Limits
 from rodjax.routing.route import Route
 from rodjax.solving.result import Equilibrium
@@ -52,7 +52,7 @@ class Report:
 
     @cached_property
     def verdict(self) -> str:
-        return words.verdict(self)
+        return report_text.verdict(self)
 
     @property
     def kept(self) -> bool | None:
@@ -70,7 +70,7 @@ class Report:
         }
 
     def __str__(self) -> str:
-        return words.text(self)
+        return report_text.text(self)
 
     def as_dict(self) -> dict[str, Any]:
         """All numbers in SI units, as JSON knows them: `None` for what is infinite or not a number."""
@@ -124,7 +124,7 @@ class Report:
 
     @cached_property
     def _sights(self) -> list[Any]:
-        from rodjax.routing.sights import extent, sight
+        from rodjax.routing.view_data import extent, sight
 
         size = extent([cable.equilibrium for cable in self.cables])
         return [sight(cable.name, cable.equilibrium, cable.limits, size) for cable in self.cables]

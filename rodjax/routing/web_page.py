@@ -15,10 +15,10 @@ from matplotlib.colors import Colormap, to_hex
 
 from rodjax.model.surfaces import Faces
 from rodjax.plot import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
-from rodjax.routing import words
-from rodjax.routing.findings import Cable
+from rodjax.routing import report_text
+from rodjax.routing.cable_report import Cable
 from rodjax.routing.records import plain
-from rodjax.routing.sights import (
+from rodjax.routing.view_data import (
     Coloring,
     Sight,
     azimuth,
@@ -162,15 +162,15 @@ def _ticks(colors: Coloring) -> str:
 def _panel(report: Any) -> str:
     kind = {None: "", True: ' class="kept"', False: ' class="broken"'}[report.kept]
     parts = [f"<h1>{escape(report.title)}</h1>", f'<p id="verdict"{kind}>{escape(report.verdict)}</p>']
-    parts.append(f'<p class="soft">{escape(words.made(report))}</p>')
+    parts.append(f'<p class="soft">{escape(report_text.made(report))}</p>')
     for k, cable in enumerate(report.cables):
         if len(report.cables) > 1:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
         parts += [_limits(cable, k), _facts(cable, k), _supports(cable)]
         if cable.gradients is not None:
-            parts.append(f"<h2>derivatives</h2><pre>{escape(words.gradients(cable))}</pre>")
+            parts.append(f"<h2>derivatives</h2><pre>{escape(report_text.gradients(cable))}</pre>")
         parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
-        rows = [_row([name, text], k, None) for name, text in words.inputs(report, cable)]
+        rows = [_row([name, text], k, None) for name, text in report_text.inputs(report, cable)]
         parts.append("<h2>inputs</h2>" + _table(("", ">SI units"), rows, ' class="inputs"'))
     parts.append(f'<div id="along"><h2>along the cable</h2>{_diagrams(report)}</div>')
     if report.obstacles:
@@ -207,10 +207,10 @@ def _limits(cable: Cable, number: int) -> str:
         sign = {"least": "≥", "most": "≤"}[found.kinds[k]]
         cells = [
             name,
-            words.amount(value, found.units[k]),
-            f"{sign} {words.amount(limit, found.units[k])}",
-            words.percent(margin, limit, found.units[k]),
-            words.amount(s, "m"),
+            report_text.amount(value, found.units[k]),
+            f"{sign} {report_text.amount(limit, found.units[k])}",
+            report_text.percent(margin, limit, found.units[k]),
+            report_text.amount(s, "m"),
         ]
         rows.append(_row(cells, number, s, "" if margin >= 0 else "broken"))
     return _table(("limit", ">value", ">asked", ">margin", ">at s"), rows)
@@ -220,8 +220,8 @@ def _facts(cable: Cable, number: int) -> str:
     rows = []
     for fact in cable.facts:
         name = f"{fact.name}, {fact.note}" if fact.note else fact.name
-        place = "" if fact.s is None else words.amount(fact.s, "m")
-        rows.append(_row([name, words.amount(fact.value, fact.unit), place], number, fact.s))
+        place = "" if fact.s is None else report_text.amount(fact.s, "m")
+        rows.append(_row([name, report_text.amount(fact.value, fact.unit), place], number, fact.s))
     return "<h2>shape</h2>" + _table(("", ">value", ">at s"), rows)
 
 
@@ -229,13 +229,13 @@ def _supports(cable: Cable) -> str:
     """For each support a block: force and moment by component, in the axes of the scene and in its own."""
     rows = []
     for reaction in cable.reactions:
-        rows.append(f'<tr class="support"><td colspan="6">{escape(words.support(reaction))}</td></tr>')
+        rows.append(f'<tr class="support"><td colspan="6">{escape(report_text.support(reaction))}</td></tr>')
         for name, load, unit in (("force", reaction.force, "N"), ("moment", reaction.moment, "N m")):
-            least = words.ROUNDING * float(np.linalg.norm(load))
+            least = report_text.ROUNDING * float(np.linalg.norm(load))
             for axes, values in (("x, y, z", load), ("tangent, left, up", reaction.axes @ load)):
-                magnitude = words.amount(float(np.linalg.norm(load)), unit) if values is load else ""
+                magnitude = report_text.amount(float(np.linalg.norm(load)), unit) if values is load else ""
                 cells = [f"{name} [{unit}]" if values is load else "", axes]
-                cells += [*(words.above(float(x), least) for x in values), _unbroken(magnitude)]
+                cells += [*(report_text.above(float(x), least) for x in values), _unbroken(magnitude)]
                 rows.append(_row(cells, 0, None))
     heads = ("what supports apply", ">axes", ">1", ">2", ">3", ">magnitude")
     return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')

@@ -22,7 +22,7 @@ from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
-from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
 from rodjax.discretization.nodal import NodalForm, pressure_rows
@@ -63,7 +63,7 @@ from rodjax.solving.refinement import (
     first_size,
     graded,
     next_size,
-    shares,
+    normalized,
 )
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
@@ -71,7 +71,7 @@ from rodjax.solving.result import (
     Found,
     NotConvergedWarning,
     SolverState,
-    equilibrium,
+    build_result,
     estimated_errors,
     passage_to,
     warn_if_coarse,
@@ -79,7 +79,7 @@ from rodjax.solving.result import (
     warn_of_single_precision,
     warn_of_unknown_mesh,
 )
-from rodjax.solving.sliding_search import INNER_TOLERANCE, slid_free
+from rodjax.solving.sliding_search import INNER_TOLERANCE, solve_sliding
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 from rodjax.warn import warn
@@ -178,17 +178,17 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         failures = 0 if result.converged else failures + 1
         errors = estimated_errors(result)
         error = float(error_by_rtol(errors))
-        sinks = depth.lacking(errors, options.segments)
+        relative_penetration = depth.lacking(errors, options.segments)
         depths = np.zeros(1) if errors.depths is None else np.asarray(errors.depths)
         if result.converged and np.max(depths) < MOST_DEPTH_LEFT:
             last = result, error, options
-        is_fine = bool(result.converged) and max(SAFETY * error / rtol, sinks) <= 1
+        is_fine = bool(result.converged) and max(SAFETY * error / rtol, relative_penetration) <= 1
         if is_fine or _is_finest(options) or failures == MOST_FAILURES:
             break
         defects = errors.defects
-        if sinks and defects is not None and errors.depths is not None:
-            defects = SAFETY * error / rtol * shares(defects) + sinks * shares(errors.depths)
-        lacking = max(error, sinks * rtol / SAFETY) if result.converged else np.nan
+        if relative_penetration and defects is not None and errors.depths is not None:
+            defects = SAFETY * error / rtol * normalized(defects) + relative_penetration * normalized(errors.depths)
+        lacking = max(error, relative_penetration * rtol / SAFETY) if result.converged else np.nan
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
@@ -227,12 +227,12 @@ def refined_together(
         errors, converged = estimated_errors(result), np.asarray(result.converged)
         sizes = error_by_rtol(errors)
         error = float(np.max(sizes[converged], initial=0.0))
-        sinks = depth.lacking(errors, options.segments, converged)
-        if max(SAFETY * error / rtol, sinks) <= 1 or _is_finest(options):
+        relative_penetration = depth.lacking(errors, options.segments, converged)
+        if max(SAFETY * error / rtol, relative_penetration) <= 1 or _is_finest(options):
             missed = int(np.sum(converged & ~(sizes <= rtol)))
             _warn_if_inaccurate(error, rtol, options, f" in {missed} of {sizes.size} cases")
             break
-        lacking = max(error, sinks * rtol / SAFETY)
+        lacking = max(error, relative_penetration * rtol / SAFETY)
         options = dataclasses.replace(
             options, segments=next_size(options.segments, lacking, rtol, options.discretization)
         )
@@ -798,7 +798,7 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
 
     count = jnp.zeros((), int)
     begin = Found(guess, point, Outcome(jnp.zeros_like(point.total_twist), count, count, count), jnp.array(False))
-    return slid_free(scene, find_at, begin, tolerance, options.find)
+    return solve_sliding(scene, find_at, begin, tolerance, options.find)
 
 
 def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:
@@ -811,8 +811,8 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
         return shape, form.begun(point, shape.nodes, guess.pressures, guess.friction)
     assert isinstance(form, MixedForm)
     if isinstance(shape, Curve):
-        assert isinstance(field, HermiteElements)
-        tangents = field.as_held(scene, shape.turned_to_ends(scene, field.places))
+        assert isinstance(field, QuadraticRotationElements)
+        tangents = field.apply_prescribed(scene, shape.turned_to_ends(scene, field.places))
     else:
         assert isinstance(shape, Polyline)
         if not scene.clips:
@@ -832,7 +832,7 @@ def _solve(
     strain_limit: Float[Array, ""] | float,
     options: Options,
 ) -> Equilibrium:
-    return equilibrium(scene, solve_from(scene, state, first, options), jnp.ones((), int), strain_limit)
+    return build_result(scene, solve_from(scene, state, first, options), jnp.ones((), int), strain_limit)
 
 
 def _in_units(state: SolverState, units: Units) -> SolverState:

@@ -195,8 +195,8 @@ def _frame_at(body: int, positions: list[Any], reaches: list[_Reach]) -> Float[A
         weight = jnp.where(is_long, 1.0, 0.0)
         pairs.append((reach.joint.frame[:, 2], along, weight))
         if reach.frame is not None:
-            swung = _swung(reach.frame, jnp.where(is_long, along, reach.frame[:, 2]))
-            pairs += [(reach.joint.frame[:, k], swung[:, k], FRAME_WEIGHT * (1 + 0 * weight)) for k in range(3)]
+            align_tangent = _swung(reach.frame, jnp.where(is_long, along, reach.frame[:, 2]))
+            pairs += [(reach.joint.frame[:, k], align_tangent[:, k], FRAME_WEIGHT * (1 + 0 * weight)) for k in range(3)]
     dtype = positions[body].dtype
     table = 1e-3 * FRAME_WEIGHT * jnp.eye(3, dtype=dtype)
     for own, seen, weight in pairs:

@@ -45,7 +45,7 @@ from rodjax.solving.result import (
     Found,
     NotConvergedWarning,
     SolverState,
-    equilibrium,
+    build_result,
     estimated_errors,
     warn_if_coarse,
     warn_of_outcome,
@@ -341,7 +341,7 @@ def _equilibria(scenes: Scene, rods: Rods, end: State, group: int, is_stable: Ar
         point = form.settled(form.holding(point))
         state = SolverState(rod.shape.reached(form, point), point.end_force, units)
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
-        return equilibrium(scene, Found(state, point, outcome, is_stable), jnp.ones((), int), strain_limit)
+        return build_result(scene, Found(state, point, outcome, is_stable), jnp.ones((), int), strain_limit)
 
     return jax.vmap(one)(scenes, rods, end.points[group], end.residuals[group])
 

@@ -21,7 +21,7 @@ from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
 from rodjax.model.scene import Scene, nondimensional, slid, sliding_places
 from rodjax.programs.linear import linear
-from rodjax.solving.result import Equilibrium, Found, SolverState, equilibrium, form_and_point
+from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to, examined
 from rodjax.solving.status import Outcome
 
@@ -78,7 +78,7 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
             shape, point.end_force, units, places, before=before, pressures=pressures, friction=friction
         )
         found = Found(state, point, outcome, result.stable)
-        return equilibrium(scene, found, result.substeps)
+        return build_result(scene, found, result.substeps)
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
     _, point = form_and_point(result)

@@ -81,7 +81,7 @@ def graded(
     return nodes.at[0].set(0.0).at[-1].set(1.0)
 
 
-def shares(values: Float[Array, "n"]) -> Float[np.ndarray, "n"]:
+def normalized(values: Float[Array, "n"]) -> Float[np.ndarray, "n"]:
     """Parts of their sum; nothing of nothing."""
     numbers = np.asarray(values)
     return numbers / (np.sum(numbers) + np.finfo(numbers.dtype).tiny)

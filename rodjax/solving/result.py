@@ -36,7 +36,7 @@ from rodjax.discretization.framed_results import (
     framed_on_elements,
     strains_beside_nodes,
 )
-from rodjax.discretization.hermite import Curve, HermiteElements
+from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
 from rodjax.discretization.nodal import SLIPS, STICKS, NodalForm
@@ -330,7 +330,7 @@ class Found(eqx.Module):
     is_stable: Bool[Array, ""]
 
 
-def equilibrium(
+def build_result(
     scene: Scene, found: Found, substeps: Int[Array, ""], strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT
 ) -> Equilibrium:
     """What a solver found, in SI units; infinite where no strain is too large."""
@@ -371,7 +371,9 @@ def equilibrium(
         residual=outcome.residual,
         scene=scene,
         state=dataclasses.replace(found.state, units=units),
-        discretization="hermite" if isinstance(form.field, HermiteElements | ElementCells) else "finite_difference",
+        discretization="hermite"
+        if isinstance(form.field, QuadraticRotationElements | ElementCells)
+        else "finite_difference",
         shear_strain=results.shear_strain,
     )
 

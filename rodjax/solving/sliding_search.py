@@ -53,7 +53,7 @@ class _Slid(eqx.Module):
     is_steady: Bool[Array, ""]
 
 
-def slid_free(
+def solve_sliding(
     scene: Scene, find_at: Callable[[Scene, Found], Found], begin: Found, tolerance: float, find: Find
 ) -> Found:
     """The equilibrium in which no sliding clip pulls along the rod, with its arclengths in its state.

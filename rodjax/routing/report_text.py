@@ -9,7 +9,7 @@ import numpy as np
 from rodjax.analysis.reactions import Reaction
 from rodjax.checks import line
 from rodjax.model.summaries import part_text, scene_text
-from rodjax.routing.findings import Cable, Fact, Gradients
+from rodjax.routing.cable_report import Cable, Fact, Gradients
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 from rodjax.version import __version__

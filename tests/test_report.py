@@ -179,7 +179,7 @@ def test_verdicts(report):
 
 
 def test_what_did_not_converge_or_is_not_stable_is_told(report, equilibrium, monkeypatch):
-    monkeypatch.setattr(words, "is_unstable", lambda found: True)
+    monkeypatch.setattr(report_text, "is_unstable", lambda found: True)
     assert with_margins(report, [0.5]).verdict.endswith("; but the equilibrium is NOT stable")
     lost = eqx.tree_at(lambda found: found.converged, equilibrium, jnp.array(False))
     told = rj.report(lost, limits=LIMITS, obstacles=OBSTACLES, names=NAMES)

@@ -19,7 +19,7 @@ from rodjax.routing.files import read_route_file
 from rodjax.routing.report import FILES
 from rodjax.routing.route import Starts
 from rodjax.routing.variables import Between, OnLine, OnPatch, Turned
-from rodjax.solving.equilibrium import solve
+from rodjax.solving.solve import solve
 
 ROUTES = Path(__file__).parents[1] / "experiments" / "routes"
 

@@ -458,7 +458,7 @@ def test_files_keep_no_code(touching, tmp_path):
     distance = rj.Distance(lambda point: point[2])
     scene = Scene(cable(), Clamp((0, 0, 0), LEVEL), Free(), GRAVITY, obstacles=[rj.Union(distance)])
     with pytest.raises(ValueError, match=r"scene\.obstacles\[0\]\.obstacles\[0\] is a Distance: code of one's own"):
-        rj.save(rj.solve(scene, segments=4), tmp_path / "x.vtkhdf")
+        rj.save(rj.solve(scene, segments=8), tmp_path / "x.vtkhdf")
 
 
 # --- rods by frames --------------------------------------------------------------------------------------------------
@@ -481,7 +481,8 @@ def test_a_flat_cable_lies_as_a_plain_one(tmp_path):
     np.testing.assert_allclose(by_frames.nodes, plain.nodes, rtol=0, atol=1e-5)
     # Of 0.5 N there, which the last contact points share so; farther on the floor as much of their ripple.
     np.testing.assert_allclose(by_frames.contact_forces, plain.contact_forces, rtol=0, atol=2e-3)
-    np.testing.assert_allclose(by_frames.contact_forces.sum(0), plain.contact_forces.sum(0), rtol=0, atol=1e-9)
+    # All of them together by what the height of the end, 1e-5 of it apart, does to the force there.
+    np.testing.assert_allclose(by_frames.contact_forces.sum(0), plain.contact_forces.sum(0), rtol=0, atol=1e-7)
     assert by_frames.iterations <= plain.iterations + 1
     np.testing.assert_allclose(by_frames.error_estimate, plain.error_estimate, rtol=0, atol=1e-3)
 

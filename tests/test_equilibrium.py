@@ -298,7 +298,10 @@ def test_float32_works_and_says_how_far():
     code = """
 import warnings; warnings.simplefilter("error")
 import numpy as np, rodjax as rj
-result = rj.solve(rj.problems.hanging_cable(), segments=20, discretization="finite_difference")
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always", rj.PrecisionWarning)
+    result = rj.solve(rj.problems.hanging_cable(), segments=20, discretization="finite_difference")
+assert [warning.category for warning in caught] == [rj.PrecisionWarning], caught
 assert result.nodes.dtype == np.float32 and result.converged, rj.describe(result)
 print(float(result.nodes[10, 2]))
 """

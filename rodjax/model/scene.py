@@ -46,7 +46,8 @@ class Scene(eqx.Module):
     - `distributed`: `DistributedForce`s and `DistributedCouple`s all along the rod, or along a part of it.
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
-        it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding. Of a mesh
+        it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding, and without
+        friction in the middle of elements, where contact gives way by 1e-3 of an element's compliance. Of a mesh
         that is chosen for a tolerance elements lie no deeper than 1e-4 of the radius between their nodes either, as far
         as finer ones help. Bent over an edge, or on a mesh that is given, the rod may lie deeper there:
         `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod that came through an obstacle since its

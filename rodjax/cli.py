@@ -320,7 +320,14 @@ def _solve_harness(arguments: argparse.Namespace) -> int:
         warnings.simplefilter("ignore", MeshWarning)
         warnings.simplefilter("always", OverstretchedWarning)
         result = rodjax.solve(file.harness, **file.settings)
-    print("\n".join([f"{arguments.scene}: {len(result)} cables, {len(result.joints)} joints", *_cables(result)]))
+    print(
+        "\n".join(
+            [
+                f"{arguments.scene}: {_counted(len(result), 'cable')}, {_counted(len(result.joints), 'joint')}",
+                *_cables(result),
+            ]
+        )
+    )
     if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
         from rodjax.plot import plot_harness
 
@@ -331,6 +338,10 @@ def _solve_harness(arguments: argparse.Namespace) -> int:
         return 0
     print(f"rodjax: {arguments.scene}: {rodjax.describe(result).splitlines()[0]}", file=sys.stderr)
     return 3
+
+
+def _counted(count: int, name: str) -> str:
+    return f"{count} {name}" if count == 1 else f"{count} {name}s"
 
 
 def _cables(result: rodjax.HarnessEquilibrium) -> list[str]:

@@ -109,7 +109,7 @@ def test_the_command_solves_and_draws_a_harness(written, tmp_path, capsys):
     picture = tmp_path / "harness.png"
     assert cli.main(["solve", str(written(BRANCHES)), "--plot", str(picture)]) == 0
     told = capsys.readouterr().out
-    assert "3 cables, 1 joints" in told
+    assert "3 cables, 1 joint\n" in told
     assert "trunk: converged" in told
     assert picture.stat().st_size > 10_000
     assert cli.main(["solve", str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf")]) == 2

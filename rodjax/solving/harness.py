@@ -36,7 +36,7 @@ from rodjax.solving.equilibrium import (
 from rodjax.solving.first_poses import first_poses
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.implicit import differentiable, not_differentiated
+from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
 from rodjax.solving.newton import Newton
 from rodjax.solving.refinement import SAFETY, SIZES, error_by_rtol, next_size
 from rodjax.solving.result import (
@@ -421,13 +421,7 @@ def _differentiable(harness: Harness, result: HarnessEquilibrium) -> HarnessEqui
 @_differentiable.def_jvp
 def _(primals, tangents):
     harness, result = primals
-    change, _ = tangents
-    change = jax.tree.map(
-        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
-        change,
-        harness,
-        is_leaf=lambda change: change is None,
-    )
+    change = with_zeros(tangents[0], harness)
     value = _differentiable(harness, result)
     return value, _change_of_result(*jax.lax.optimization_barrier((harness, value)), change)
 

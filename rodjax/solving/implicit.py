@@ -36,6 +36,16 @@ def differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
     return result if is_known(scene) else _differentiable(scene, result)
 
 
+def with_zeros(change: Any, value: Any) -> Any:
+    """The tangent of a value, zero where `filter_custom_jvp` has `None` for a number that does not change."""
+    return jax.tree.map(
+        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
+        change,
+        value,
+        is_leaf=lambda change: change is None,
+    )
+
+
 @eqx.filter_custom_jvp
 def _differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
     return result
@@ -44,13 +54,7 @@ def _differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
 @_differentiable.def_jvp
 def _(primals, tangents):
     scene, result = primals
-    scene_change, _ = tangents
-    scene_change = jax.tree.map(
-        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
-        scene_change,
-        scene,
-        is_leaf=lambda change: change is None,
-    )
+    scene_change = with_zeros(tangents[0], scene)
     # With derivatives of its own, for second ones of what is made of it.
     value = _differentiable(scene, result)
     # It stays what the search found, whatever XLA makes of the same numbers beside the derivatives.

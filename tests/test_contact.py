@@ -117,13 +117,16 @@ def test_floor_and_supports_carry_the_weight(lying):
     assert float(jnp.sum(lying.contact_forces[middle, 2])) == pytest.approx(weight, rel=1e-3)
 
 
-def test_the_estimate_knows_how_coarse_contacts_are():
-    """On 32 elements, where the lift-off lies between two contact points; on 64 it hits one, and the error is 1e-7."""
-    _, end = heavy_elastica(0.3)
-    result = solved(lifted(0.3), segments=32)
-    error = abs(float(result.nodes[-1, 2]) - RADIUS - end[2])
-    estimate = float(result.error_estimate)
-    assert error < estimate < 10 * error
+def test_the_estimate_knows_how_coarse_contacts_are(lying):
+    """Lift-offs at several places between two contact points: at one of them the error all but vanishes."""
+    errors, estimates = [], []
+    for force in (0.3, 0.28, 0.26):
+        result = rj.solve(lifted(force), segments=64, guess=lying)
+        _, end = heavy_elastica(force)
+        errors.append(abs(float(result.nodes[-1, 2]) - RADIUS - end[2]))
+        estimates.append(float(result.error_estimate))
+    np.testing.assert_array_less(errors, estimates)
+    assert max(estimates) < 10 * max(errors)
 
 
 def test_meshes_are_chosen_with_contacts():
@@ -146,9 +149,7 @@ def test_meshes_are_chosen_over_a_pipe():
     scene = Scene(Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=RADIUS), *ends, (0, 0, -1.0), obstacles=[pipe])
     result = rj.solve(scene, guess=rj.Guess(above))
     assert result.converged
-    # 3.6e-5 on 192 elements. With the roundings of programs that are not optimized the search there ends without an
-    # equilibrium, and that on 128 is told.
-    assert deepest(result) < 1.5 * DEEPEST
+    assert deepest(result) < DEEPEST
     assert float(result.contact_forces[:, 2].sum()) > 100.0
 
 
@@ -188,14 +189,12 @@ def test_the_first_mesh_beside_obstacles_is_finer():
 
 @pytest.mark.slow
 def test_a_rod_that_begins_across_a_box_and_stays_there_is_told():
-    """The library's first shape of so much slack crosses the box, and contacts push on it from both sides: no search
-    ends in an equilibrium, and none is sought up to the finest mesh.
+    """The library's first shape of so much slack crosses the box, and contacts push on it from both sides: where a
+    search ends so, it is not converged, and not sought up to the finest mesh.
     """
     box = rj.Box((0.4, 0, -0.25), (0.1, 1, 0.6))
     scene = Scene(cable(1.2), Clamp((0, 0, 0.1), LEVEL), Clamp((0.8, 0, 0.1), LEVEL), GRAVITY, obstacles=[box])
-    with pytest.warns(
-        rj.NotConvergedWarning, match=r"not converged: (stopped at|.*within obstacles\[0\] \(Box\) at s = )"
-    ):
+    with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = "):
         result = rj.solve(scene)
     assert not result.converged
     assert len(result.s) - 1 < 512
@@ -462,7 +461,7 @@ def test_files_keep_no_code(touching, tmp_path):
     distance = rj.Distance(lambda point: point[2])
     scene = Scene(cable(), Clamp((0, 0, 0), LEVEL), Free(), GRAVITY, obstacles=[rj.Union(distance)])
     with pytest.raises(ValueError, match=r"scene\.obstacles\[0\]\.obstacles\[0\] is a Distance: code of one's own"):
-        rj.save(rj.solve(scene, segments=8), tmp_path / "x.vtkhdf")
+        rj.save(rj.solve(scene, segments=4), tmp_path / "x.vtkhdf")
 
 
 # --- rods by frames --------------------------------------------------------------------------------------------------
@@ -481,12 +480,9 @@ def test_a_flat_cable_lies_as_a_plain_one(tmp_path):
 
     plain = rj.solve(scene(cable()), segments=32)
     by_frames = solved(scene(flat(EI, 3 * EI)), segments=32)
-    # Two discretizations: at the lift-off, which lies between two contact points, both are 9e-5 off.
-    np.testing.assert_allclose(by_frames.nodes, plain.nodes, rtol=0, atol=1e-5)
-    # Of 0.5 N there, which the last contact points share so; farther on the floor as much of their ripple.
-    np.testing.assert_allclose(by_frames.contact_forces, plain.contact_forces, rtol=0, atol=2e-3)
-    # All of them together by what the height of the end, 1e-5 of it apart, does to the force there.
-    np.testing.assert_allclose(by_frames.contact_forces.sum(0), plain.contact_forces.sum(0), rtol=0, atol=1e-7)
+    # Two discretizations of fourth order; a contact that is off by 1e-6 N bends the rod by 1e-6/(3 EI).
+    np.testing.assert_allclose(by_frames.nodes, plain.nodes, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(by_frames.contact_forces, plain.contact_forces, rtol=0, atol=1e-4)
     assert by_frames.iterations <= plain.iterations + 1
     np.testing.assert_allclose(by_frames.error_estimate, plain.error_estimate, rtol=0, atol=1e-3)
 
@@ -502,10 +498,8 @@ def test_a_flat_cable_lies_as_a_plain_one(tmp_path):
         for stiffness in (EI + step, EI - step)
     )
     np.testing.assert_allclose(in_plane, (there - back) / (2 * step), rtol=1e-6)  # seen: 1e-9
-    # The heights themselves are 5e-5 of each other apart.
-    np.testing.assert_allclose(in_plane, of_plain, rtol=5e-4)
-    # Contact points within elements give way by 1e-3 of an element's compliance, in units of the mean stiffness.
-    assert abs(across) < 3e-5 * abs(of_plain)
+    np.testing.assert_allclose(in_plane, of_plain, rtol=1e-5)
+    assert abs(across) < 1e-5 * abs(of_plain)
 
     path = tmp_path / "flat.vtkhdf"
     rj.save(by_frames, path)
@@ -518,12 +512,13 @@ def test_derivatives_of_a_curved_cable_in_a_clip_on_a_floor():
     """A clip that holds the frame, a rod curved out of the plane of gravity: nothing is symmetric."""
     frame_of_clip = frame((1.0, 0.1, 0.0))
 
-    def seen(p):
+    def seen(p, tolerance=1e-8):
         rod = flat(EI, 2 * EI, rest_curvature=(0.8, 0.5 * p[0]))
         floor = rj.Plane((0, 0, -0.06 + 0.1 * p[1]), (0, 0.1, 1))
         ends = Clamp((0, 0, 0), LEVEL), Free(force=(0, 0.02, 0))
         clips = [Clip(0.3, (0.29, 0.0, 0.02 + 0.1 * p[2]), frame=frame_of_clip)]
-        result = rj.solve(Scene(rod, *ends, GRAVITY, clips=clips, obstacles=[floor]), segments=32, guess=guess)
+        scene, solver = Scene(rod, *ends, GRAVITY, clips=clips, obstacles=[floor]), rj.Newton(tolerance=tolerance)
+        result = rj.solve(scene, segments=32, guess=guess, solver=solver)
         contacts = jnp.sum(result.contact_forces, axis=0)
         return jnp.concatenate([contacts, result.clip_moments[0], result.nodes[-1], result.energy[None]]), result
 
@@ -533,12 +528,13 @@ def test_derivatives_of_a_curved_cable_in_a_clip_on_a_floor():
     assert guess.converged
     assert values[2] > 0.2  # N: it lies on the floor
     forward = np.asarray(jax.jacfwd(lambda p: seen(p)[0])(nominal))
-    step = 1e-5
-    differences = np.stack(
-        [(seen(nominal.at[k].add(step))[0] - seen(nominal.at[k].add(-step))[0]) / (2 * step) for k in range(3)], axis=1
+    step, tight = 1e-5, 1e-11
+    there, back = (
+        np.stack([seen(nominal.at[k].add(change), tight)[0] for k in range(3)], axis=1) for change in (step, -step)
     )
-    # Of the residual of 1e-8 EI/L^2 over 1e-5, and the square of the step where contacts are stiff.
-    np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-5 * np.max(np.abs(differences)))
+    differences = (there - back) / (2 * step)
+    # Of the residual of 1e-11 EI/L^2 over 1e-5.
+    np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-6 * np.max(np.abs(differences)))
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------

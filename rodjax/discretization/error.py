@@ -12,7 +12,6 @@ Newton's method.
 The same solution changes forces, moments and curvatures: so much are these off.
 """
 
-import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ from rodjax.discretization.results import clip_moments, resultants, with_fields_
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
 from rodjax.linalg.blocks import partial_sums, short_sum
-from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor_and_solve
 from rodjax.mechanics.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.mechanics.strain import swept_angle
@@ -45,9 +43,6 @@ COUPLE_REACH = 12.0
 # vanishes no part can be told. Of curvatures [1/L] as of moments.
 LEAST_FORCE = 1.0
 LEAST_MOMENT = 0.1
-# Contacts within elements count as so much softer, about as soft as an element: how much of a force they bear, and how
-# much the nodes beside them, is no error of the rod.
-SOFTENED = 1e3
 # A correction of less stiffness [EI/L^2 per rad and length] than this may be mostly a turn that nothing resists; the
 # softest motion of a clamped rod has pi^2.
 SOFT = 1.0
@@ -138,10 +133,7 @@ def correction(
     turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
     turn the rod far. The turn about the given axis, zero for none, is taken out.
     """
-    system = here.system
-    if isinstance(system, ChainSystem):
-        system = dataclasses.replace(system, contacts=system.contacts.softened(SOFTENED))
-    motion = Motion(*factor_and_solve(form.regular(system), -gradient, -closure)[1:])
+    motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
     if not form.has_potential:
         return motion, jnp.array(False)
     places = motion.rotation.shape[1]

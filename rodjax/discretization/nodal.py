@@ -52,9 +52,12 @@ from rodjax.model.supports import Held
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
 SOFTNESS = 1e-5
-# Of a contact in the middle of an element, as a part of h^3/EI: it gives way by so much times its pressure, which both
-# nodes beside it would bear else. Harder ones leave all but undetermined who of the three does where the rod lies on.
-INNER_SOFTNESS = 1e-3
+# And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
+# one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
+LEAST_SOFTNESS = 5e4
+# In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
+# would say the same, and who bears it would be undetermined: so nodes do.
+THINNER = 1e-5
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
 # A rod less deep within an obstacle than this [L] is led out in one step.
@@ -70,12 +73,14 @@ THIN = 0.5
 LOOKED_AT = tuple(k / 8 for k in range(1, 8))
 LEAST_WAY = 0.05
 MOST_LOOKS = 24
+# Where it is looked whether a rod has come through: beside nodes and middles of most meshes, by this part of a step.
+BESIDE = 0.3
 # What a contact does.
 OPEN, STICKS, SLIPS = 0, 1, 2
 # A node lies on an obstacle where its gap is below this [L].
 LIES_ON = 1e-9
-# A start touches where its gap is below this part of the radius.
-TOUCHES = 1e-3
+# A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
+TOUCHES = 1e-2
 
 
 class InnerStiffness(NamedTuple):
@@ -330,19 +335,8 @@ class NodalForm(Form):
     def softness(self) -> Float[Array, ""]:
         """Of the contacts in the model of a step [L^3/EI]."""
         h = jnp.diff(self.field.s)
-        return SOFTNESS * h[jnp.argmin(h)] ** 3
-
-    @property
-    def inner_softness(self) -> Float[Array, "n"]:
-        """Of the contacts within elements [L^3/EI]."""
-        return INNER_SOFTNESS * jnp.diff(self.field.s) ** 3
-
-    def with_cushions(self, gaps: Float[Array, "r n+1"], pressures: Float[Array, "r n+1"]) -> Float[Array, "r n+1"]:
-        """The gaps less what contacts within elements give way by."""
-        if not self.smooth:
-            return gaps
-        inner = slice(len(self.scene.obstacles), None)
-        return gaps.at[inner, :-1].add(self.inner_softness[None] * pressures[inner, :-1])
+        softness = SOFTNESS * h[jnp.argmin(h)] ** 3
+        return jnp.maximum(softness, LEAST_SOFTNESS * jnp.finfo(h.dtype).eps) if self.smooth else softness
 
     def distances_and_normals(
         self, places: Float[Array, "n+1 3"]
@@ -372,7 +366,8 @@ class NodalForm(Form):
             return middles, jnp.zeros((0, len(s)), s.dtype), jnp.zeros((0, len(s) - 1, 3), s.dtype)
         distances, normals = self.distances_and_normals(middles.points)
         smooth = np.array(self.smooth)
-        gaps = distances[smooth] - self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[None, :, 0]
+        radius = (1 - THINNER) * self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+        gaps = distances[smooth] - radius[None]
         return middles, jnp.pad(gaps, ((0, 0), (0, 1)), constant_values=1.0), normals[smooth]
 
     @property
@@ -422,7 +417,7 @@ class NodalForm(Form):
         middles, gaps, normals = self.within_elements(point)
         rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
         b = rates.shape[1] - 3
-        rows = InnerRows(rates[:, :b], rates[:, b:], self.inner_softness, first=len(self.scene.obstacles))
+        rows = InnerRows(rates[:, :b], rates[:, b:], first=len(self.scene.obstacles))
         curved = self._curving(middles.points, pressures, self.smooth)
         by_moves = middles.rates.reshape(3, 2 * (b + 3), -1)
         blocks = jnp.einsum("cin,ncd,djn->ijn", by_moves, curved, by_moves)
@@ -451,7 +446,7 @@ class NodalForm(Form):
     def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
         """The contacts of the model of a step from a point, to gaps and ways."""
         nodal = point.nodal
-        gaps = self.with_cushions(gaps + nodal.relaxed[:, None], nodal.pressures)
+        gaps = gaps + nodal.relaxed[:, None]
         if nodal.friction is None or ways is None:
             return Unilateral(gaps, nodal.pressures)
         _, normals = self.gaps_and_normals(nodal.places)
@@ -481,7 +476,7 @@ class NodalForm(Form):
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
         """The closure of contacts and nodes, and what is out of balance there."""
-        nodal, gaps = point.nodal, self.with_cushions(contacts.gaps, point.nodal.pressures)
+        nodal, gaps = point.nodal, contacts.gaps
         pressures, forces = nodal.pressures, nodal.contact_forces
         balance = self.applied(point).T - contacts.rows.pushed(forces)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
@@ -586,8 +581,8 @@ class NodalForm(Form):
         """L with the contacts as of the model, with the pressures of a point."""
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        softness, model = here.system.contacts.softnesses, self.model(point, here.gaps, here.ways)
-        return here.energy + model.energy(model.pressures - model.gaps / softness, softness) / 2
+        softness, model = here.system.contacts.softness, self.model(point, here.gaps, here.ways)
+        return here.energy + softness * model.energy(model.pressures - model.gaps / softness) / 2
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -615,7 +610,7 @@ class NodalForm(Form):
         else:
             k = len(here.gaps)
             # What slips, and by how much, is a matter of the model.
-            trial = contacts.pressures - contacts.gaps / system.contacts.softnesses
+            trial = contacts.pressures - contacts.gaps / system.contacts.softness
             sticks = contacts.is_closed(trial)[k:]
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
@@ -652,7 +647,7 @@ class NodalForm(Form):
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         model = self.model(point, here.gaps, here.ways)
-        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.softnesses)
+        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.softness)
         rows = here.system.contacts
         rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
         if rows.inner is not None:
@@ -727,11 +722,12 @@ class NodalForm(Form):
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
 
     def places(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
-        """At equal steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
+        """At steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
         beside a held node this, elsewhere not a number.
         """
         s = self.field.s
         x = jnp.linspace(0.0, 1.0, PLACES, dtype=s.dtype)
+        x = x.at[1:-1].add(BESIDE * x[1])
         points = cubic(s, nodes, self.node_slopes(point), x)
         cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
         radius = value_at(self._radius, x, s[cell], s[cell + 1])

@@ -34,12 +34,11 @@ class InnerRows(eqx.Module):
     """The gradients of q gaps within each element, by the rotations (M) and the places (K) of its first and last node.
 
     `first`: the number of the first of q rows among those of all contacts; a row has the elements in turn, and a last
-    number that stands for nothing. `softness`: of the contact itself, not of a model of it.
+    number that stands for nothing.
     """
 
     by_rotation: Float[Array, "q b 2 n"]
     by_place: Float[Array, "q 3 2 n"]
-    softness: Float[Array, "n"]
     first: int = eqx.field(static=True)
 
     @property
@@ -98,25 +97,9 @@ class ContactRows(eqx.Module):
         """Moments on the rod with those of pressures."""
         return moments if self.inner is None else moments + self.inner.turned(pressures[self.inner.rows])
 
-    @property
-    def softnesses(self) -> Float[Array, "#k #n+1"]:
-        """Of all rows: of those within elements at least their own."""
-        if self.inner is None:
-            return self.softness[None, None]
-        own = jnp.pad(self.inner.softness, (0, 1), constant_values=1.0)
-        softness = jnp.broadcast_to(self.softness, self.is_closed.shape)
-        return softness.at[self.inner.rows].set(jnp.maximum(self.softness, own)[None])
-
-    def softened(self, factor: float) -> "ContactRows":
-        """With contacts within elements softer by a factor."""
-        if self.inner is None:
-            return self
-        inner = dataclasses.replace(self.inner, softness=factor * self.inner.softness)
-        return dataclasses.replace(self, inner=inner)
-
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
         """The system with what closed contacts add to its stiffness."""
-        weights = jnp.where(self.is_closed, 1 / self.softnesses, 0.0)
+        weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
         stiffness = jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
         system = dataclasses.replace(system, stiffness=system.stiffness + stiffness)
         if self.inner is None:
@@ -242,7 +225,7 @@ class ChainSystem(eqx.Module):
             f = f.at[:, 2::2].add(after[:b]).at[:, :-1:2].add(before[:b])
             balance += _on_nodes(before[b:].T, after[b:].T)
         balance = jnp.where(self.held[:, None], u, balance)
-        gaps = -jnp.where(is_closed, self.contacts.rates(x, moved) + self.contacts.softnesses * pressures, pressures)
+        gaps = -jnp.where(is_closed, self.contacts.rates(x, moved) + self.contacts.softness * pressures, pressures)
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
         return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
 
@@ -334,8 +317,7 @@ class ChainFactors(eqx.Module):
         """With the softness of the contacts."""
         system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
-        softnesses = contacts.softnesses
-        pulling = -jnp.where(contacts.is_closed, given / softnesses, 0.0)
+        pulling = -jnp.where(contacts.is_closed, given / contacts.softness, 0.0)
         nodes += contacts.pushed(pulling)
         f = contacts.turned(pulling, f)
         if system.is_backward:
@@ -350,7 +332,7 @@ class ChainFactors(eqx.Module):
         if system.is_backward:
             x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
         rates = contacts.rates(x, displacements)
-        pressures = jnp.where(contacts.is_closed, -(given + rates) / softnesses, -given)
+        pressures = jnp.where(contacts.is_closed, -(given + rates) / contacts.softness, -given)
         parts = (multipliers, pressures, displacements, forces)
         return x, jnp.concatenate([part.reshape(-1) for part in parts])
 

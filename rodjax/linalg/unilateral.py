@@ -20,8 +20,6 @@ of the energy softness |q|^2/2, and beyond the bound one that is linear in |q0 -
 A contact that sticks is three closed rows, P; what one that slips does as it turns is in the stiffness of its node.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -67,30 +65,25 @@ class Unilateral(eqx.Module):
         sticks = _lengths(tangential) < self.bounds
         return self._joined(normal > 0, jnp.broadcast_to(sticks[:, None], tangential.shape))
 
-    def energy(self, trial: Float[Array, "r n+1"], softness: Float[Array, "#r #n+1"]) -> Float[Array, ""]:
-        """Twice that of the contacts."""
+    def energy(self, trial: Float[Array, "r n+1"]) -> Float[Array, ""]:
+        """Twice that of the contacts, over their softness."""
         if self.bounds is None:
-            return jnp.sum(softness * jnp.where(trial > 0, trial, 0.0) ** 2)
+            return jnp.sum(jnp.where(trial > 0, trial, 0.0) ** 2)
         normal, tangential = self._parted(trial)
         lengths, bounds = _lengths(tangential), self.bounds
         of_friction = jnp.where(lengths < bounds, lengths**2, bounds * (2 * lengths - bounds))
-        of_pressures, of_slips = self._softnesses(softness)
-        return jnp.sum(of_pressures * jnp.where(normal > 0, normal, 0.0) ** 2) + of_slips * jnp.sum(of_friction)
+        return jnp.sum(jnp.where(normal > 0, normal, 0.0) ** 2) + jnp.sum(of_friction)
 
-    def growth(
-        self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], softness: Float[Array, "#r #n+1"]
-    ) -> Float[Array, ""]:
+    def growth(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"]) -> Float[Array, ""]:
         """The second derivative of half of that along -falls."""
         if self.bounds is None:
-            return jnp.sum(softness * jnp.where(trial > 0, falls, 0.0) * falls)
+            return jnp.sum(jnp.where(trial > 0, falls, 0.0) * falls)
         normal, tangential = self._parted(trial)
         of_normal, of_tangential = self._parted(falls)
         directions, parts = self._slipping(tangential)
         along = jnp.sum(directions * of_tangential, axis=1)
         of_friction = parts * (jnp.sum(of_tangential**2, axis=1) - along**2)
-        of_pressures, of_slips = self._softnesses(softness)
-        of_normal *= of_pressures * jnp.where(normal > 0, of_normal, 0.0)
-        return jnp.sum(of_normal) + of_slips * jnp.sum(of_friction)
+        return jnp.sum(jnp.where(normal > 0, of_normal, 0.0) * of_normal) + jnp.sum(of_friction)
 
     def slipping(
         self, trial: Float[Array, "r n+1"], contacts: ContactRows, softness: Float[Array, ""]
@@ -116,11 +109,6 @@ class Unilateral(eqx.Module):
         (here, _), (there, _) = (self._slipping(self._parted(each)[1]) for each in (trial, other))
         turned = jnp.max(jnp.abs(here - there), axis=1)
         return jnp.any(self.bounds * turned > SAME_DIRECTION * jnp.max(self.bounds))
-
-    def _softnesses(self, softness: Float[Array, "#r #n+1"]) -> tuple[Float[Array, "#k #n+1"], Float[Array, ""]]:
-        """Of pressures, and of all slips."""
-        assert self.bounds is not None
-        return softness[: len(self.gaps) - 3 * len(self.bounds)], softness[-1, 0]
 
     def _parted(self, rows: Array) -> tuple[Array, Array]:
         """Of pressures (k, n+1), and of tangential forces (f, 3, n+1)."""
@@ -205,9 +193,6 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         turned = here.contacts.turned(pressures, f)
         return factors.is_minimum, *factors.solve_softly(turned, jnp.concatenate(right))
 
-    def softnesses(softness: Float[Array, ""]) -> Float[Array, "#r #n+1"]:
-        return dataclasses.replace(system.contacts, softness=softness).softnesses
-
     def opening(x: Float[Array, "b m"], y: Float[Array, "j"]) -> Float[Array, "r n+1"]:
         """By how much the gaps grow."""
         return open_system.contacts.rates(x, open_system.parted(y)[2])
@@ -230,14 +215,13 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
         slope = (work(state.x, state.y, ahead) + work(dx, dy, here)) / 2 - jnp.sum(f * dx) - jnp.sum(of_nodes * du)
         curvature = work(dx, dy, ahead)
         before, rate = contacts.gaps + opening(state.x, state.y), opening(dx, dy)
-        soft = softnesses(softness)
-        pressures, falls = contacts.pressures - before / soft, rate / soft
+        pressures, falls = contacts.pressures - before / softness, rate / softness
 
         def rise(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
             """The slope of the model there, and how much that grows."""
             there = pressures - part * falls
-            work = jnp.sum(soft * contacts.allowed(there) * falls)
-            return slope + part * curvature - work, curvature + contacts.growth(there, falls, soft)
+            work = softness * jnp.sum(contacts.allowed(there) * falls)
+            return slope + part * curvature - work, curvature + softness * contacts.growth(there, falls)
 
         def closer(_, bracket: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             low, high, part = bracket
@@ -247,8 +231,8 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
             return low, high, jnp.where((newton > low) & (newton < high), newton, (low + high) / 2)
 
         zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)
-        squares = [contacts.energy(pressures, soft), contacts.energy(pressures - falls, soft)]
-        is_whole = is_early | (slope + curvature / 2 + (squares[1] - squares[0]) / 2 <= 0)
+        squares = [contacts.energy(pressures), contacts.energy(pressures - falls)]
+        is_whole = is_early | (slope + curvature / 2 + softness / 2 * (squares[1] - squares[0]) <= 0)
         part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
         trial = pressures - part * falls
         is_closed = contacts.is_closed(trial)
@@ -270,13 +254,10 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
 
     count = jnp.zeros((), int)
     no = jnp.array(False)
-    trial = contacts.pressures - contacts.gaps / softnesses(final)
+    trial = contacts.pressures - contacts.gaps / final
     begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), trial, system.contacts.is_closed, final, no, no, count, count)
     end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
-    change = (
-        contacts.allowed(contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / softnesses(final))
-        - contacts.pressures
-    )
+    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / final)
     first, _, u, force = open_system.parted(end.y)
-    y = jnp.concatenate([part.reshape(-1) for part in (first, change, u, force)])
+    y = jnp.concatenate([part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force)])
     return ModelMinimum(end.x, y, end.is_minimum & end.is_done, end.count)

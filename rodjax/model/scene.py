@@ -375,6 +375,12 @@ def with_plain_rod(scene: Scene) -> Scene:
     return Scene(plain, scene.start, scene.end, scene.gravity, dead_forces(scene), scene.turns)
 
 
+def with_pins(scene: Scene) -> Scene:
+    """The same scene whose ends may turn where clamps hold them."""
+    ends = [Pin(end.position) if isinstance(end, Clamp) else end for end in (scene.start, scene.end)]
+    return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
+
+
 def dead_forces(scene: Scene) -> list[PointForce]:
     """The point forces that do not follow the rod."""
     return [load for load in scene.point_forces if not load.follower]

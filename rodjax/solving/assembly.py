@@ -31,7 +31,7 @@ from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
 from rodjax.model.scene import held_position, scene_axes
-from rodjax.model.supports import Clamp, rotate
+from rodjax.solving.coupling import Coupling, RodInBodies, linearized_with_ends
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -89,37 +89,6 @@ class Rods(eqx.Module):
         return positions[self.body], frames[self.body]
 
 
-class Rod(NamedTuple):
-    """One of `Rods`, with the poses of the bodies at its ends, `length` the unit of their displacements."""
-
-    form: Form
-    units: Units
-    is_joint: Bool[Array, "2"]
-    frame: Float[Array, "2 3 3"]
-    offset: Float[Array, "2 3"]
-    position_of_body: Float[Array, "2 3"]
-    frame_of_body: Float[Array, "2 3 3"]
-    length: Float[Array, ""]
-
-    def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
-        """The form with its ends at the poses of the bodies, moved."""
-        scene = self.form.scene
-        ends = []
-        for end, support in enumerate((scene.start, scene.end)):
-            if isinstance(support, Clamp):
-                place, frame = self.position_of_body[end], self.frame_of_body[end]
-                if motions is not None:
-                    place += self.length * motions[end, :3]
-                    frame = rotate(frame, motions[end, 3:])
-                place = (place + frame @ self.offset[end] - self.units.origin) / self.units.length
-                place = jnp.where(self.is_joint[end], place, support.position)
-                frame = jnp.where(self.is_joint[end], frame @ self.frame[end], support.frame)
-                support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
-            ends.append(support)
-        scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
-        return eqx.tree_at(lambda form: form.scene, self.form, scene)
-
-
 class RodStep(NamedTuple):
     """Where a rod is, and a step from there."""
 
@@ -129,7 +98,7 @@ class RodStep(NamedTuple):
     force_change: Float[Array, "3 parts"]
 
     def value(
-        self, rod: Rod, motions: Float[Array, "2 6"], part: Float[Array, ""]
+        self, rod: RodInBodies, motions: Float[Array, "2 6"], part: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
         """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans; the
         point there.
@@ -139,38 +108,6 @@ class RodStep(NamedTuple):
         value, closure = form.lagrangian(there)
         scene = form.scene
         return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
-
-
-class Coupling(NamedTuple):
-    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure."""
-
-    first: Float[Array, "12"]
-    second: Float[Array, "12 12"]
-    of_gradient: Float[Array, "b m 12"]
-    of_closure: Float[Array, "k 12"]
-
-
-def coupling(rod: Rod, point: Any, here: Linearization) -> Coupling:
-    layout = rod.form.layout
-
-    def value(rotation: Array, forces: Array, motions: Array) -> Float[Array, ""]:
-        step = RodStep(point, here.bases, rotation, layout.forces(forces))
-        return step.value(rod, motions.reshape(2, 6), jnp.ones((), rotation.dtype))[0]
-
-    def gradients(motions: Float[Array, "12"]) -> tuple[Array, Array, Array]:
-        nothing = jnp.zeros_like(here.gradient), jnp.zeros(layout.size, motions.dtype)
-        return jax.grad(value, argnums=(0, 1, 2))(*nothing, motions)
-
-    nowhere = jnp.zeros(12, here.gradient.dtype)
-
-    def both(motions: Float[Array, "12"]) -> tuple[tuple[Array, Array, Array], Float[Array, "12"]]:
-        found = gradients(motions)
-        return found, found[2]
-
-    (of_gradient, of_closure, second), first = jax.jacfwd(both, has_aux=True)(nowhere)
-    # Before the closures there is a row for the torque, of which nothing is asked.
-    more = len(here.closure) - layout.size
-    return Coupling(first, second, of_gradient, jnp.pad(of_closure, ((more, 0), (0, 0))))
 
 
 class Eliminated(NamedTuple):
@@ -230,11 +167,11 @@ class Assembly(eqx.Module):
     def count(self) -> int:
         return len(self.bodies.position)
 
-    def rods(self, group: Rods, poses: Poses) -> Rod:
+    def rods(self, group: Rods, poses: Poses) -> RodInBodies:
         """Stacked."""
         positions, frames = group.under(poses)
         length = jnp.broadcast_to(self.length, group.units.length.shape)
-        return Rod(
+        return RodInBodies(
             group.form, group.units, group.body < self.count, group.frame, group.offset, positions, frames, length
         )
 
@@ -279,7 +216,7 @@ def find_assembly(assembly: Assembly, points: tuple[Any, ...], poses: Poses, sol
 class _Here(NamedTuple):
     """Of a group of rods at a state."""
 
-    rods: Rod
+    rods: RodInBodies
     points: Any
     linearization: Linearization
     coupling: Coupling
@@ -287,12 +224,12 @@ class _Here(NamedTuple):
     aside: Float[Array, "k b m"]
 
 
-def _linearized(rod: Rod, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
+def _linearized(rod: RodInBodies, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
     form = rod.moved()
     point = form.holding(point)
-    here = form.linearized(point)
+    here, coupled = linearized_with_ends(rod, form, point)
     aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
-    return point, here, coupling(rod, point, here), form.rounding_floor(point), aside
+    return point, here, coupled, form.rounding_floor(point), aside
 
 
 def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:

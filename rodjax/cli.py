@@ -17,7 +17,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rodjax.identification.refits import Profile
+
+Result = TypeVar("Result", Equilibrium, rodjax.HarnessEquilibrium)
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 # Seconds of compiling after which a terminal is told what the wait is.
@@ -277,8 +279,6 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
     note(f"reading {arguments.scene}")
     if is_harness_file(arguments.scene):
-        if arguments.output:
-            raise CommandError("-o is not allowed for a harness, which no file holds yet; --plot draws it")
         return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
@@ -311,9 +311,10 @@ def _solve(arguments: argparse.Namespace) -> int:
 
 
 def _solve_harness(arguments: argparse.Namespace) -> int:
-    for option in ("csv", "dxf"):
-        if getattr(arguments, option):
-            raise SceneFileError(f"{arguments.scene}: --{option} is for one cable: the file has several")
+    if arguments.dxf:
+        raise CommandError(
+            f"--dxf is for one cable: {arguments.scene} has several; rodjax.write_dxf takes each of them"
+        )
     file = read_harness_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", NotConvergedWarning)
@@ -328,10 +329,12 @@ def _solve_harness(arguments: argparse.Namespace) -> int:
             ]
         )
     )
-    if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
-        from rodjax.plot import plot_harness
-
-        _save_figure(plot_harness(result), arguments.plot)
+    if arguments.output:
+        save(result, arguments.output)
+    if arguments.plot:
+        _draw(arguments.plot, result, _plot_harness)
+    if arguments.csv:
+        _draw(arguments.csv, result, write_table)
     for warning in caught:
         print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
@@ -593,6 +596,8 @@ def _last(path: Path) -> Equilibrium:
         result = load(path)
     except ValueError as error:
         raise CommandError(f"--result: {error}") from None
+    if not isinstance(result, Equilibrium):
+        raise CommandError(f"--result: {path} holds a harness, of which this command takes the TOML file alone")
     return jax.tree.map(lambda leaf: leaf[-1], result) if result.s.ndim > 1 else result
 
 
@@ -615,12 +620,19 @@ def _check_folder(path: Path, option: str) -> None:
         raise CommandError(f"{option} must be a folder that can be written, got {str(path)!r}")
 
 
-def _draw(path: Path, equilibrium: Equilibrium, write: Callable[[Equilibrium, Path], None]) -> None:
+def _draw(path: Path, equilibrium: Result, write: Callable[[Result, Path], None]) -> None:
     """Writes a file of a shape, which must be finite."""
-    if not np.all(np.isfinite(equilibrium.nodes)):
+    rods = [equilibrium] if isinstance(equilibrium, Equilibrium) else equilibrium.values()
+    if not all(np.all(np.isfinite(rod.nodes)) for rod in rods):
         print(f"rodjax: {path} is not written: the shape is not finite", file=sys.stderr)
         return
     write(equilibrium, path)
+
+
+def _plot_harness(result: rodjax.HarnessEquilibrium, path: Path) -> None:
+    from rodjax.plot import plot_harness
+
+    _save_figure(plot_harness(result), path)
 
 
 def _plot(equilibrium: Equilibrium, path: Path) -> None:

@@ -29,7 +29,7 @@ from rodjax.cluster import ClusterError, connected
 from rodjax.io.cad import SUFFIX as CAD_SUFFIX
 from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, load, save
-from rodjax.io.harness_file import is_harness_file, read_harness_file
+from rodjax.io.harness_file import HarnessFile, is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
@@ -493,10 +493,14 @@ def _report(arguments: argparse.Namespace) -> int:
 
     _check_folder(arguments.out, "--out")
     file = read_route_file(arguments.file, with_scene=arguments.result is None)
-    if arguments.result is None:
-        cables = {name: _solved(scene) for name, scene in file.cables.items()}
+    scenes = file.cables.values() if file.harness is None else [file.harness]
+    if arguments.result is not None:
+        result = _last(arguments.result)
+        cables = {"cable": result} if isinstance(result, Equilibrium) else dict(result.items())
+    elif file.harness is None:
+        cables = {name: _solved(scene.scenes[0], scene.settings) for name, scene in file.cables.items()}
     else:
-        cables = {"cable": _last(arguments.result)}
+        cables = dict(_solved(file.harness.harness, file.harness.settings).items())
     try:
         report = rodjax.report(
             cables,
@@ -504,9 +508,7 @@ def _report(arguments: argparse.Namespace) -> int:
             obstacles=file.obstacles,
             names=file.names,
             title=file.title or str(arguments.file),
-            source=_source(arguments.file, *file.cables.values())
-            if arguments.result is None
-            else str(arguments.result),
+            source=_source(arguments.file, *scenes) if arguments.result is None else str(arguments.result),
         )
     except ValueError as error:
         if all(np.all(cable.converged) for cable in cables.values()):
@@ -573,7 +575,7 @@ def _route(arguments: argparse.Namespace) -> int:
     return 3
 
 
-def _source(path: Path, *scenes: SceneFile) -> str:
+def _source(path: Path, *scenes: SceneFile | HarnessFile) -> str:
     """What a report is made of, and how exactly."""
     meshes = [
         f"rtol = {scene.rtol or DEFAULT_RTOL:g}" if scene.segments is None else f"{scene.segments} segments"
@@ -582,23 +584,21 @@ def _source(path: Path, *scenes: SceneFile) -> str:
     return ", ".join([str(path), *dict.fromkeys(meshes)])
 
 
-def _solved(file: SceneFile) -> Equilibrium:
+def _solved(scene: Any, settings: dict[str, Any]) -> Any:
     with warnings.catch_warnings():
         # Said in the report.
         warnings.simplefilter("ignore", NotConvergedWarning)
         warnings.simplefilter("ignore", OverstretchedWarning)
-        return rodjax.solve(file.scenes[0], **file.settings)
+        return rodjax.solve(scene, **settings)
 
 
-def _last(path: Path) -> Equilibrium:
+def _last(path: Path) -> Equilibrium | rodjax.HarnessEquilibrium:
     """The equilibrium in a file, or the last of a path."""
     try:
         result = load(path)
     except ValueError as error:
         raise CommandError(f"--result: {error}") from None
-    if not isinstance(result, Equilibrium):
-        raise CommandError(f"--result: {path} holds a harness, of which this command takes the TOML file alone")
-    return jax.tree.map(lambda leaf: leaf[-1], result) if result.s.ndim > 1 else result
+    return jax.tree.map(lambda leaf: leaf[-1], result) if result.energy.ndim else result
 
 
 def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:

@@ -127,3 +127,27 @@ def test_the_command_solves_and_draws_a_harness(written, tmp_path, capsys):
     capsys.readouterr()
     assert cli.main(["solve", str(written(BRANCHES)), "--dxf", str(tmp_path / "out.dxf")]) == 2
     assert "--dxf is for one cable" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_reports_on_a_harness(written, tmp_path, capsys):
+    """In the file of a harness itself, or by its name, and of a saved result: the same table of all cables."""
+    limits = '[limits]\nend_force = "100 N"\n'
+    (tmp_path / "apart.toml").write_text('scene = "harness.toml"\n' + limits)
+    assert cli.main(["solve", str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf")]) == 0
+    (tmp_path / "both.toml").write_text(BRANCHES + limits)
+    (tmp_path / "limits.toml").write_text(limits)
+    capsys.readouterr()
+    told = []
+    for arguments in (["both.toml"], ["apart.toml"], ["limits.toml", "--result", str(tmp_path / "out.vtkhdf")]):
+        folder = tmp_path / "report"
+        assert cli.main(["report", str(tmp_path / arguments[0]), *arguments[1:], "--out", str(folder)]) == 0
+        assert (folder / "report.png").stat().st_size > 10_000
+        told.append((folder / "report.csv").read_text())
+    for name in ("trunk", "left", "right"):
+        assert f"\n{name}," in told[0]
+    assert told[1] == told[0]
+    assert told[2] == told[0]
+    capsys.readouterr()
+    assert cli.main(["route", str(tmp_path / "both.toml"), "--out", str(tmp_path / "route")]) == 2
+    assert "a harness is not allowed where a route is sought" in capsys.readouterr().err

@@ -121,6 +121,15 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
     set_up()
     arguments.out.mkdir(parents=True, exist_ok=True)
     print(conditions())
+    folder = kept.folder()
+    rj.keep_programs(False)  # first answers are to be compiled, while nothing else is
+    rows = timed(arguments.cables, arguments.repeats) if arguments.cables else []
+    rj.keep_programs(folder or False)
+    for row in rows:
+        print(
+            f"{row.cables:3} cables: first {row.first_cpu_s:5.1f} s of processor time ({row.first_ratio:.1f} x one), "
+            f"then {row.warm_ms:.2f} ms ({row.warm_ratio:.1f} x one), {row.iterations} iterations"
+        )
     with rj.numpy_first(True):
         result = rj.solve(branching(), rtol=arguments.rtol)
     print(rj.describe(result))
@@ -131,15 +140,6 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
             f"{name:7} {rod.s.shape[-1] - 1:4} elements, {force:.3f} N, {moment:.4f} N m at its end, bend {bend:.3f} m"
         )
     plot_harness(result).savefig(arguments.out / "harness.png", dpi=150)
-    folder = kept.folder()
-    rj.keep_programs(False)  # first answers are to be compiled
-    rows = timed(arguments.cables, arguments.repeats) if arguments.cables else []
-    rj.keep_programs(folder or False)
-    for row in rows:
-        print(
-            f"{row.cables:3} cables: first {row.first_cpu_s:5.1f} s of processor time ({row.first_ratio:.1f} x one), "
-            f"then {row.warm_ms:.2f} ms ({row.warm_ratio:.1f} x one), {row.iterations} iterations"
-        )
     save_rows(rows, arguments.out / "harness.csv")
     return result, rows
 

@@ -165,7 +165,10 @@ def instance(value: Any, name: str, kinds: type | Sequence[type]) -> None:
     if not isinstance(value, kinds):
         allowed = " or ".join(kind.__name__ for kind in kinds)
         article = "an" if allowed[0] in "AEIOU" else "a"
-        raise TypeError(f"{name} must be {article} {allowed}, got {shown(value)}")
+        # Of what stands for several: how to take one of them.
+        instead = getattr(type(value), "instead", None)
+        given = shown(value) if instead is None else f"a {type(value).__name__}: {instead}"
+        raise TypeError(f"{name} must be {article} {allowed}, got {given}")
 
 
 def sequence(value: Any, name: str, kind: str) -> tuple[Any, ...]:

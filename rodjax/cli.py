@@ -17,7 +17,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
@@ -29,7 +29,7 @@ from rodjax.cluster import ClusterError, connected
 from rodjax.io.cad import SUFFIX as CAD_SUFFIX
 from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, load, save
-from rodjax.io.harness_file import is_harness_file, read_harness_file
+from rodjax.io.harness_file import HarnessFile, is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rodjax.identification.refits import Profile
+
+Result = TypeVar("Result", Equilibrium, rodjax.HarnessEquilibrium)
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 # Seconds of compiling after which a terminal is told what the wait is.
@@ -277,8 +279,6 @@ def _solve(arguments: argparse.Namespace) -> int:
     _check_output(arguments.dxf, "--dxf", (CAD_SUFFIX,))
     note(f"reading {arguments.scene}")
     if is_harness_file(arguments.scene):
-        if arguments.output:
-            raise CommandError("-o is not allowed for a harness, which no file holds yet; --plot draws it")
         return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
@@ -311,9 +311,10 @@ def _solve(arguments: argparse.Namespace) -> int:
 
 
 def _solve_harness(arguments: argparse.Namespace) -> int:
-    for option in ("csv", "dxf"):
-        if getattr(arguments, option):
-            raise SceneFileError(f"{arguments.scene}: --{option} is for one cable: the file has several")
+    if arguments.dxf:
+        raise CommandError(
+            f"--dxf is for one cable: {arguments.scene} has several; rodjax.write_dxf takes each of them"
+        )
     file = read_harness_file(arguments.scene)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", NotConvergedWarning)
@@ -328,10 +329,12 @@ def _solve_harness(arguments: argparse.Namespace) -> int:
             ]
         )
     )
-    if arguments.plot and np.all([np.all(np.isfinite(rod.nodes)) for rod in result.values()]):
-        from rodjax.plot import plot_harness
-
-        _save_figure(plot_harness(result), arguments.plot)
+    if arguments.output:
+        save(result, arguments.output)
+    if arguments.plot:
+        _draw(arguments.plot, result, _plot_harness)
+    if arguments.csv:
+        _draw(arguments.csv, result, write_table)
     for warning in caught:
         print(f"rodjax: {arguments.scene}: warning: {warning.message}", file=sys.stderr)
     if np.all(result.converged):
@@ -490,10 +493,14 @@ def _report(arguments: argparse.Namespace) -> int:
 
     _check_folder(arguments.out, "--out")
     file = read_route_file(arguments.file, with_scene=arguments.result is None)
-    if arguments.result is None:
-        cables = {name: _solved(scene) for name, scene in file.cables.items()}
+    scenes = file.cables.values() if file.harness is None else [file.harness]
+    if arguments.result is not None:
+        result = _last(arguments.result)
+        cables = {"cable": result} if isinstance(result, Equilibrium) else dict(result.items())
+    elif file.harness is None:
+        cables = {name: _solved(scene.scenes[0], scene.settings) for name, scene in file.cables.items()}
     else:
-        cables = {"cable": _last(arguments.result)}
+        cables = dict(_solved(file.harness.harness, file.harness.settings).items())
     try:
         report = rodjax.report(
             cables,
@@ -501,9 +508,7 @@ def _report(arguments: argparse.Namespace) -> int:
             obstacles=file.obstacles,
             names=file.names,
             title=file.title or str(arguments.file),
-            source=_source(arguments.file, *file.cables.values())
-            if arguments.result is None
-            else str(arguments.result),
+            source=_source(arguments.file, *scenes) if arguments.result is None else str(arguments.result),
         )
     except ValueError as error:
         if all(np.all(cable.converged) for cable in cables.values()):
@@ -570,7 +575,7 @@ def _route(arguments: argparse.Namespace) -> int:
     return 3
 
 
-def _source(path: Path, *scenes: SceneFile) -> str:
+def _source(path: Path, *scenes: SceneFile | HarnessFile) -> str:
     """What a report is made of, and how exactly."""
     meshes = [
         f"rtol = {scene.rtol or DEFAULT_RTOL:g}" if scene.segments is None else f"{scene.segments} segments"
@@ -579,21 +584,21 @@ def _source(path: Path, *scenes: SceneFile) -> str:
     return ", ".join([str(path), *dict.fromkeys(meshes)])
 
 
-def _solved(file: SceneFile) -> Equilibrium:
+def _solved(scene: Any, settings: dict[str, Any]) -> Any:
     with warnings.catch_warnings():
         # Said in the report.
         warnings.simplefilter("ignore", NotConvergedWarning)
         warnings.simplefilter("ignore", OverstretchedWarning)
-        return rodjax.solve(file.scenes[0], **file.settings)
+        return rodjax.solve(scene, **settings)
 
 
-def _last(path: Path) -> Equilibrium:
+def _last(path: Path) -> Equilibrium | rodjax.HarnessEquilibrium:
     """The equilibrium in a file, or the last of a path."""
     try:
         result = load(path)
     except ValueError as error:
         raise CommandError(f"--result: {error}") from None
-    return jax.tree.map(lambda leaf: leaf[-1], result) if result.s.ndim > 1 else result
+    return jax.tree.map(lambda leaf: leaf[-1], result) if result.energy.ndim else result
 
 
 def _check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
@@ -615,12 +620,19 @@ def _check_folder(path: Path, option: str) -> None:
         raise CommandError(f"{option} must be a folder that can be written, got {str(path)!r}")
 
 
-def _draw(path: Path, equilibrium: Equilibrium, write: Callable[[Equilibrium, Path], None]) -> None:
+def _draw(path: Path, equilibrium: Result, write: Callable[[Result, Path], None]) -> None:
     """Writes a file of a shape, which must be finite."""
-    if not np.all(np.isfinite(equilibrium.nodes)):
+    rods = [equilibrium] if isinstance(equilibrium, Equilibrium) else equilibrium.values()
+    if not all(np.all(np.isfinite(rod.nodes)) for rod in rods):
         print(f"rodjax: {path} is not written: the shape is not finite", file=sys.stderr)
         return
     write(equilibrium, path)
+
+
+def _plot_harness(result: rodjax.HarnessEquilibrium, path: Path) -> None:
+    from rodjax.plot import plot_harness
+
+    _save_figure(plot_harness(result), path)
 
 
 def _plot(equilibrium: Equilibrium, path: Path) -> None:

@@ -449,3 +449,13 @@ def test_engine_bay(tmp_path):
     assert route.objective < 1.35
     with open(tmp_path / "starts.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == 4
+
+
+@pytest.mark.slow
+def test_harness_times_stars_against_one_cable():
+    harness = script("harness")
+    # Two cables: the program of twenty, but for its arrays.
+    one, two = harness.timed([2], repeats=1)
+    assert (one.cables, two.cables, one.warm_ratio, one.first_ratio) == (1, 2, 1.0, 1.0)
+    assert two.warm_ms == pytest.approx(two.warm_ratio * one.warm_ms)
+    assert 1 <= two.iterations <= 3

@@ -10,7 +10,7 @@ import pytest
 from planar_frames import PlanarRod, solve_frame
 
 import rodjax
-from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring
+from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring, plot
 
 GRAVITY = (0.0, 3.0, -9.81)
 START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
@@ -194,6 +194,86 @@ def test_a_path_carries_turns_and_leaves_no_step_coarse():
     assert abs(twist[-1] - 3 * math.pi) < 1.5
     assert max(jnp.max(rod.error_estimate) for rod in path.values()) < 1e-3
     assert path.joints["cut"].position.shape == (11, 3)
+
+
+RODS = "got a HarnessEquilibrium: take one of its rods, result[name], or all of them, result.items()"
+SCENES = "got a Harness: rodjax.solve, solve_path, solve_batch and end_stiffness take it, others the scene of a rod"
+
+
+def pulled(load: float) -> Harness:
+    """A rod in two parts, the end of the second on a spring."""
+    straight = rodjax.frame((1, 0, 0))
+    first = Scene(plain(0.5), Clamp((0, 0, 0), straight), Joint("cut", straight), gravity=GRAVITY)
+    second = Scene(plain(0.5), Joint("cut", straight), Joint("end", straight), gravity=GRAVITY)
+    soft = Spring(Clamp((0.9, 0.1 * load, 0), np.eye(3)), 40.0, 1.0)
+    return Harness({"a": first, "b": second}, {"end": Body((0, load, 0), support=soft)})
+
+
+def test_a_batch_of_harnesses_is_each_of_them():
+    loads = [0.0, 0.5]
+    batch = rodjax.solve_batch([pulled(load) for load in loads], segments=4)
+    assert jnp.all(batch.converged)
+    for k, load in enumerate(loads):
+        one = rodjax.solve(pulled(load), segments=4)
+        # Bit by bit: the same program from the same start.
+        assert np.array_equal(batch["b"].nodes[k], one["b"].nodes)
+        assert batch.joints["cut"].position[k, 1] == one.joints["cut"].position[1]
+
+
+def test_steps_of_a_path_that_fail_are_halved():
+    """With few iterations a large step fails at once, and not by way of harnesses between."""
+    impatient = Newton(max_iterations=4)
+    first = rodjax.solve(pulled(0.0), segments=4)
+    with pytest.warns(rodjax.NotConvergedWarning):
+        assert not rodjax.solve(pulled(3.0), segments=4, guess=first, solver=impatient).converged
+    path = rodjax.solve_path([pulled(0.0), pulled(3.0)], segments=4, guess=first, solver=impatient)
+    assert jnp.all(path.converged)
+    assert path["a"].substeps[0] == 1
+    assert path["a"].substeps[1] > 2
+    expected = rodjax.solve(pulled(3.0), segments=4, guess=first)
+    # Both to the tolerance of 1e-8 EI/L^2.
+    assert jnp.max(jnp.abs(path["b"].nodes[1] - expected["b"].nodes)) < 1e-7
+
+
+def test_the_support_of_a_cut_rod_feels_the_stiffness_of_the_rod():
+    tight = Newton(tolerance=1e-11)
+    expected = rodjax.end_stiffness(Scene(plain(1.0), START, END, gravity=GRAVITY), segments=8, solver=tight)
+    found = rodjax.end_stiffness(cut(plain), "b", segments=4, solver=tight)
+    # Derivatives of equilibria with residuals of 1e-11.
+    assert jnp.max(jnp.abs(found - expected)) < 1e-8 * jnp.max(jnp.abs(expected))
+    assert jnp.max(jnp.abs(found - found.T)) < 1e-8 * jnp.max(jnp.abs(expected))
+
+
+def test_a_report_of_a_harness_is_of_all_its_cables(both, tmp_path):
+    _, parts = both
+    report = rodjax.report(parts, limits=rodjax.Limits(end_force=1e3), title="Two parts")
+    assert report.kept
+    assert [cable.name for cable in report.cables] == ["a", "b"]
+    assert {name.split(":")[0] for name in report.margins} == {"a", "b"}
+    assert {"report.png", "report.html"} <= {path.name for path in report.save(tmp_path)}
+
+
+@pytest.mark.parametrize(
+    ("take", "message"),
+    [
+        (lambda parts: plot.plot_rod(parts), RODS),
+        (lambda parts: rodjax.lowest_mode(parts), RODS),
+        (lambda parts: rodjax.centerline_table(parts), RODS),
+        (lambda parts: rodjax.view(parts), RODS),
+        (lambda parts: rodjax.view(parts.harness), SCENES),
+        (lambda parts: rodjax.write_scene(parts.harness, "x.toml"), SCENES),
+        (lambda parts: rodjax.sensitivities(parts.harness, of=["nodes"], wrt=["gravity"]), "of rodjax.solve gives any"),
+        (lambda parts: rodjax.follow([parts.harness] * 2), 'its branches are followed by solve_path(..., find="equil'),
+        (lambda parts: rodjax.solve_batch([[parts.harness]]), "is a Harness: rodjax.solve_path and solve_batch take"),
+        (lambda parts: rodjax.end_stiffness(parts.harness), "cable must be one of 'a', 'b', got None"),
+        (lambda parts: rodjax.end_stiffness(parts.harness, "a"), "scene['a'].end must be a Clamp"),
+    ],
+)
+def test_what_takes_no_harness_says_what_to_do(both, take, message):
+    _, parts = both
+    with pytest.raises((TypeError, ValueError), match=re.escape(message)) as error:
+        take(parts)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

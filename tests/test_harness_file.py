@@ -112,5 +112,42 @@ def test_the_command_solves_and_draws_a_harness(written, tmp_path, capsys):
     assert "3 cables, 1 joint\n" in told
     assert "trunk: converged" in told
     assert picture.stat().st_size > 10_000
-    assert cli.main(["solve", str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf")]) == 2
-    assert "-o is not allowed for a harness" in capsys.readouterr().err
+    again = [str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf"), "--csv", str(tmp_path / "out.csv")]
+    assert cli.main(["solve", *again]) == 0
+    result = rodjax.load(tmp_path / "out.vtkhdf")
+    assert isinstance(result, rodjax.HarnessEquilibrium)
+    assert result.names == ("trunk", "left", "right")
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    assert lines[0].startswith("cable,s [m],x [m],")
+    assert [line.split(",")[0] for line in lines[1:]] == sorted(
+        (line.split(",")[0] for line in lines[1:]), key=result.names.index
+    )
+    last = [float(number) for number in lines[-1].split(",")[1:5]]
+    assert last == [0.3, 0.5, -0.15, 0.0]
+    capsys.readouterr()
+    assert cli.main(["solve", str(written(BRANCHES)), "--dxf", str(tmp_path / "out.dxf")]) == 2
+    assert "--dxf is for one cable" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_reports_on_a_harness(written, tmp_path, capsys):
+    """In the file of a harness itself, or by its name, and of a saved result: the same table of all cables."""
+    limits = '[limits]\nend_force = "100 N"\n'
+    (tmp_path / "apart.toml").write_text('scene = "harness.toml"\n' + limits)
+    assert cli.main(["solve", str(written(BRANCHES)), "-o", str(tmp_path / "out.vtkhdf")]) == 0
+    (tmp_path / "both.toml").write_text(BRANCHES + limits)
+    (tmp_path / "limits.toml").write_text(limits)
+    capsys.readouterr()
+    told = []
+    for arguments in (["both.toml"], ["apart.toml"], ["limits.toml", "--result", str(tmp_path / "out.vtkhdf")]):
+        folder = tmp_path / "report"
+        assert cli.main(["report", str(tmp_path / arguments[0]), *arguments[1:], "--out", str(folder)]) == 0
+        assert (folder / "report.png").stat().st_size > 10_000
+        told.append((folder / "report.csv").read_text())
+    for name in ("trunk", "left", "right"):
+        assert f"\n{name}," in told[0]
+    assert told[1] == told[0]
+    assert told[2] == told[0]
+    capsys.readouterr()
+    assert cli.main(["route", str(tmp_path / "both.toml"), "--out", str(tmp_path / "route")]) == 2
+    assert "a harness is not allowed where a route is sought" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """How the results of a solve change with the numbers of its scene, as tables: no search is repeated for them."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +10,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, sequence
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
+from rodjax.solving.harness import differentiable_harness
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
@@ -64,6 +67,8 @@ def sensitivities(
     those of the other. Where the solve did not converge, or at a critical equilibrium, they are not numbers.
     Raises `ValueError` or `TypeError` for names that are not among these, or options that `rodjax.solve` refuses.
     """
+    if isinstance(scene, Harness):
+        raise ValueError("sensitivities is for a Scene; of a Harness jax.jacfwd of rodjax.solve gives any derivative")
     instance(scene, "scene", Scene)
     of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
     if "shear_strain" in of and scene.rod.GA is None:
@@ -74,8 +79,9 @@ def sensitivities(
 
 
 @one_answer
-def end_stiffness(scene: Scene, **options: Any) -> Float[Array, "k k"]:
-    """The stiffness that the support at s = L feels: second derivatives of the energy by its motion, global axes.
+def end_stiffness(scene: Scene | Harness, cable: str | None = None, **options: Any) -> Float[Array, "k k"]:
+    """The stiffness that the support at s = L feels: second derivatives of the energy by its motion, global axes. Of a
+    `Harness` the support of the rod `cable`, while all other rods and the joints follow.
 
     Of a `Clamp` (6, 6), rows and columns (ux, uy, uz, rx, ry, rz), displacement [m] and rotation vector [rad]: blocks
     in N/m, N, N and N m. Of a `Pin` (3, 3), displacements alone [N/m]. `options`: of `rodjax.solve`.
@@ -85,21 +91,46 @@ def end_stiffness(scene: Scene, **options: Any) -> Float[Array, "k k"]:
     product with `end_moment`, which is added here. The whole is symmetric unless a dead moment acts on the other end,
     which has no energy. Not numbers where `sensitivities` are not.
 
-    Raises `ValueError` for an end that is `Free` or a `Swivel`.
+    Raises `ValueError` for an end that is `Free`, a `Swivel` or a `Joint`, or a `cable` that is not there.
     """
-    instance(scene, "scene", Scene)
-    if isinstance(scene.end, Free):
-        raise ValueError("scene.end must hold a position to have a stiffness, got Free; make it a Clamp or Pin")
-    if not isinstance(scene.end, Clamp | Pin):
-        raise ValueError(f"scene.end must be a Clamp (6 x 6) or a Pin (3 x 3), got {type(scene.end).__name__}")
+    instance(scene, "scene", (Scene, Harness))
+    if isinstance(scene, Harness):
+        if cable not in scene.names:
+            raise ValueError(f"cable must be one of {', '.join(map(repr, scene.names))}, got {cable!r}")
+        _check_end(scene[cable], f"scene[{cable!r}]")
+        return _end_stiffness_in(scene, solve(scene, **options), scene.names.index(cable))
+    if cable is not None:
+        raise ValueError(f"cable must be None for a Scene, which has one, got {cable!r}")
+    _check_end(scene, "scene")
     return _end_stiffness(scene, solve(scene, **options))
+
+
+def _check_end(scene: Scene, name: str) -> None:
+    if isinstance(scene.end, Free):
+        raise ValueError(f"{name}.end must hold a position to have a stiffness, got Free; make it a Clamp or Pin")
+    if not isinstance(scene.end, Clamp | Pin):
+        raise ValueError(f"{name}.end must be a Clamp (6 x 6) or a Pin (3 x 3), got {type(scene.end).__name__}")
 
 
 @compiled
 def _end_stiffness(scene: Scene, result: Equilibrium) -> Float[Array, "k k"]:
+    return _stiffness(scene, result, lambda near: differentiable(near, result))
+
+
+@functools.partial(compiled, static_argnames=("number",))
+def _end_stiffness_in(harness: Harness, result: HarnessEquilibrium, number: int) -> Float[Array, "k k"]:
+    def rod(near: Scene) -> Equilibrium:
+        changed = eqx.tree_at(lambda harness: harness.scenes[number], harness, near)
+        return differentiable_harness(changed, result).rod(number)
+
+    return _stiffness(harness.scenes[number], result.rod(number), rod)
+
+
+def _stiffness(scene: Scene, result: Equilibrium, near: Callable[[Scene], Equilibrium]) -> Float[Array, "k k"]:
+    """`near`: the equilibrium with other numbers of the scene."""
     if isinstance(scene.end, Pin):
-        return _derivatives(scene, result, ("end_force",), ("end.position",))["end_force"]["end.position"]
-    rows = _derivatives(scene, result, ("end_force", "end_moment"), ("end.position", "end.frame"))
+        return _by_numbers(scene, result, near, ("end_force",), ("end.position",))["end_force"]["end.position"]
+    rows = _by_numbers(scene, result, near, ("end_force", "end_moment"), ("end.position", "end.frame"))
     force, moment = ([rows[of][wrt] for wrt in ("end.position", "end.frame")] for of in ("end_force", "end_moment"))
     moment[1] += 0.5 * jnp.cross(result.end_moment[:, None], jnp.eye(3, dtype=moment[1].dtype), axis=0)
     return jnp.block([force, moment])
@@ -119,10 +150,19 @@ def _derivatives(
     scene: Scene, result: Equilibrium, of: tuple[str, ...], wrt: tuple[str, ...]
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
     """By the implicit function theorem at a result, whose mesh is kept."""
+    return _by_numbers(scene, result, lambda near: differentiable(near, result), of, wrt)
 
+
+def _by_numbers(
+    scene: Scene,
+    result: Equilibrium,
+    near: Callable[[Scene], Equilibrium],
+    of: tuple[str, ...],
+    wrt: tuple[str, ...],
+) -> dict[str, dict[str, Float[Array, "..."]]]:
     def fields(changes: dict[str, Float[Array, "..."]]) -> dict[str, Float[Array, "..."]]:
-        near = differentiable(moved(scene, changes), result)
-        return {name: getattr(near, name) for name in of}
+        found = near(moved(scene, changes))
+        return {name: getattr(found, name) for name in of}
 
     numbers = named_numbers(scene)
     nowhere = {name: jnp.zeros_like(numbers[name][0] if _is_frame(name) else numbers[name]) for name in wrt}

@@ -1,7 +1,7 @@
 """What the two forms of a scene, by its tangents and by its frames, have in common."""
 
 from abc import abstractmethod
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -45,6 +45,18 @@ class Linearization(eqx.Module):
     residual: Float[Array, ""]
     gaps: Float[Array, "k n+1"] | None = None
     ways: Float[Array, "n+1 3"] | None = None
+
+
+class EndTurn(NamedTuple):
+    """What turns with the frame of a clamped end about global axes, beside the position: `rotation`, the rotations at
+    the end in the bases of a released linearisation, and what these leave out of the derivatives of L: `torque`, by the
+    axes, of the closure for the torque, `None` where there is none; `first` and `second` ones of L.
+    """
+
+    rotation: Float[Array, "b 3"]
+    torque: Float[Array, "3"] | None
+    first: Float[Array, "3"]
+    second: Float[Array, "3 3"]
 
 
 class Point(Protocol):
@@ -143,6 +155,19 @@ class Form(eqx.Module):
 
     @abstractmethod
     def linearized(self, point: Any) -> Linearization: ...
+
+    def released(self, point: Any) -> Linearization:
+        """The linearisation at a point, but that the ends may turn where clamps hold them, the total twist following by
+        smallest rotations; `residual` without these.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has a force in each element")
+
+    def end_turn(self, point: Any, released: Linearization, end: int) -> EndTurn:
+        """Of the clamped start, 0, or end, -1."""
+        axes = jnp.eye(3, dtype=released.gradient.dtype)
+        rotation = jnp.stack([self.turn(point, released.bases, axis)[:, end] for axis in axes], axis=1)
+        nothing = jnp.zeros_like(axes)
+        return EndTurn(rotation, None, nothing[0], nothing)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
         """A point to go on from, with what its linearisation tells."""

@@ -47,7 +47,7 @@ from rodjax.linalg.blocks import product as block_product
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import Sections
-from rodjax.model.scene import Scene, has_potential
+from rodjax.model.scene import Scene, has_potential, with_pins
 from rodjax.model.supports import Clamp, Directed
 
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
@@ -419,6 +419,10 @@ class FrameForm(Form):
             energy=value,
             residual=self._residual(gradient),
         )
+
+    def released(self, point: FramePoint) -> Linearization:
+        here = dataclasses.replace(self, scene=with_pins(self.scene)).linearized(point)
+        return dataclasses.replace(here, residual=self._residual(self.projected(here.gradient)))
 
     def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         layout = self.layout

@@ -416,9 +416,10 @@ def _by_chords(
 ) -> Blocks:
     """Derivatives by rotations from those by the three chords of each element."""
     points, point_bases = _of_pairs(tangents), _of_pairs(bases)
-    # 1 - a.b falls by e.b as a turns along e, and grows again by a.b.
-    toward_last = components(point_bases[0], points[1])
-    toward_first = components(point_bases[1], points[0])
+    # 1 - a.b falls by e.b as a turns along e, and grows again by a.b. e.b = e.(b - a) without cancellation, as e.a = 0.
+    chords = points[1] - points[0]
+    toward_last = components(point_bases[0], chords)
+    toward_first = components(point_bases[1], -chords)
     falls: list[dict[int, Array]] = [{}, {}, {}]
     for p, (i, j) in enumerate(PAIRS):
         falls[i][p], falls[j][p] = toward_last[:, p], toward_first[:, p]

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.first_twist import FirstTwist, twist_on
-from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
+from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, EndTurn, Form, Linearization
 from rodjax.discretization.joints import rotated, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodal_point import Nodal
@@ -42,7 +42,7 @@ from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene, dead_end_moment
+from rodjax.model.scene import Scene, dead_end_moment, with_pins
 from rodjax.model.supports import Clamp, Free
 
 
@@ -253,9 +253,31 @@ class MixedForm(Form):
     # --- derivatives -------------------------------------------------------------------------------------------------
 
     def linearized(self, point: MixedPoint) -> Linearization:
+        return self._linearized(point, self.scene)
+
+    def released(self, point: MixedPoint) -> Linearization:
+        return self._linearized(point, with_pins(self.scene))
+
+    def end_turn(self, point: MixedPoint, released: Linearization, end: int) -> EndTurn:
+        """A frame turned by a vector is that turned by the smallest rotation to the new tangent, and by the component
+        along the tangent about it. The first turns the tangent along a great circle, to second order by what is across
+        of the vector, r, and half of its product with the component along, (r + (r . t) t x r / 2).
+        """
+        tangent, basis = point.tangents[:, end], released.bases[..., end]
+        turn = super().end_turn(point, released, end)
+        across = basis @ released.gradient[:, end]
+        second = (tangent[:, None] * across[None] + across[:, None] * tangent[None]) / 2
+        if not self.has_torsion:
+            return turn._replace(second=second)
+        torque = jax.grad(lambda twist: density(self.scene.rod, twist=twist))(point.total_twist)
+        spin = tangent if end else -tangent
+        return EndTurn(turn.rotation, spin, torque * spin, second)
+
+    def _linearized(self, point: MixedPoint, holding: Scene) -> Linearization:
+        """With the tangents held that supports and clips of a scene hold."""
         scene, tangents = self.scene, point.tangents
         assert isinstance(self.layout, SpanForces)
-        bases, energy, blocks, torque_column, softness = self._elastic(point)
+        bases, energy, blocks, torque_column, softness = self._elastic(point, holding)
         cells = self._by_cells(point, bases, blocks)
         border = [self.layout.columns(cells.by_force)] if self.layout.size else []
         if torque_column is not None:
@@ -289,12 +311,13 @@ class MixedForm(Form):
             compliance.append(self.layout.compliance(cells.compliance))
             rows = None if rows is None else [*rows, border[-1]]
         nothing = jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1]), energy.dtype)
+        free = bases if holding is scene else self.field.basis(scene, bases)
         return Linearization(
             bases=bases,
             gradient=gradient,
             closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
-                self.field.held(scene, diagonal),
+                self.field.held(holding, diagonal),
                 blocks.lower,
                 jnp.concatenate(columns, axis=1) if columns else nothing,
                 jax.scipy.linalg.block_diag(*compliance) if compliance else jnp.zeros((0, 0), energy.dtype),
@@ -302,11 +325,12 @@ class MixedForm(Form):
                 blocks.across,
             ),
             energy=energy,
-            residual=self.field.residual(scene, short_sum(bases * gradient[None], axis=1), lengths),
+            residual=self.field.residual(scene, short_sum(free * gradient[None], axis=1), lengths),
         )
 
-    def _elastic(self, point: MixedPoint) -> Elastic:
-        scene, rod, field, tangents = self.scene, self.scene.rod, self.field, point.tangents
+    def _elastic(self, point: MixedPoint, holding: Scene | None = None) -> Elastic:
+        """`holding`: the scene whose supports hold tangents, else that of the form."""
+        scene, rod, field, tangents = holding or self.scene, self.scene.rod, self.field, point.tangents
         all_bases = self.bases(field.append_prescribed(scene, tangents))
         bases = field.basis(scene, all_bases)
         energy, blocks = field.bending(scene, tangents, all_bases)

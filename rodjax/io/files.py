@@ -1,9 +1,11 @@
-"""save() and load(): an `Equilibrium` in one VTKHDF file, which ParaView draws and rodjax reads back to the last bit.
+"""save() and load(): an `Equilibrium`, or that of a harness, in one VTKHDF file, which ParaView draws and rodjax reads
+back to the last bit.
 
 The file is HDF5 with two groups. `/VTKHDF` holds the picture, for ParaView and other programs on VTK: see `vtk_parts`.
 `/rodjax` holds every field of `Equilibrium` under its own name, each with the attributes `units` and `description`, so
-that `load` needs no pickle and other programs need no rodjax. A hash follows after the end of the HDF5 file, by which
-`load` finds damage.
+that `load` needs no pickle and other programs need no rodjax. Of a harness `/rodjax/cables/0`, ... hold these fields of
+each rod, and `joints/start`, `joints/end` there how it is fixed in a joint; `/rodjax/joints/0`, ... hold what acts on
+these. A hash follows after the end of the HDF5 file, by which `load` finds damage.
 """
 
 import dataclasses
@@ -27,11 +29,13 @@ from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.io.vtk_parts import write_picture
 from rodjax.model.along import Smooth, Steps
+from rodjax.model.harness import ENDS, Body, Harness
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
-from rodjax.model.scene import has_node_places
-from rodjax.model.supports import Clamp, Free, Pin, Swivel
+from rodjax.model.scene import Scene, has_node_places
+from rodjax.model.supports import Clamp, Free, Hinge, Joint, Pin, Slider, Spring, Swivel
 from rodjax.model.triangle_mesh import Mesh
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium, PrecisionWarning
 from rodjax.solving.status import Status
 from rodjax.version import __version__
@@ -42,6 +46,8 @@ SUFFIX = ".vtkhdf"
 # that this one reads where fields are asked for that the older ones lack.
 FORMAT = 13
 OLDEST_FORMAT = 7
+# Of the equilibrium of a harness, which rodjax of format 13 cannot read.
+HARNESS_FORMAT = 14
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -155,6 +161,33 @@ FIELDS = {
         )
     },
 }
+# The same of harnesses, by their place within a rod, a joint or the file.
+HARNESS_FIELDS = {
+    "harness/positions": ("m", "positions of the joints"),
+    "harness/frames": ("1", "frames of the joints, columns their axes"),
+    "harness/energy": ("J", "energy of rods, springs and dead loads, zero of height at the origin"),
+    "harness/stable": ("1", "whether no motion of rods and joints lowers the energy"),
+    "harness/index": ("1", "independent motions of rods and joints that lower the energy"),
+    "harness/residual": ("1", "largest component of the gradient, in EI/L^2 of each rod"),
+    **{f"harness/{name}": FIELDS[name] for name in ("converged", "status", "iterations", "evaluations")},
+    "end/frame": ("1", "frame of the end of the rod in the axes of the joint, columns d1, d2, t"),
+    "end/offset": ("m", "from the position of the joint to the end of the rod, in the axes of the joint"),
+    "joint/force": ("N", "dead force on the joint, global axes"),
+    "joint/moment": ("N m", "dead moment on the joint, global axes"),
+    "joint/mass": ("kg", "mass of the joint, under the gravity of its rods"),
+    **{
+        f"joint/support/{inner}{name}": (unit, f"{description}, global axes")
+        for inner in ("", "support/")
+        for name, unit, description in (
+            ("position", "m", "position that the support of the joint holds"),
+            ("frame", "1", "frame that the support of the joint holds, columns its axes"),
+            ("axis", "1", "axis of a hinge"),
+            ("directions", "1", "directions in which a slider moves"),
+        )
+    },
+    "joint/support/translation": ("N/m", "stiffness of the spring against displacements"),
+    "joint/support/rotation": ("N m/rad", "stiffness of the spring against rotations"),
+}
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
 # Loads of which files of older formats have none.
@@ -172,9 +205,11 @@ KINDS = {
         *OBSTACLES,
     )
 }
+# The same of the supports of joints.
+JOINT_KINDS = {kind.__name__: kind for kind in (Clamp, Pin, Hinge, Slider, Spring)}
 
 
-def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
+def save(equilibrium: Equilibrium | HarnessEquilibrium, path: str | os.PathLike[str]) -> None:
     """Writes a result to a `.vtkhdf` file, which ParaView opens and `rodjax.load` reads back to the last bit.
 
     A path becomes time steps, with the number of the step for the time. The file is replaced as a whole: whatever goes
@@ -182,25 +217,19 @@ def save(equilibrium: Equilibrium, path: str | os.PathLike[str]) -> None:
 
     Raises `ValueError` or `TypeError` for what cannot be saved, `OSError` where the file cannot be written.
     """
-    instance(equilibrium, "equilibrium", Equilibrium)
     path = file_path(path, "path", SUFFIX)
     replace_file(path, file_content(equilibrium))
 
 
-def file_content(equilibrium: Equilibrium) -> bytes:
+def file_content(equilibrium: Equilibrium | HarnessEquilibrium) -> bytes:
     """What `save` writes, with the same errors."""
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call save outside jax.jit, vmap and grad")
-    if equilibrium.scene.rod.law is not None:
-        raise ValueError(
-            f"equilibrium.scene.rod.law must be None, got a {type(equilibrium.scene.rod.law).__name__}: "
-            "a law is code, which cannot be saved"
-        )
-    if equilibrium.scene.potentials:
-        raise ValueError("equilibrium.scene.potentials must be (): a potential is code, which cannot be saved")
-    _check_obstacles(equilibrium.scene.obstacles, "equilibrium.scene.obstacles", MOST_UNIONS)
-    leading = equilibrium.s.shape[:-1]
+    is_harness = isinstance(equilibrium, HarnessEquilibrium)
+    for name, rod in equilibrium.items() if is_harness else [(None, equilibrium)]:
+        _check_scene(rod.scene, "equilibrium.scene" if name is None else f"equilibrium[{name!r}].scene")
+    leading = equilibrium.energy.shape
     if len(leading) > 1:
         raise ValueError(
             f"equilibrium must be a single one or a path with one leading axis, got leading axes {leading}: "
@@ -211,10 +240,24 @@ def file_content(equilibrium: Equilibrium) -> bytes:
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         write_picture(file.create_group("VTKHDF", track_order=True), equilibrium)
-        _write(file.create_group("rodjax"), equilibrium)
-        file["rodjax"].attrs.update({"format": FORMAT, "version": __version__})
+        group = file.create_group("rodjax")
+        if isinstance(equilibrium, HarnessEquilibrium):
+            _write_harness(group, equilibrium)
+        else:
+            _write(group, equilibrium)
+        group.attrs.update({"format": HARNESS_FORMAT if is_harness else FORMAT, "version": __version__})
     seal(image)
     return image.getvalue()
+
+
+def _check_scene(scene: Scene, name: str) -> None:
+    if scene.rod.law is not None:
+        raise ValueError(
+            f"{name}.rod.law must be None, got a {type(scene.rod.law).__name__}: a law is code, which cannot be saved"
+        )
+    if scene.potentials:
+        raise ValueError(f"{name}.potentials must be (): a potential is code, which cannot be saved")
+    _check_obstacles(scene.obstacles, f"{name}.obstacles", MOST_UNIONS)
 
 
 def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) -> None:
@@ -229,8 +272,8 @@ def _check_obstacles(obstacles: tuple[Obstacle, ...], name: str, unions: int) ->
             _check_obstacles(obstacle.obstacles, f"{name}[{k}].obstacles", unions - 1)
 
 
-def load(path: str | os.PathLike[str]) -> Equilibrium:
-    """Reads what `rodjax.save` wrote: the same `Equilibrium` to the last bit, which serves as a `guess` too.
+def load(path: str | os.PathLike[str]) -> Equilibrium | HarnessEquilibrium:
+    """Reads what `rodjax.save` wrote: the same result to the last bit, which serves as a `guess` too.
 
     Where the file holds float64 while JAX is set to float32 the numbers are rounded, and a `PrecisionWarning` says so.
     Raises `OSError` where the file cannot be read, such as `FileNotFoundError`; `ValueError` where it is no result of
@@ -247,11 +290,23 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             _group(file, "VTKHDF", path)
             group = _group(file, "rodjax", path)
             _check_format(group, path)
-            points = group.get("s")
-            equilibrium = _read(group, (Equilibrium,), path, points.shape if isinstance(points, h5py.Dataset) else ())
+            is_harness = group.attrs.get("kind") == HarnessEquilibrium.__name__
+            equilibrium = _read_harness(group, path) if is_harness else _read_rod(group, path)
     # What h5py raises for a file that is not HDF5, is cut short or damaged.
     except (OSError, KeyError, RuntimeError, TypeError, OverflowError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file: {error}") from error
+    if jnp.zeros(()).dtype == np.float32 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
+        warn(
+            f"{path} holds float64 numbers, which are rounded to float32: "
+            'call jax.config.update("jax_enable_x64", True) before anything else to keep them',
+            PrecisionWarning,
+        )
+    return jax.tree.map(jnp.asarray, equilibrium)
+
+
+def _read_rod(group: h5py.Group, path: Path) -> Equilibrium:
+    points = group.get("s")
+    equilibrium = _read(group, (Equilibrium,), path, points.shape if isinstance(points, h5py.Dataset) else ())
     forces = equilibrium.state.end_force
     if forces.ndim == equilibrium.s.ndim:  # of a rod without clips, until format 8: of its one span
         equilibrium = eqx.tree_at(lambda result: result.state.end_force, equilibrium, forces[..., None])
@@ -261,13 +316,7 @@ def load(path: str | os.PathLike[str]) -> Equilibrium:
             f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
             "rodjax has no longer: solve its scene again"
         )
-    if jnp.zeros(()).dtype == np.float32 and any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(equilibrium)):
-        warn(
-            f"{path} holds float64 numbers, which are rounded to float32: "
-            'call jax.config.update("jax_enable_x64", True) before anything else to keep them',
-            PrecisionWarning,
-        )
-    return jax.tree.map(jnp.asarray, equilibrium)
+    return equilibrium
 
 
 def _group(file: h5py.Group, name: str, path: Path) -> h5py.Group:
@@ -281,10 +330,11 @@ def _check_format(group: h5py.Group, path: Path) -> None:
     written = group.attrs.get("format")
     if not isinstance(written, np.integer):
         raise ValueError(f"{path} lacks the attribute format of /rodjax: load reads files that rodjax.save wrote")
-    if written > FORMAT:
+    newest = HARNESS_FORMAT if group.attrs.get("kind") == HarnessEquilibrium.__name__ else FORMAT
+    if written > newest:
         raise ValueError(
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
-            f"this rodjax reads formats up to {FORMAT}: update it"
+            f"this rodjax reads formats up to {newest}: update it"
         )
     if written < OLDEST_FORMAT:
         raise ValueError(
@@ -294,7 +344,7 @@ def _check_format(group: h5py.Group, path: Path) -> None:
 
 
 def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
-    if type(module).__name__ in KINDS:
+    if type(module).__name__ in KINDS | JOINT_KINDS:
         group.attrs["kind"] = type(module).__name__
     for field in dataclasses.fields(module):
         value = getattr(module, field.name)
@@ -313,21 +363,25 @@ def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
             _write_value(entries, str(k), entry, f"{place}/*")
     elif value is not None:
         dataset = group.create_dataset(name, data=value)
-        dataset.attrs["units"], dataset.attrs["description"] = FIELDS[place]
+        dataset.attrs["units"], dataset.attrs["description"] = (
+            FIELDS[place] if place in FIELDS else HARNESS_FIELDS[place]
+        )
 
 
-def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[int, ...]) -> Any:
+def _read(
+    group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[int, ...], kinds: dict[str, Any] = KINDS
+) -> Any:
     """A module of one of the classes, or of the one below them that the group names, with NumPy arrays for leaves.
 
-    `shape`: of the arclengths of the nodes.
+    `shape`: of the arclengths of the nodes; `kinds`: the classes that a group may name.
     """
-    allowed = [name for name, known in KINDS.items() if issubclass(known, classes)]
+    allowed = [name for name, known in kinds.items() if issubclass(known, classes)]
     kind = classes[0]
     if allowed:
         name = group.attrs.get("kind")
         if not isinstance(name, str) or name not in allowed:
             raise ValueError(f"{path} says of {group.name} that it is {name}; allowed are {', '.join(allowed)}")
-        kind = KINDS[name]
+        kind = kinds[name]
     # As it was written, without the checks of its constructor, which take a single scene of sensible numbers.
     module = object.__new__(kind)
     for field in dataclasses.fields(kind):
@@ -336,7 +390,7 @@ def _read(group: h5py.Group, classes: tuple[Any, ...], path: Path, shape: tuple[
         elif field.name in LATER and field.name not in group:
             value = ()
         else:
-            value = _read_value(group, field.name, field.type, path, shape)
+            value = _read_value(group, field.name, field.type, path, shape, kinds)
         object.__setattr__(module, field.name, value)
     return module
 
@@ -353,24 +407,26 @@ def _static(group: h5py.Group, field: dataclasses.Field, path: Path) -> Any:
     return bool(value)
 
 
-def _read_value(group: h5py.Group, name: str, annotation: Any, path: Path, shape: tuple[int, ...]) -> Any:
-    """What a group has under a name: of one of the kinds that the annotation allows."""
+def _read_value(
+    group: h5py.Group, name: str, annotation: Any, path: Path, shape: tuple[int, ...], kinds: dict[str, Any]
+) -> Any:
+    """What a group has under a name: of one of the types that the annotation allows."""
     is_union = typing.get_origin(annotation) in (types.UnionType, typing.Union)
-    kinds = typing.get_args(annotation) if is_union else (annotation,)
-    classes = tuple(kind for kind in kinds if dataclasses.is_dataclass(kind))
-    of_tuple = next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is tuple), None)
-    of_arrays = [kind for kind in kinds if hasattr(kind, "dim_str")]
+    annotations = typing.get_args(annotation) if is_union else (annotation,)
+    classes = tuple(one for one in annotations if dataclasses.is_dataclass(one))
+    of_tuple = next((typing.get_args(one) for one in annotations if typing.get_origin(one) is tuple), None)
+    of_arrays = [one for one in annotations if hasattr(one, "dim_str")]
     entry = group.get(name)
     if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
         items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
-        return tuple(_read_value(entry, str(k), item, path, shape) for k, item in enumerate(items))
+        return tuple(_read_value(entry, str(k), item, path, shape, kinds) for k, item in enumerate(items))
     if isinstance(entry, h5py.Group) and classes:
-        return _read(entry, classes, path, shape)
+        return _read(entry, classes, path, shape, kinds)
     if isinstance(entry, h5py.Dataset) and of_arrays:
         axes = len(entry.shape or ()) - max(len(shape) - 1, 0)
-        fitting = [kind for kind in of_arrays if len(kind.dim_str.replace("...", "").split()) == axes]
+        fitting = [one for one in of_arrays if len(one.dim_str.replace("...", "").split()) == axes]
         return _array(entry, [*fitting, *of_arrays][0], path, shape)
-    if entry is None and types.NoneType in kinds:
+    if entry is None and types.NoneType in annotations:
         return None
     raise ValueError(f"{path} lacks {group.name}/{name}: it is damaged, or rodjax.save did not write it")
 
@@ -380,7 +436,7 @@ def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...])
     *leading, nodes = shape or (0,)
     # "m": nodes and middles of elements, or two ends and the middles between nodes; of other names any size.
     sizes = {"n+1": (nodes,), "n": (nodes - 1,), "m": (2 * nodes - 1, nodes + 1), "3": (3,), "4": (4,)}
-    if str(dataset.name).startswith("/rodjax/scene/"):  # made without a mesh: its names are sizes of its own
+    if "/scene/" in str(dataset.name):  # made without a mesh: its names are sizes of its own
         sizes = {name: allowed for name, allowed in sizes.items() if name.isdigit()}
     names = [name for name in kind.dim_str.split() if name != "..."]
     wanted = [*((size,) for size in leading), *(sizes.get(name) for name in names)]
@@ -394,3 +450,94 @@ def _array(dataset: h5py.Dataset, kind: Any, path: Path, shape: tuple[int, ...])
             f"got {dataset.dtype.name} of shape {dataset.shape}"
         )
     return dataset[()]
+
+
+# --- harnesses -------------------------------------------------------------------------------------------------------
+
+
+def _write_harness(group: h5py.Group, result: HarnessEquilibrium) -> None:
+    group.attrs["kind"] = HarnessEquilibrium.__name__
+    cables = group.create_group("cables")
+    of_group = {number: k for k, members in enumerate(result.members) for number in members}
+    for number, (name, rod) in enumerate(result.items()):
+        cable = cables.create_group(str(number))
+        cable.attrs.update({"name": name, "group": of_group[number]})
+        _write(cable, jax.tree.map(np.asarray, rod))
+        joined = result.harness.scenes[number]
+        for end in ENDS:
+            joint = getattr(joined, end)
+            if isinstance(joint, Joint):
+                place = cable.create_group(f"joints/{end}")
+                place.attrs["name"] = joint.name
+                for field in ("frame", "offset"):
+                    _write_value(place, field, getattr(joint, field), f"end/{field}")
+    joints = group.create_group("joints")
+    for number, (name, body) in enumerate(zip(result.harness.joint_names, result.harness.bodies, strict=True)):
+        joint = joints.create_group(str(number))
+        joint.attrs["name"] = name
+        _write(joint, body, "joint/")
+    for name in _harness_arrays():
+        _write_value(group, name, getattr(result, name), f"harness/{name}")
+
+
+def _harness_arrays() -> dict[str, Any]:
+    """The fields of a `HarnessEquilibrium` that are arrays, and what they are annotated with."""
+    fields = dataclasses.fields(HarnessEquilibrium)
+    return {field.name: field.type for field in fields if hasattr(field.type, "dim_str")}
+
+
+def _read_harness(group: h5py.Group, path: Path) -> HarnessEquilibrium:
+    names, rods, scenes, groups = [], [], [], {}
+    for number, cable in enumerate(_numbered(group, "cables", path)):
+        names.append(_name(cable, path))
+        groups.setdefault(np.asarray(cable.attrs["group"]).item(), []).append(number)
+        rods.append(_read_rod(cable, path))
+        scenes.append(_joined(rods[-1], cable, path))
+    shape = rods[0].s.shape
+    joint_groups = _numbered(group, "joints", path)
+    harness = object.__new__(Harness)
+    for name, value in {
+        "scenes": tuple(scenes),
+        "bodies": tuple(_read(joint, (Body,), path, shape, JOINT_KINDS) for joint in joint_groups),
+        "names": tuple(names),
+        "joint_names": tuple(_name(joint, path) for joint in joint_groups),
+    }.items():
+        object.__setattr__(harness, name, value)
+    members = tuple(tuple(groups[k]) for k in sorted(groups))
+    axis = len(shape) - 1
+    stacked = tuple(
+        jax.tree.map(lambda *leaves: np.stack(leaves, axis), *(rods[number] for number in numbers))
+        for numbers in members
+    )
+    arrays = {
+        name: _read_value(group, name, annotation, path, shape, KINDS) for name, annotation in _harness_arrays().items()
+    }
+    return HarnessEquilibrium(groups=stacked, harness=harness, members=members, **arrays)
+
+
+def _joined(rod: Equilibrium, cable: h5py.Group, path: Path) -> Scene:
+    """The scene of a rod with joints in the place of the clamps that stand for them."""
+    scene = rod.scene
+    for end in ENDS:
+        place = cable.get(f"joints/{end}")
+        if isinstance(place, h5py.Group):
+            joint = object.__new__(Joint)
+            object.__setattr__(joint, "name", _name(place, path))
+            for field in dataclasses.fields(Joint):
+                if not field.metadata.get("static"):
+                    value = _read_value(place, field.name, field.type, path, rod.s.shape, KINDS)
+                    object.__setattr__(joint, field.name, value)
+            scene = eqx.tree_at(lambda scene, end=end: getattr(scene, end), scene, joint)
+    return scene
+
+
+def _numbered(group: h5py.Group, name: str, path: Path) -> list[h5py.Group]:
+    entries = _group(group, name, path)
+    return [_group(entries, str(number), path) for number in range(len(entries))]
+
+
+def _name(group: h5py.Group, path: Path) -> str:
+    name = group.attrs.get("name")
+    if not isinstance(name, str):
+        raise ValueError(f"{path} is damaged: {group.name} lacks the attribute name")
+    return name

@@ -56,6 +56,7 @@ from rodjax.model.scene import Scene
 from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
+HARNESS_TABLES = ("cables", "joints", "loads", "solve")
 CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips")
 
 
@@ -98,7 +99,7 @@ def read_harness_file(path: str | os.PathLike[str]) -> HarnessFile:
 
 
 def harness_file(content: dict[str, Any]) -> HarnessFile:
-    check_keys(content, "", ("cables",), ("joints", "loads", "solve"))
+    check_keys(content, "", HARNESS_TABLES[:1], HARNESS_TABLES[1:])
     for name in ("cables", "joints"):
         table = content.get(name, {})
         if not isinstance(table, dict) or not all(isinstance(one, dict) for one in table.values()):

@@ -1,5 +1,7 @@
 """A rod at rest as a table along its centerline, for spreadsheets and other programs."""
 
+import csv
+import io
 import os
 from typing import Any
 
@@ -10,6 +12,7 @@ from jaxtyping import Float
 from rodjax.analysis.samples import Samples, samples_at, smooth_samples
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, number_list, shown
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 SUFFIX = ".csv"
@@ -79,21 +82,36 @@ def _by_axis(name: str, unit: str, values: Float[np.ndarray, "k 3"]) -> dict[str
     return {f"{name}{axis} [{unit}]": values[..., k] for k, axis in enumerate(AXES)}
 
 
-def write_table(equilibrium: Equilibrium, path: str | os.PathLike[str], s: Any = None) -> None:
-    """Writes `centerline_table` as comma-separated values, all digits of them; of a path, with a leading column `step`.
+def write_table(equilibrium: Equilibrium | HarnessEquilibrium, path: str | os.PathLike[str], s: Any = None) -> None:
+    """Writes `centerline_table` as comma-separated values, all digits of them; of a path, with a leading column `step`,
+    of a harness of one `cable`, by their names.
 
     The file is replaced as a whole. Raises as `centerline_table`, and `OSError` where the file cannot be written.
     """
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     path = file_path(path, "path", SUFFIX)
+    if isinstance(equilibrium, HarnessEquilibrium):
+        tables = {name: _table(rod, s) for name, rod in equilibrium.items()}
+        shared = [name for name in next(iter(tables.values())) if all(name in table for table in tables.values())]
+        cables = np.concatenate([np.full(len(table["s [m]"]), name) for name, table in tables.items()])
+        columns = {"cable": cables} | {
+            name: np.concatenate([table[name] for table in tables.values()]) for name in shared
+        }
+    else:
+        columns = _table(equilibrium, s)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    replace_file(path, text.getvalue().encode())
+
+
+def _table(equilibrium: Equilibrium, s: Any) -> dict[str, np.ndarray]:
+    """`centerline_table`, of a path with the number of the step before it."""
     if equilibrium.s.ndim == 2 and is_known(equilibrium):
         equilibrium = jax.tree.map(np.asarray, equilibrium)
         steps = [jax.tree.map(lambda leaf, k=k: leaf[k], equilibrium) for k in range(len(equilibrium.s))]
         tables = [centerline_table(step, s) for step in steps]
         numbers = np.concatenate([np.full(len(table["s [m]"]), k) for k, table in enumerate(tables)])
-        columns = {"step": numbers} | {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
-    else:
-        columns = centerline_table(equilibrium, s)
-    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-    text = "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
-    replace_file(path, text.encode())
+        return {"step": numbers} | {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
+    return centerline_table(equilibrium, s)

@@ -5,11 +5,14 @@
 - `clips`: a collar around the rod at each clip
 - `obstacle_0`, ...: their surfaces, near the rod
 
-of which those that the scene lacks are left out; along a path all of them over time steps. The names of the point data
-end with their SI units, as powers: HDF5 has no names with a slash. The format is that of
+of which those that the scene lacks are left out; along a path all of them over time steps. Of a harness `trunk`,
+`trunk_supports`, ... for each cable by its name, of which all characters but letters, digits and _ become _; and
+`joints`, a point at the position of each. The names of the point data end with their SI units, as powers: HDF5 has no
+names with a slash. The format is that of
 https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/
 """
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,6 +24,7 @@ from jaxtyping import Float
 from rodjax.analysis.reactions import reactions
 from rodjax.analysis.samples import Samples, smooth_samples
 from rodjax.model.surfaces import Faces, collar, surfaces
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 # A bend radius beyond so many lengths of the rod is told as that: an infinite one would leave ParaView no scale.
@@ -39,16 +43,31 @@ class Piece(NamedTuple):
     data: dict[str, np.ndarray]
 
 
-def write_picture(root: h5py.Group, equilibrium: Equilibrium) -> None:
+def write_picture(root: h5py.Group, result: Equilibrium | HarnessEquilibrium) -> None:
     """Into an empty group that tracks the order of its links."""
     root.attrs["Version"] = (2, 3)
     root.attrs["Type"] = np.bytes_("PartitionedDataSetCollection")  # VTK reads no string of variable length here
     assembly = root.create_group("Assembly", track_order=True)
-    for number, (name, pieces) in enumerate(_parts(equilibrium).items()):
+    parts = _parts(result) if isinstance(result, Equilibrium) else _parts_of_harness(result)
+    steps = result.energy.shape[0] if result.energy.ndim else None
+    for number, (name, pieces) in enumerate(parts.items()):
         part = root.create_group(name)
         part.attrs["Index"] = number
-        _write_part(part, pieces, equilibrium.s.shape[0] if equilibrium.s.ndim == 2 else None)
+        _write_part(part, pieces, steps)
         assembly[name] = h5py.SoftLink(f"{root.name}/{name}")
+
+
+def _parts_of_harness(result: HarnessEquilibrium) -> dict[str, list[Piece]]:
+    parts = {}
+    for number, (cable, rod) in enumerate(result.items()):
+        plain = re.sub(r"\W", "_", cable, flags=re.ASCII)
+        for name, pieces in _parts(rod).items():
+            name = plain if name == "cable" else f"{plain}_{name}"
+            parts[f"{name}_{number}" if name in parts or name in ("joints", "Assembly") else name] = pieces
+    positions = np.asarray(result.positions)
+    cells = [np.array([j]) for j in range(positions.shape[-2])]
+    parts["joints"] = [Piece(points, "Vertices", cells, {}) for points in positions.reshape(-1, len(cells), 3)]
+    return parts
 
 
 def cable_data(samples: Samples) -> dict[str, np.ndarray]:

@@ -1,7 +1,7 @@
 """Harnesses: rods whose ends meet in rigid bodies with unknown poses."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
 from rodjax.geometry.rotations import from_frame
-from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.scene import Scene, between, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -53,6 +53,12 @@ class Harness(eqx.Module):
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
     and for a scene with an obstacle, a potential field, a sliding clip or a load without a potential.
     """
+
+    # In the place of a scene.
+    instead: ClassVar[str] = (
+        "rodjax.solve, solve_path, solve_batch and end_stiffness take it, others the scene of a rod with clamps "
+        "where its joints were found: result[name].scene"
+    )
 
     scenes: tuple[Scene, ...]
     bodies: tuple[Body, ...]
@@ -205,6 +211,22 @@ def _motions(support: Support | None) -> _Motions:
         rotations = everything if support.frame is None else none
         return _Motions(support.position, support.frame, support.directions.T, rotations, None, None)
     return _Motions(None, None, everything, everything, None, None)
+
+
+def harness_between(harness: Harness, other: Harness, fraction: Float[Array, ""]) -> Harness:
+    """A harness on the way from one to another of its structure, as `rodjax.model.scene.between`."""
+    mixed = jax.tree.map(lambda a, b: a + fraction * (b - a), harness, other)
+    scenes = [between(*both, fraction) for both in zip(harness.scenes, other.scenes, strict=True)]
+    supports = [
+        support_between(one.support, two.support, fraction)
+        for one, two in zip(harness.bodies, other.bodies, strict=True)
+        if one.support is not None and two.support is not None
+    ]
+
+    def parts(harness: Harness) -> list[Any]:
+        return [*harness.scenes, *(body.support for body in harness.bodies if body.support is not None)]
+
+    return eqx.tree_at(parts, mixed, [*scenes, *supports])
 
 
 class Bodies(eqx.Module):

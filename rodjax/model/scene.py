@@ -16,7 +16,7 @@ from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple,
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
 from rodjax.model.summaries import scene_text
-from rodjax.model.supports import Clamp, Clip, Free, Held, Movable, Pin, Support, Swivel
+from rodjax.model.supports import Clamp, Clip, Free, Held, Hinge, Movable, Pin, Slider, Spring, Support, Swivel
 from rodjax.units import Units
 
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
@@ -245,33 +245,47 @@ def _check_clips(scene: Scene, length: float) -> None:
 def between(scene: Scene, other: Scene, fraction: Float[Array, ""]) -> Scene:
     """A scene on the way from one to another: numbers linear, frames by the smallest rotation, as `fraction` of it."""
 
-    def support(end: Support, other: Support) -> Support:
-        mixed = jax.tree.map(number, end, other)
-        if isinstance(end, Clamp) and isinstance(other, Clamp):
-            return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(end.frame, other.frame))
-        if isinstance(end, Swivel):
-            return Swivel(mixed.position, mixed.tangent)
-        return mixed
-
-    def turned(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-        turn = Rotation.from_matrix(frame.T @ other).as_rotvec()
-        return frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
+    def number(a, b):
+        return a + fraction * (b - a)
 
     def clip(mixed: Clip, first: Clip, other: Clip) -> Clip:
         if first.frame is None or other.frame is None:
             return Clip(mixed.at, mixed.position, mixed.tangent, mixed.sliding)
-        return eqx.tree_at(lambda mixed: mixed.frame, mixed, turned(first.frame, other.frame))
+        frame = frame_between(first.frame, other.frame, fraction)
+        return eqx.tree_at(lambda mixed: mixed.frame, mixed, frame)
 
-    def number(a, b):
-        return a + fraction * (b - a)
-
-    ends = support(scene.start, other.start), support(scene.end, other.end)
+    ends = [support_between(*both, fraction) for both in ((scene.start, other.start), (scene.end, other.end))]
     mixed = jax.tree.map(number, scene, other)
-    mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, ends)
+    mixed = eqx.tree_at(lambda mixed: (mixed.start, mixed.end), mixed, tuple(ends))
     if not scene.clips:
         return mixed
     clips = tuple(clip(*of_three) for of_three in zip(mixed.clips, scene.clips, other.clips, strict=True))
     return eqx.tree_at(lambda mixed: mixed.clips, mixed, clips)
+
+
+def support_between(support: Support, other: Support, fraction: Float[Array, ""]) -> Support:
+    """The same of supports of one kind."""
+    mixed = jax.tree.map(lambda a, b: a + fraction * (b - a), support, other)
+    if isinstance(support, Spring) and isinstance(other, Spring):
+        inner = support_between(support.support, other.support, fraction)
+        return eqx.tree_at(lambda mixed: mixed.support, mixed, inner)
+    if isinstance(support, Swivel):
+        return Swivel(mixed.position, mixed.tangent)
+    frame, last = getattr(support, "frame", None), getattr(other, "frame", None)
+    if frame is not None and last is not None:
+        mixed = eqx.tree_at(lambda mixed: mixed.frame, mixed, frame_between(frame, last, fraction))
+    if isinstance(support, Hinge):
+        return Hinge(mixed.position, mixed.frame, mixed.axis)
+    if isinstance(support, Slider):
+        return Slider(mixed.position, mixed.directions, mixed.frame)
+    return mixed
+
+
+def frame_between(
+    frame: Float[Array, "3 3"], other: Float[Array, "3 3"], fraction: Float[Array, ""]
+) -> Float[Array, "3 3"]:
+    turn = Rotation.from_matrix(frame.T @ other).as_rotvec()
+    return frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
 
 
 def held_position(scene: Scene) -> Float[Array, "3"]:
@@ -373,6 +387,12 @@ def with_plain_rod(scene: Scene) -> Scene:
     EI1, EI2, GJ, EA = (rod.mean(stiffness) for stiffness in rod.stiffnesses)
     plain = Rod(rod.length, (EI1 + EI2) / 2, GJ, EA, rod.mean_mass_per_length)
     return Scene(plain, scene.start, scene.end, scene.gravity, dead_forces(scene), scene.turns)
+
+
+def with_pins(scene: Scene) -> Scene:
+    """The same scene whose ends may turn where clamps hold them."""
+    ends = [Pin(end.position) if isinstance(end, Clamp) else end for end in (scene.start, scene.end)]
+    return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
 
 
 def dead_forces(scene: Scene) -> list[PointForce]:

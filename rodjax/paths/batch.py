@@ -8,7 +8,7 @@ compiled loop without idle work, until there are no more scenes. Many scenes go 
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -21,7 +21,9 @@ from tqdm import tqdm
 from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, has_friction, has_node_places, slides
+from rodjax.paths.harness_path import harness_batch
 from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -62,26 +64,27 @@ CHUNKS = ((16, 16), (128, 128), (256, 4096), (1024, math.inf))
 
 @one_answer
 def solve_batch(
-    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene,
+    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene | Sequence[Harness],
     *,
     segments: int | None = None,
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | None = None,
+    guess: Any = None,
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     threads: int | None = None,
     progress: bool = False,
-) -> Equilibrium:
-    """The equilibria of independent scenes of one structure, or of independent paths.
+) -> Any:
+    """The equilibria of independent scenes of one structure, or of independent paths; or of harnesses.
 
     **Arguments:**
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
-        one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps.
+        one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps; or
+        `Harness`es of one structure, which are solved one after another.
     - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each, from which friction acts.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
@@ -92,9 +95,15 @@ def solve_batch(
         scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
 
     Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
-    is marked, and all others are not affected.
+    is marked, and all others are not affected. Of harnesses a `HarnessEquilibrium`.
     """
-    stacked = _stacked(scenes)
+    if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
+        if mesh is not None:
+            raise ValueError("mesh must be None for harnesses, which are solved one after another")
+        numbers: dict[str, Any] = {"segments": segments, "rtol": rtol, "guess": guess, "strain_limit": strain_limit}
+        how: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
+        return harness_batch(cast(Sequence[Harness], scenes), **numbers, **how)
+    stacked = _stacked(cast(Sequence[Scene] | Sequence[Sequence[Scene]] | Scene, scenes))
     check_ranges(*not_differentiated(stacked))
     return solve_stack(
         stacked,

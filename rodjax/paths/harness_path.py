@@ -1,18 +1,23 @@
-"""Paths of harnesses: each solved from the last."""
+"""Several harnesses of one structure: paths, each solved from the last, and batches, each from its own start."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from rodjax.checks import instance, is_known
-from rodjax.model.harness import Harness
+from rodjax.checks import instance, is_known, sequence
+from rodjax.model.harness import Harness, harness_between
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
-from rodjax.solving.harness import finer_meshes, solve_harness
+from rodjax.solving.harness import finer_meshes, solve_harness, warn_of_harness
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import NotConvergedWarning
 from rodjax.warn import warn
+
+# A step is halved at most so often, to a sixty-fourth of it.
+MAX_SPLITS = 6
 
 
 def harness_path(
@@ -24,25 +29,120 @@ def harness_path(
     **options: Any,
 ) -> HarnessEquilibrium:
     """See `rodjax.paths.path.solve_path`. All steps are on one mesh, refined until no step needs a finer one."""
+    harnesses = _checked(harnesses, "path")
+
+    def steps(first: HarnessEquilibrium) -> list[HarnessEquilibrium]:
+        found = [first]
+        for harness in harnesses[1:]:
+            found.append(_step(found[-1], harness, segments=first.segments, **options))
+        return found
+
+    first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=guess, **options)
+    return _on_one_mesh(first, steps, segments, rtol, options)
+
+
+def harness_batch(
+    harnesses: Sequence[Harness],
+    *,
+    segments: int | None,
+    rtol: float | None,
+    guess: HarnessEquilibrium | None,
+    **options: Any,
+) -> HarnessEquilibrium:
+    """See `rodjax.paths.batch.solve_batch`: one after another, by one program, on one mesh."""
+    harnesses = _checked(harnesses, "batch")
+    if guess is not None:
+        instance(guess, "guess", HarnessEquilibrium)
+        if guess.energy.shape not in ((), (len(harnesses),)):
+            raise ValueError(f"guess must be one, or one for each of {len(harnesses)}, got shape {guess.energy.shape}")
+
+    def begin(k: int) -> HarnessEquilibrium | None:
+        return guess if guess is None or not guess.energy.ndim else jax.tree.map(lambda leaf: leaf[k], guess)
+
+    def all_of(first: HarnessEquilibrium) -> list[HarnessEquilibrium]:
+        found = [first]
+        for k, harness in enumerate(harnesses[1:], 1):
+            found.append(solve_harness(harness, segments=first.segments, guess=begin(k), **options))
+        return found
+
+    first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=begin(0), **options)
+    return _on_one_mesh(first, all_of, segments, rtol, options)
+
+
+def _checked(harnesses: Any, name: str) -> tuple[Harness, ...]:
+    harnesses = sequence(harnesses, "scenes", "Harness")
     for k, harness in enumerate(harnesses):
         instance(harness, f"scenes[{k}]", Harness)
         if jax.tree.structure(harness) != jax.tree.structure(harnesses[0]):
-            raise ValueError(f"scenes[{k}] must have the structure of scenes[0], to be a step of one path")
+            raise ValueError(f"scenes[{k}] must have the structure of scenes[0], to be one of a {name}")
+    return harnesses
+
+
+def _on_one_mesh(
+    first: HarnessEquilibrium,
+    solved: Callable[[HarnessEquilibrium], list[HarnessEquilibrium]],
+    segments: int | None,
+    rtol: float | None,
+    options: dict[str, Any],
+) -> HarnessEquilibrium:
+    """All equilibria on the mesh of the first, refined until none needs a finer one, unless `segments` are given."""
     tolerance = DEFAULT_RTOL if rtol is None else checked_rtol(rtol)
-    first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=guess, **options)
     while True:
-        steps = [first]
-        for harness in harnesses[1:]:
-            steps.append(solve_harness(harness, segments=first.segments, guess=steps[-1], **options))
-        path = jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps)
-        if segments is not None or not is_known(path.status):
-            return path
-        counts, worst, _ = finer_meshes(path, tolerance)
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *solved(first))
+        if segments is not None or not is_known(found.status):
+            return found
+        counts, worst, _ = finer_meshes(found, tolerance)
         if counts == first.segments:
             if worst > tolerance:
                 warn(
                     f"the estimated error {worst:.1e} of a rod is above rtol = {tolerance:g} on the finest mesh",
                     NotConvergedWarning,
                 )
-            return path
-        first = solve_harness(harnesses[0], segments=counts, guess=first, **options)
+            return found
+        first = solve_harness(first.harness, segments=counts, guess=first, **options)
+
+
+def _step(last: HarnessEquilibrium, harness: Harness, *, strain_limit: Any, **options: Any) -> HarnessEquilibrium:
+    """The equilibrium of a harness from the last one, at once or by way of harnesses between the two."""
+
+    def solve(harness: Harness, guess: HarnessEquilibrium) -> HarnessEquilibrium:
+        return solve_harness(harness, guess=guess, strain_limit=strain_limit, is_told=False, **options)
+
+    found = solve(harness, last)
+    if not is_known(harness, last, found.status):
+        return found
+    attempts, reached, fraction, share = [found], last, 0.0, 0.5
+    while not bool(found.converged) and share >= 0.5**MAX_SPLITS:
+        target = min(fraction + share, 1.0)
+        here = harness if target == 1 else _between(last.harness, harness, jnp.asarray(target))
+        trial = solve(here, reached)
+        attempts.append(trial)
+        if not bool(trial.converged):
+            share /= 2
+            continue
+        reached, fraction, share = trial, target, 2 * share
+        if target == 1:
+            found = trial
+    if not bool(found.converged) and fraction > 0:
+        found = solve(harness, reached)
+        attempts.append(found)
+    if len(attempts) > 1:
+        found = _counted(found, attempts)
+    warn_of_harness(found, strain_limit)
+    return found
+
+
+_between = compiled(harness_between)
+
+
+def _counted(found: HarnessEquilibrium, attempts: list[HarnessEquilibrium]) -> HarnessEquilibrium:
+    """With the iterations of all attempts, and how many these were, as `substeps` of the rods."""
+    iterations, evaluations = (
+        sum(int(getattr(attempt, name)) for attempt in attempts) for name in ("iterations", "evaluations")
+    )
+    substeps = [jnp.full_like(rod.substeps, len(attempts)) for rod in found.groups]
+    return eqx.tree_at(
+        lambda result: [result.iterations, result.evaluations, *(rod.substeps for rod in result.groups)],
+        found,
+        [jnp.asarray(iterations), jnp.asarray(evaluations), *substeps],
+    )

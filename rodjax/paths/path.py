@@ -179,6 +179,11 @@ def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
     if not scenes:
         raise ValueError("scenes must hold at least one scene, got none")
     for k, scene in enumerate(scenes):
+        if isinstance(scene, Harness):
+            raise ValueError(
+                f"scenes[{k}] is a Harness: rodjax.solve_path and solve_batch take lists of these alone; its branches "
+                'are followed by solve_path(..., find="equilibrium") in small steps, whose index tells what they pass'
+            )
         instance(scene, f"scenes[{k}]", Scene)
         if jax.tree.structure(scene) != jax.tree.structure(scenes[0]):
             raise ValueError(

@@ -4,7 +4,8 @@ A complete example; quantities are as in scene files, a number and any unit of t
 
     scene = "scene.toml"           # in a folder as seen from this file, without [[path]]; or the tables of a scene,
                                    # [rod], [start], [end] and others, in this file; or of several cables, for a report:
-                                   # cables = { "brake line" = "brake.toml", "sensor" = "sensor.toml" }
+                                   # cables = { "brake line" = "brake.toml", "sensor" = "sensor.toml" }; for a report
+                                   # also the file of a harness, or its tables [cables.NAME] and others
     title = "Brake line"           # optional
     starts = 8                     # optional, for `rodjax route`: from how many designs the search begins
 
@@ -78,6 +79,7 @@ from jaxtyping import Float
 from rodjax.checks import file_path, shown, whole_number
 from rodjax.identification.unknowns import unit_of
 from rodjax.io.clocking import check_clocked
+from rodjax.io.harness_file import HARNESS_TABLES, HarnessFile, harness_file, is_harness_file, read_harness_file
 from rodjax.io.obstacle_tables import kind_of, obstacle
 from rodjax.io.quantities import (
     OF_TABLES,
@@ -109,9 +111,12 @@ MOST_STARTS = 10_000
 
 
 class RouteFile(NamedTuple):
-    """What a file holds: a scene file for each cable by its name, what it shall keep to, and what may vary."""
+    """What a file holds: a scene file for each cable by its name, or a harness; what it shall keep to, and what may
+    vary.
+    """
 
     cables: dict[str, SceneFile]
+    harness: HarnessFile | None
     title: str | None
     obstacles: tuple[Obstacle, ...]
     names: tuple[str, ...]
@@ -132,19 +137,22 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, fo
     with in_file(path):
         content = toml_tables(read_text(path))
         required, optional = SCENE_TABLES
-        check_keys(content, "", (), (*required, *optional, "scene", "cables", *OF_A_ROUTE))
+        check_keys(content, "", (), (*required, *optional, "scene", "cables", "joints", *OF_A_ROUTE))
         names, obstacles = _obstacles(content.get("obstacles", []), path.parent)
         limits = _limits(content["limits"], obstacles) if "limits" in content else None
         objective = _objective(content["objective"]) if "objective" in content else None
         title, starts = _title(content), _starts(content)
-    cables = _cables(content, path) if with_scene else {}
+    harness = _harness(content, path) if with_scene else None
+    cables = _cables(content, path) if with_scene and harness is None else {}
     with in_file(path):
         variables = _variables(content.get("variables", []))
+        if for_route and harness is not None:
+            raise SceneFileError("a harness is not allowed where a route is sought, which is of one cable")
         if for_route:
             _check_for_route(content, cables, variables)
         if len(cables) == 1 and variables:
             _check_variables(variables, next(iter(cables.values())))
-    return RouteFile(cables, title, obstacles, names, limits, variables, objective, starts)
+    return RouteFile(cables, harness, title, obstacles, names, limits, variables, objective, starts)
 
 
 def _title(content: dict[str, Any]) -> str | None:
@@ -163,6 +171,23 @@ def _starts(content: dict[str, Any]) -> int | None:
 
 
 # --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def _harness(content: dict[str, Any], path: Path) -> HarnessFile | None:
+    """`None` where the file is of single cables."""
+    cables, scene = content.get("cables"), content.get("scene")
+    if isinstance(cables, dict) and any(isinstance(one, dict) for one in cables.values()):
+        with in_file(path):
+            if scene is not None:
+                raise SceneFileError("scene is not allowed together with the tables of a harness")
+            return harness_file({key: content[key] for key in HARNESS_TABLES if key in content})
+    if "joints" in content:
+        with in_file(path):
+            raise SceneFileError("joints is not allowed without the tables [cables.NAME] of a harness")
+    if not isinstance(scene, str) or "\0" in scene:
+        return None
+    file = path.parent / scene
+    return read_harness_file(file) if file.is_file() and is_harness_file(file) else None
 
 
 def _cables(content: dict[str, Any], path: Path) -> dict[str, SceneFile]:

@@ -21,6 +21,7 @@ from rodjax.routing import records, report_text
 from rodjax.routing.cable_report import Cable, Gradients, cable
 from rodjax.routing.limits import Limits
 from rodjax.routing.route import Route
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
@@ -145,7 +146,8 @@ def report(
 
     **Arguments:**
 
-    - `equilibrium`: one `Equilibrium`, a list of them, or a dictionary of them by the names of the cables.
+    - `equilibrium`: one `Equilibrium`, a list of them, or a dictionary of them by the names of the cables; or that of a
+      harness, whose rods are the cables: whether they are stable is told of the whole.
     - `limits`: `Limits` of all cables, or a list of `Limits` or `None`, one for each cable; `None`: none.
     - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
@@ -180,7 +182,9 @@ def report(
 
 
 def _cables(equilibrium: Any) -> dict[str, Equilibrium]:
-    if isinstance(equilibrium, Equilibrium):
+    if isinstance(equilibrium, HarnessEquilibrium):
+        equilibrium = dict(equilibrium.items())
+    elif isinstance(equilibrium, Equilibrium):
         equilibrium = {"cable": equilibrium}
     elif not isinstance(equilibrium, Mapping):
         given = sequence(equilibrium, "equilibrium", "Equilibrium")

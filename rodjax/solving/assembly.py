@@ -31,7 +31,7 @@ from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
 from rodjax.model.scene import held_position, scene_axes
-from rodjax.model.supports import Clamp, rotate
+from rodjax.solving.coupling import Coupling, RodInBodies, linearized_with_ends
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -89,37 +89,6 @@ class Rods(eqx.Module):
         return positions[self.body], frames[self.body]
 
 
-class Rod(NamedTuple):
-    """One of `Rods`, with the poses of the bodies at its ends, `length` the unit of their displacements."""
-
-    form: Form
-    units: Units
-    is_joint: Bool[Array, "2"]
-    frame: Float[Array, "2 3 3"]
-    offset: Float[Array, "2 3"]
-    position_of_body: Float[Array, "2 3"]
-    frame_of_body: Float[Array, "2 3 3"]
-    length: Float[Array, ""]
-
-    def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
-        """The form with its ends at the poses of the bodies, moved."""
-        scene = self.form.scene
-        ends = []
-        for end, support in enumerate((scene.start, scene.end)):
-            if isinstance(support, Clamp):
-                place, frame = self.position_of_body[end], self.frame_of_body[end]
-                if motions is not None:
-                    place += self.length * motions[end, :3]
-                    frame = rotate(frame, motions[end, 3:])
-                place = (place + frame @ self.offset[end] - self.units.origin) / self.units.length
-                place = jnp.where(self.is_joint[end], place, support.position)
-                frame = jnp.where(self.is_joint[end], frame @ self.frame[end], support.frame)
-                support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
-            ends.append(support)
-        scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
-        return eqx.tree_at(lambda form: form.scene, self.form, scene)
-
-
 class RodStep(NamedTuple):
     """Where a rod is, and a step from there."""
 
@@ -129,7 +98,7 @@ class RodStep(NamedTuple):
     force_change: Float[Array, "3 parts"]
 
     def value(
-        self, rod: Rod, motions: Float[Array, "2 6"], part: Float[Array, ""]
+        self, rod: RodInBodies, motions: Float[Array, "2 6"], part: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
         """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans; the
         point there.
@@ -139,38 +108,6 @@ class RodStep(NamedTuple):
         value, closure = form.lagrangian(there)
         scene = form.scene
         return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
-
-
-class Coupling(NamedTuple):
-    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure."""
-
-    first: Float[Array, "12"]
-    second: Float[Array, "12 12"]
-    of_gradient: Float[Array, "b m 12"]
-    of_closure: Float[Array, "k 12"]
-
-
-def coupling(rod: Rod, point: Any, here: Linearization) -> Coupling:
-    layout = rod.form.layout
-
-    def value(rotation: Array, forces: Array, motions: Array) -> Float[Array, ""]:
-        step = RodStep(point, here.bases, rotation, layout.forces(forces))
-        return step.value(rod, motions.reshape(2, 6), jnp.ones((), rotation.dtype))[0]
-
-    def gradients(motions: Float[Array, "12"]) -> tuple[Array, Array, Array]:
-        nothing = jnp.zeros_like(here.gradient), jnp.zeros(layout.size, motions.dtype)
-        return jax.grad(value, argnums=(0, 1, 2))(*nothing, motions)
-
-    nowhere = jnp.zeros(12, here.gradient.dtype)
-
-    def both(motions: Float[Array, "12"]) -> tuple[tuple[Array, Array, Array], Float[Array, "12"]]:
-        found = gradients(motions)
-        return found, found[2]
-
-    (of_gradient, of_closure, second), first = jax.jacfwd(both, has_aux=True)(nowhere)
-    # Before the closures there is a row for the torque, of which nothing is asked.
-    more = len(here.closure) - layout.size
-    return Coupling(first, second, of_gradient, jnp.pad(of_closure, ((more, 0), (0, 0))))
 
 
 class Eliminated(NamedTuple):
@@ -230,11 +167,11 @@ class Assembly(eqx.Module):
     def count(self) -> int:
         return len(self.bodies.position)
 
-    def rods(self, group: Rods, poses: Poses) -> Rod:
+    def rods(self, group: Rods, poses: Poses) -> RodInBodies:
         """Stacked."""
         positions, frames = group.under(poses)
         length = jnp.broadcast_to(self.length, group.units.length.shape)
-        return Rod(
+        return RodInBodies(
             group.form, group.units, group.body < self.count, group.frame, group.offset, positions, frames, length
         )
 
@@ -279,7 +216,7 @@ def find_assembly(assembly: Assembly, points: tuple[Any, ...], poses: Poses, sol
 class _Here(NamedTuple):
     """Of a group of rods at a state."""
 
-    rods: Rod
+    rods: RodInBodies
     points: Any
     linearization: Linearization
     coupling: Coupling
@@ -287,182 +224,46 @@ class _Here(NamedTuple):
     aside: Float[Array, "k b m"]
 
 
-def _linearized(rod: Rod, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
-    form = rod.moved()
-    point = form.holding(point)
-    here = form.linearized(point)
-    aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
-    return point, here, coupling(rod, point, here), form.rounding_floor(point), aside
+class _Balance(NamedTuple):
+    """What is out of balance: of the bodies before their supports, `gradient`, and the largest of all; `balanced`: the
+    status with which the search may end, else RUNNING.
+    """
+
+    gradient: Float[Array, "j 6"]
+    stiffness: Float[Array, "j 6 6"]
+    residuals: tuple[Float[Array, "k"], ...]
+    residual: Float[Array, ""]
+    floor: Float[Array, ""]
+    balanced: Int[Array, ""]
+    is_balanced: Bool[Array, ""]
 
 
-def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:
-    """One linearisation, the step that follows from it, and the part of it that is taken."""
-    seeks_minimum = find == "minimum"
-    count, poses = assembly.count, state.poses
-    dtype = poses.positions.dtype
-    least = jnp.asarray(NEUTRAL, dtype)
-    all_here = []
-    for group, points in zip(assembly.groups, state.points, strict=True):
-        rods = assembly.rods(group, poses)
-        all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points)))
+class _Rods(NamedTuple):
+    """The systems of all rods eliminated, group by group, and what these tell together."""
 
-    # --- what is out of balance ---
-    gradient, stiffness = assembly.body_derivatives(poses)
-    gradient = jnp.pad(gradient, ((0, 1), (0, 0)))
-    scale = jnp.zeros(count + 1, dtype)
-    residual, floor, is_closed = jnp.zeros((), dtype), jnp.zeros((), dtype), jnp.array(True)
-    residuals = []
-    for group, here in zip(assembly.groups, all_here, strict=True):
-        shares = assembly.shares(group)
-        of_ends = shares[:, None, None] * here.coupling.first.reshape(-1, 2, 6)
-        for end in range(2):
-            gradient = gradient.at[group.body[:, end]].add(of_ends[:, end])
-            scale = scale.at[group.body[:, end]].max(shares)
-        residuals.append(here.linearization.residual)
-        residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
-        floor = jnp.maximum(floor, jnp.max(here.floor))
-        closed = jax.vmap(lambda form, closure: form.is_closed(closure, solver.tolerance))
-        is_closed &= jnp.all(closed(group.form, here.linearization.closure))
-    motions = assembly.bodies.motions
-    gradient, scale = gradient[:count], scale[:count]
-    out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
-    residual = jnp.maximum(residual, jnp.max(jnp.abs(out_of_balance), initial=0.0))
-    balanced = jnp.where(residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
-    balanced = jnp.where(residual <= solver.tolerance, Status.CONVERGED, balanced)
-    stagnates = (state.iterations > 0) & (residual > state.residual / 2) & (residual <= STAGNATION * floor)
-    balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
-    is_balanced = is_closed & (balanced != Status.RUNNING)
+    found: list["Eliminated"]
+    shifts: tuple[Float[Array, "k"], ...]
+    is_definite: Bool[Array, ""]
+    negative: Int[Array, ""]
+    is_pushed: Bool[Array, ""]
 
-    # --- the rods eliminated ---
-    all_found, shifts, is_definite, negative, is_pushed = [], [], jnp.array(True), jnp.zeros((), int), jnp.array(False)
-    for here, last in zip(all_here, state.shifts, strict=True):
-        found, shift, pushed = _eliminated(here, last, state, is_balanced, residual, find)
-        all_found.append(found)
-        shifts.append(shift)
-        is_definite &= jnp.all(found.is_minimum & (shift <= least)) if seeks_minimum else True
-        negative += jnp.sum(found.negative)
-        is_pushed |= pushed
 
-    # --- the bodies ---
-    full = jnp.zeros((count + 1, 6, count + 1, 6), dtype)
-    number = np.arange(count)
-    full = full.at[number, :, number, :].add(stiffness)
-    right = -jnp.pad(gradient, ((0, 1), (0, 0)))
-    for group, here, found in zip(assembly.groups, all_here, all_found, strict=True):
-        shares, couple = assembly.shares(group), here.coupling
-        condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
-        condensed -= jnp.einsum("kci,kcj->kij", couple.of_closure, found.multipliers_by_motions)
-        loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
-        loads += jnp.einsum("kci,kc->ki", couple.of_closure, found.multipliers)
-        condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
-        loads = (shares[:, None] * loads).reshape(-1, 2, 6)
-        for a in range(2):
-            right = right.at[group.body[:, a]].add(-loads[:, a])
-            for b in range(2):
-                full = full.at[group.body[:, a], :, group.body[:, b], :].add(condensed[:, a, :, b])
-    matrix = motions.T @ full[:count, :, :count].reshape(6 * count, 6 * count) @ motions
-    right = motions.T @ right[:count].reshape(-1)
-    values, vectors = jnp.linalg.eigh((matrix + matrix.T) / 2)
-    below = jnp.sum(values < -LEAST_STIFFNESS)
-    if seeks_minimum:
-        is_definite &= below == 0
-        may_push = is_balanced & (below > 0) & (state.pushes < MAX_PUSHES)
-        sides = jnp.where(jnp.sum(vectors * _generic(len(values), dtype)[:, None], axis=0) < 0, -1.0, 1.0)
-        aside = jnp.where(may_push & (values < -LEAST_STIFFNESS), PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
-        is_pushed |= may_push
-        stiff = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
-        coordinates = vectors @ ((vectors.T @ right + aside) / stiff)
-    else:
-        stiff = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
-        coordinates = vectors @ ((vectors.T @ right) / stiff)
-    body_motions = (motions @ coordinates).reshape(count, 6)
+class _Bodies(NamedTuple):
+    """The motions of the bodies that bring all into balance, and what their condensed stiffness tells."""
 
-    # --- the step ---
-    largest = jnp.max(jnp.sum(body_motions[:, 3:] ** 2, axis=1), initial=0.0)
-    all_steps, all_motions = [], []
-    padded = jnp.pad(body_motions, ((0, 1), (0, 0)))
-    for group, here, found in zip(assembly.groups, all_here, all_found, strict=True):
-        of_ends = padded[group.body]
-        flat = of_ends.reshape(-1, 12)
-        rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
-        multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
-        change = jax.vmap(lambda form, y: form.layout.forces(form.closure(y)))(group.form, multipliers)
-        all_steps.append(RodStep(here.points, here.linearization.bases, rotation, change))
-        all_motions.append(of_ends)
-        largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
-    part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
-    all_steps = [step._replace(force_change=part * step.force_change) for step in all_steps]
-    is_finite = jnp.isfinite(residual) & jnp.isfinite(largest)
+    motions: Float[Array, "j 6"]
+    below: Int[Array, ""]
+    is_pushed: Bool[Array, ""]
 
-    is_sought = is_definite if seeks_minimum else jnp.array(True)
-    is_done = is_balanced & is_sought
 
-    def moved_by(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""], tuple[Any, ...]]:
-        """The energy, with L of the rods, half of the squared closures, and the points of the rods."""
-        energy = jnp.sum(assembly.body_energies(poses, part * body_motions))
-        lacking, points = jnp.zeros((), dtype), []
-        for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
-            shares = assembly.shares(group)
-            value, closure, point = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
-                step, here.rods, of_ends
-            )
-            energy += jnp.sum(shares * value)
-            lacking += jnp.sum(shares[:, None] * closure**2) / 2
-            points.append(point)
-        return energy, lacking, tuple(points)
+class _Steps(NamedTuple):
+    """A step of all rods and bodies, of which `part` is the most that may be taken; forces change by that part."""
 
-    slope, rate = _slopes(assembly, all_here, all_steps, all_motions, gradient, body_motions)
-    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
-    slope += weight * rate
-
-    def tried(trial: _Trial) -> _Trial:
-        """First where the step begins, under the new forces; then all of it, and ever shorter parts."""
-        tries = trial.tries + 1
-        next_part = jnp.where(tries == 1, part, trial.part / 2)
-        energy, lacking, points = moved_by(jnp.where(tries == 0, 0.0, next_part))
-        merit = energy + weight * lacking
-        bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
-        bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
-        is_better = (tries > 0) & (is_pushed | (merit <= bound) | (not seeks_minimum))
-        return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
-
-    # At the end no step is tried.
-    start = _Trial(part, jnp.full((), -1), jnp.zeros((), dtype), is_done, tuple(here.points for here in all_here))
-    trial = jax.lax.while_loop(lambda trial: ~trial.is_better & (trial.tries <= MAX_HALVINGS), tried, start)
-    part, is_better = trial.part, trial.is_better
-
-    # --- what follows ---
-    status = jnp.where(state.iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
-    fails = ~is_better & (residual <= STAGNATION * floor)
-    status = jnp.where(fails, Status.ROUNDING_FLOOR, status)
-    fails |= ~is_better & (state.damping > MAX_SHIFT)
-    status = jnp.where(fails & (status == Status.RUNNING), Status.LINE_SEARCH_FAILED, status)
-    has_saddle = is_balanced & ~is_sought & (state.pushes >= MAX_PUSHES)
-    status = jnp.where(has_saddle, Status.SADDLE, status)
-    status = jnp.where(is_done, balanced, status)
-    status = jnp.where(is_finite | is_balanced, status, Status.NOT_FINITE)
-    goes = (status == Status.RUNNING) & is_better
-    taken = jnp.where(goes, part, 0.0)
-    there = poses.moved(taken * body_motions, assembly.length)
-    there = jax.tree.map(lambda new, old: jnp.where(goes, new, old), there, poses)
-    points = jax.tree.map(
-        lambda new, old: jnp.where(goes, new, old), trial.points, tuple(here.points for here in all_here)
-    )
-    damping = jnp.where(is_better, state.damping / SHIFT_GROWTH**2, SHIFT_GROWTH * state.damping)
-    damping = jnp.where(is_better, jnp.where(damping < FIRST_SHIFT, 0.0, damping), jnp.maximum(damping, FIRST_SHIFT))
-    return State(
-        points=points,
-        poses=there,
-        shifts=tuple(shifts),
-        damping=damping,
-        residual=residual,
-        residuals=tuple(residuals),
-        pushes=state.pushes + jnp.where(goes & is_pushed, 1, 0),
-        iterations=state.iterations + jnp.where(goes, 1, 0),
-        evaluations=state.evaluations + jnp.maximum(trial.tries, 1),
-        status=status.astype(int),
-        negative=(negative + below).astype(int),
-    )
+    rods: list[RodStep]
+    ends: list[Float[Array, "k 2 6"]]
+    bodies: Float[Array, "j 6"]
+    part: Float[Array, ""]
+    is_finite: Bool[Array, ""]
 
 
 class _Trial(NamedTuple):
@@ -477,19 +278,265 @@ class _Trial(NamedTuple):
     points: tuple[Any, ...]
 
 
-def _slopes(
+def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:
+    """One linearisation, the step that follows from it, and the part of it that is taken."""
+    all_here = []
+    for group, points in zip(assembly.groups, state.points, strict=True):
+        rods = assembly.rods(group, state.poses)
+        all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points)))
+    balance = _balance(assembly, all_here, state, solver)
+    rods = _eliminated_rods(all_here, state, balance, find)
+    bodies = _condensed(assembly, all_here, rods, state, balance, find)
+    steps = _steps(assembly, all_here, rods, bodies, balance, solver)
+    is_sought = (rods.is_definite & (bodies.below == 0)) if find == "minimum" else jnp.array(True)
+    is_pushed = rods.is_pushed | bodies.is_pushed
+    trial = _searched(assembly, all_here, state, steps, balance, is_pushed | (find != "minimum"), is_sought)
+    status = _status(state, balance, trial, steps, is_sought, solver)
+    goes = (status == Status.RUNNING) & trial.is_better
+    taken = jnp.where(goes, trial.part, 0.0)
+    there = state.poses.moved(taken * steps.bodies, assembly.length), trial.points
+    poses, points = jax.tree.map(
+        lambda new, old: jnp.where(goes, new, old), there, (state.poses, tuple(here.points for here in all_here))
+    )
+    return State(
+        points=points,
+        poses=poses,
+        shifts=rods.shifts,
+        damping=_damping(state, trial),
+        residual=balance.residual,
+        residuals=balance.residuals,
+        pushes=state.pushes + jnp.where(goes & is_pushed, 1, 0),
+        iterations=state.iterations + jnp.where(goes, 1, 0),
+        evaluations=state.evaluations + jnp.maximum(trial.tries, 1),
+        status=status.astype(int),
+        negative=(rods.negative + bodies.below).astype(int),
+    )
+
+
+def _linearized(rod: RodInBodies, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
+    form = rod.moved()
+    point = form.holding(point)
+    here, coupling = linearized_with_ends(rod, form, point)
+    aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
+    return point, here, coupling, form.rounding_floor(point), aside
+
+
+# --- balance ---------------------------------------------------------------------------------------------------------
+
+
+def _balance(assembly: Assembly, all_here: list[_Here], state: State, solver: Newton) -> _Balance:
+    count = assembly.count
+    gradient, stiffness = assembly.body_derivatives(state.poses)
+    dtype = gradient.dtype
+    gradient, scale = jnp.pad(gradient, ((0, 1), (0, 0))), jnp.zeros(count + 1, dtype)
+    residual, floor, is_closed = jnp.zeros((), dtype), jnp.zeros((), dtype), jnp.array(True)
+    for group, here in zip(assembly.groups, all_here, strict=True):
+        shares = assembly.shares(group)
+        of_ends = shares[:, None, None] * here.coupling.first.reshape(-1, 2, 6)
+        for end in range(2):
+            gradient = gradient.at[group.body[:, end]].add(of_ends[:, end])
+            scale = scale.at[group.body[:, end]].max(shares)
+        residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
+        floor = jnp.maximum(floor, jnp.max(here.floor))
+        closed = jax.vmap(lambda form, closure: form.is_closed(closure, solver.tolerance))
+        is_closed &= jnp.all(closed(group.form, here.linearization.closure))
+    motions, gradient, scale = assembly.bodies.motions, gradient[:count], scale[:count]
+    out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
+    residual = jnp.maximum(residual, jnp.max(jnp.abs(out_of_balance), initial=0.0))
+    balanced = jnp.where(residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
+    balanced = jnp.where(residual <= solver.tolerance, Status.CONVERGED, balanced)
+    stagnates = (state.iterations > 0) & (residual > state.residual / 2) & (residual <= STAGNATION * floor)
+    balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
+    is_balanced = is_closed & (balanced != Status.RUNNING)
+    residuals = tuple(here.linearization.residual for here in all_here)
+    return _Balance(gradient, stiffness, residuals, residual, floor, balanced, is_balanced)
+
+
+# --- the rods eliminated ---------------------------------------------------------------------------------------------
+
+
+def _eliminated_rods(all_here: list[_Here], state: State, balance: _Balance, find: Find) -> _Rods:
+    least = jnp.asarray(NEUTRAL, balance.residual.dtype)
+    all_found, shifts = [], []
+    is_definite, negative, is_pushed = jnp.array(True), jnp.zeros((), int), jnp.array(False)
+    for here, last in zip(all_here, state.shifts, strict=True):
+        found, shift, pushed = _eliminated(here, last, state, balance, find)
+        all_found.append(found)
+        shifts.append(shift)
+        is_definite &= jnp.all(found.is_minimum & (shift <= least))
+        negative += jnp.sum(found.negative)
+        is_pushed |= pushed
+    return _Rods(all_found, tuple(shifts), is_definite, negative, is_pushed)
+
+
+def _eliminated(
+    here: _Here, last: Float[Array, "k"], state: State, balance: _Balance, find: Find
+) -> tuple[Eliminated, Float[Array, "k"], Bool[Array, ""]]:
+    """Under the least shifts with which each rod by itself has a minimum, and those; whether a rod is pushed aside."""
+    least = jnp.asarray(NEUTRAL, last.dtype)
+    h = 1 / here.linearization.gradient.shape[2]
+    nothing = jnp.zeros_like(here.aside)
+    if find == "equilibrium":
+        shift = jnp.full_like(last, least)
+        found = jax.vmap(eliminated)(here.linearization, here.coupling, shift, nothing)
+        return found, shift, jnp.array(False)
+    shift = jnp.where(balance.is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
+    shift = jnp.maximum(shift, state.damping)
+    may_push = state.pushes < MAX_PUSHES
+
+    def pushes(shift: Float[Array, "k"]) -> Float[Array, "k"]:
+        is_near = balance.is_balanced | (balance.residual <= NEAR * shift)
+        pushed = may_push & ((state.pushes == 0) | is_near) & (shift > least) & (state.damping == 0)
+        return jnp.where(pushed, PUSH * h * shift, 0.0)
+
+    def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
+        shift, tries, found = trial
+        larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
+        shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
+        push = pushes(shift)[:, None, None] * here.aside
+        return shift, tries + 1, jax.vmap(eliminated)(here.linearization, here.coupling, shift, push)
+
+    kinds = jax.eval_shape(jax.vmap(eliminated), here.linearization, here.coupling, shift, nothing)
+    blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
+    shift, _, found = jax.lax.while_loop(
+        lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
+        again,
+        (shift, jnp.zeros((), int), blank),
+    )
+    return found, shift, jnp.any(pushes(shift) > 0)
+
+
+# --- the bodies ------------------------------------------------------------------------------------------------------
+
+
+def _condensed(
+    assembly: Assembly, all_here: list[_Here], rods: _Rods, state: State, balance: _Balance, find: Find
+) -> _Bodies:
+    matrix, right = _condensed_system(assembly, all_here, rods, balance)
+    motions, dtype = assembly.bodies.motions, right.dtype
+    values, vectors = jnp.linalg.eigh((matrix + matrix.T) / 2)
+    is_below = values < -LEAST_STIFFNESS
+    below = jnp.sum(is_below)
+    if find == "minimum":
+        is_pushed = balance.is_balanced & (below > 0) & (state.pushes < MAX_PUSHES)
+        sides = jnp.where(jnp.sum(vectors * _generic(len(values), dtype)[:, None], axis=0) < 0, -1.0, 1.0)
+        aside = jnp.where(is_pushed & is_below, PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
+        stiffness = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
+        coordinates = vectors @ ((vectors.T @ right + aside) / stiffness)
+    else:
+        is_pushed = jnp.array(False)
+        stiffness = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
+        coordinates = vectors @ ((vectors.T @ right) / stiffness)
+    return _Bodies((motions @ coordinates).reshape(assembly.count, 6), below, is_pushed)
+
+
+def _condensed_system(
+    assembly: Assembly, all_here: list[_Here], rods: _Rods, balance: _Balance
+) -> tuple[Float[Array, "k k"], Float[Array, "k"]]:
+    """S and its right side, along the motions that the supports of the bodies leave."""
+    count, dtype = assembly.count, balance.gradient.dtype
+    full = jnp.zeros((count + 1, 6, count + 1, 6), dtype)
+    number = np.arange(count)
+    full = full.at[number, :, number, :].add(balance.stiffness)
+    right = -jnp.pad(balance.gradient, ((0, 1), (0, 0)))
+    for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
+        shares, couple = assembly.shares(group), here.coupling
+        condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
+        condensed -= jnp.einsum("kci,kcj->kij", couple.of_closure, found.multipliers_by_motions)
+        loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
+        loads += jnp.einsum("kci,kc->ki", couple.of_closure, found.multipliers)
+        condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
+        loads = (shares[:, None] * loads).reshape(-1, 2, 6)
+        for a in range(2):
+            right = right.at[group.body[:, a]].add(-loads[:, a])
+            for b in range(2):
+                full = full.at[group.body[:, a], :, group.body[:, b], :].add(condensed[:, a, :, b])
+    motions = assembly.bodies.motions
+    full = full[:count, :, :count].reshape(6 * count, 6 * count)
+    return motions.T @ full @ motions, motions.T @ right[:count].reshape(-1)
+
+
+def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
+    """A direction along no other."""
+    return np.cos(1.0 + 2.0 * np.arange(count)).astype(dtype)
+
+
+# --- the step --------------------------------------------------------------------------------------------------------
+
+
+def _steps(
+    assembly: Assembly, all_here: list[_Here], rods: _Rods, bodies: _Bodies, balance: _Balance, solver: Newton
+) -> _Steps:
+    largest = jnp.max(jnp.sum(bodies.motions[:, 3:] ** 2, axis=1), initial=0.0)
+    padded = jnp.pad(bodies.motions, ((0, 1), (0, 0)))
+    steps, ends = [], []
+    for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
+        of_ends = padded[group.body]
+        flat = of_ends.reshape(-1, 12)
+        rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
+        multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
+        change = jax.vmap(lambda form, y: form.layout.forces(form.closure(y)))(group.form, multipliers)
+        steps.append(RodStep(here.points, here.linearization.bases, rotation, change))
+        ends.append(of_ends)
+        largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
+    part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
+    steps = [step._replace(force_change=part * step.force_change) for step in steps]
+    return _Steps(steps, ends, bodies.motions, part, jnp.isfinite(balance.residual) & jnp.isfinite(largest))
+
+
+def _searched(
     assembly: Assembly,
     all_here: list[_Here],
-    all_steps: list[RodStep],
-    all_motions: list[Array],
-    gradient: Float[Array, "j 6"],
-    body_motions: Float[Array, "j 6"],
+    state: State,
+    steps: _Steps,
+    balance: _Balance,
+    is_unjudged: Bool[Array, ""],
+    is_sought: Bool[Array, ""],
+) -> _Trial:
+    """The part of a step that is taken: the first of ever shorter ones that lowers the merit, or that is not judged."""
+
+    def merit_at(part: Float[Array, ""]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
+        """The energy, with L of the rods and the squared closures, and the points of the rods."""
+        energy = jnp.sum(assembly.body_energies(state.poses, part * steps.bodies))
+        lacking, points = jnp.zeros_like(energy), []
+        for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
+            shares = assembly.shares(group)
+            value, closure, point = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
+                step, here.rods, of_ends
+            )
+            energy += jnp.sum(shares * value)
+            lacking += jnp.sum(shares[:, None] * closure**2) / 2
+            points.append(point)
+        return energy + weight * lacking, tuple(points)
+
+    slope, rate = _slopes(assembly, all_here, steps, balance.gradient)
+    weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
+    slope += weight * rate
+
+    def tried(trial: _Trial) -> _Trial:
+        """First where the step begins, under the new forces; then all of it, and ever shorter parts."""
+        tries = trial.tries + 1
+        next_part = jnp.where(tries == 1, steps.part, trial.part / 2)
+        merit, points = merit_at(jnp.where(tries == 0, 0.0, next_part))
+        bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
+        bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
+        is_better = (tries > 0) & (is_unjudged | (merit <= bound))
+        return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
+
+    # At the end no step is tried.
+    is_done, here = balance.is_balanced & is_sought, tuple(here.points for here in all_here)
+    start = _Trial(steps.part, jnp.full((), -1), jnp.zeros_like(slope), is_done, here)
+    return jax.lax.while_loop(lambda trial: ~trial.is_better & (trial.tries <= MAX_HALVINGS), tried, start)
+
+
+def _slopes(
+    assembly: Assembly, all_here: list[_Here], steps: _Steps, gradient: Float[Array, "j 6"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How fast L, and half of the squared closures, change as a step begins under the new forces, which L has to first
     order.
     """
-    slope, rate = jnp.sum(gradient * body_motions), jnp.zeros((), gradient.dtype)
-    for group, here, step, of_ends in zip(assembly.groups, all_here, all_steps, all_motions, strict=True):
+    slope, rate = jnp.sum(gradient * steps.bodies), jnp.zeros((), gradient.dtype)
+    for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
 
         def of_rod(form: Form, here: Linearization, coupling: Coupling, step: RodStep, motions: Array):
             nothing = jnp.zeros_like(here.gradient)
@@ -511,43 +558,25 @@ def _slopes(
     return slope, rate
 
 
-def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
-    """A direction along no other."""
-    return np.cos(1.0 + 2.0 * np.arange(count)).astype(dtype)
+# --- what follows ----------------------------------------------------------------------------------------------------
 
 
-def _eliminated(
-    here: _Here, last: Float[Array, "k"], state: State, is_balanced: Bool[Array, ""], residual: Array, find: Find
-) -> tuple[Eliminated, Float[Array, "k"], Bool[Array, ""]]:
-    """Under the least shifts with which each rod by itself has a minimum, and those; whether a rod is pushed aside."""
-    least = jnp.asarray(NEUTRAL, last.dtype)
-    h = 1 / here.linearization.gradient.shape[2]
-    nothing = jnp.zeros_like(here.aside)
-    if find == "equilibrium":
-        shift = jnp.full_like(last, least)
-        found = jax.vmap(eliminated)(here.linearization, here.coupling, shift, nothing)
-        return found, shift, jnp.array(False)
-    shift = jnp.where(is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
-    shift = jnp.maximum(shift, state.damping)
-    may_push = state.pushes < MAX_PUSHES
+def _status(
+    state: State, balance: _Balance, trial: _Trial, steps: _Steps, is_sought: Bool[Array, ""], solver: Newton
+) -> Int[Array, ""]:
+    is_balanced, fails = balance.is_balanced, ~trial.is_better
+    status = jnp.where(state.iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
+    is_at_floor = fails & (balance.residual <= STAGNATION * balance.floor)
+    status = jnp.where(is_at_floor, Status.ROUNDING_FLOOR, status)
+    is_stuck = fails & ~is_at_floor & (state.damping > MAX_SHIFT)
+    status = jnp.where(is_stuck & (status == Status.RUNNING), Status.LINE_SEARCH_FAILED, status)
+    has_saddle = is_balanced & ~is_sought & (state.pushes >= MAX_PUSHES)
+    status = jnp.where(has_saddle, Status.SADDLE, status)
+    status = jnp.where(is_balanced & is_sought, balance.balanced, status)
+    return jnp.where(steps.is_finite | is_balanced, status, Status.NOT_FINITE)
 
-    def pushes(shift: Float[Array, "k"]) -> Float[Array, "k"]:
-        is_near = is_balanced | (residual <= NEAR * shift)
-        pushed = may_push & ((state.pushes == 0) | is_near) & (shift > least) & (state.damping == 0)
-        return jnp.where(pushed, PUSH * h * shift, 0.0)
 
-    def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
-        shift, tries, found = trial
-        larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
-        shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
-        push = pushes(shift)[:, None, None] * here.aside
-        return shift, tries + 1, jax.vmap(eliminated)(here.linearization, here.coupling, shift, push)
-
-    kinds = jax.eval_shape(jax.vmap(eliminated), here.linearization, here.coupling, shift, nothing)
-    blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
-    shift, _, found = jax.lax.while_loop(
-        lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
-        again,
-        (shift, jnp.zeros((), int), blank),
-    )
-    return found, shift, jnp.any(pushes(shift) > 0)
+def _damping(state: State, trial: _Trial) -> Float[Array, ""]:
+    """What stiffens rods and bodies in the next step: more where no part of this one is better."""
+    less, more = state.damping / SHIFT_GROWTH**2, jnp.maximum(SHIFT_GROWTH * state.damping, FIRST_SHIFT)
+    return jnp.where(trial.is_better, jnp.where(less < FIRST_SHIFT, 0.0, less), more)

@@ -68,9 +68,10 @@ def solve_harness(
     find: Any = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     shape: Guess | None = None,
+    is_told: bool = True,
 ) -> HarnessEquilibrium:
     """See `rodjax.solving.solve.solve`; `segments` may be those of each rod; `shape`: with which all rods begin where
-    there is no guess.
+    there is no guess; `is_told`: whether warnings say what is wrong with the result.
     """
     if discretization not in (None, "hermite"):
         raise ValueError(f"discretization must be 'hermite' where poses of ends are unknown, got {discretization!r}")
@@ -103,10 +104,11 @@ def solve_harness(
             result = _refined(
                 result, tuple(all_options), DEFAULT_RTOL if tolerance is None else tolerance, strain_limit
             )
-        else:
+        elif is_told:
             for group in result.groups:
                 warn_if_coarse(group)
-        _warn(result, strain_limit)
+        if is_told:
+            warn_of_harness(result, strain_limit)
     return result if fixed is harness else differentiable_harness(harness, result)
 
 
@@ -158,7 +160,8 @@ def _of_one_rod(result: HarnessEquilibrium) -> Equilibrium:
     )
 
 
-def _warn(result: HarnessEquilibrium, strain_limit: Any) -> None:
+def warn_of_harness(result: HarnessEquilibrium, strain_limit: Any) -> None:
+    """Outside `jit`, what is wrong with the result."""
     if not bool(result.converged):
         warn(result.in_words().splitlines()[0], NotConvergedWarning)
         return

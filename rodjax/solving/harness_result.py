@@ -1,6 +1,7 @@
 """What a solve of a harness gives: the equilibria of its rods, and the poses of its bodies."""
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -36,6 +37,9 @@ class HarnessEquilibrium(Described):
     - `iterations`, `evaluations` [...] of the solver; `residual` [...] largest component of the gradient, in EI/L^2 of
       each rod, of a body in that of its stiffest rod
     """
+
+    # In the place of an equilibrium.
+    instead: ClassVar[str] = "take one of its rods, result[name], or all of them, result.items()"
 
     groups: tuple[Equilibrium, ...]
     positions: Float[Array, "... j 3"]

@@ -1,0 +1,81 @@
+"""What couples the rods of a harness to its bodies, against automatic derivatives of the Lagrangian."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rodjax import Clamp, Clip, Free, PointForce, Rod, Scene, frame
+from rodjax.solving.assembly import RodStep
+from rodjax.solving.coupling import RodInBodies, linearized_with_ends
+from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of
+
+START = Clamp((0.1, 0, 0.2), frame((1, 0, -1)))
+END = Clamp((0.7, 0.2, 0.1), frame((1, 1, 1)))
+LOADS = {"gravity": (0.0, 3.0, -9.81), "point_forces": [PointForce(0.5, (0.0, 0.3, 0.1))]}
+PLAIN = (1.0, 1.0, 0.7, 100.0, 0.1)
+STRIP = (1.0, (1.0, 2.0), 0.7, 100.0, 0.1)
+SCENES = {
+    "tangents": Scene(Rod(*PLAIN), START, END, **LOADS),
+    "a free start": Scene(Rod(*PLAIN), Free(force=(1, 2, 3)), END, **LOADS),
+    "frames in a clip": Scene(Rod(*STRIP), START, END, clips=[Clip(0.25, (0.3, 0, 0.1))], gravity=LOADS["gravity"]),
+    "shear": Scene(Rod(*STRIP, GA=50.0, rest_curvature=(1.0, 0.5)), START, END, **LOADS),
+}
+
+
+# The others are the same code with shear, and without a torque.
+CASES = [
+    pytest.param(kind, marks=[] if kind in ("tangents", "frames in a clip") else pytest.mark.exhaustive)
+    for kind in SCENES
+]
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_coupling_is_that_of_automatic_derivatives(kind):
+    """Along one motion of both bodies that has all components, away from equilibrium."""
+    scene, random = SCENES[kind], np.random.default_rng(0)
+    options, _ = checked_options(scene, 2, None, "hermite", None)
+    state, first = first_state(scene, None, options)
+    direction = jnp.asarray(random.normal(size=12))
+
+    @jax.jit
+    def found_and_expected(scene, state, first, frames, offsets, shift):
+        search = Search.of(*in_units_of(scene, state), first, options)
+        form, units = search.form, search.units
+        ends = [end if isinstance(end, Clamp) else END for end in (scene.start, scene.end)]
+        # Bodies under which the clamps are where they are.
+        of_body = jnp.stack([end.frame @ own.T for end, own in zip(ends, frames, strict=True)])
+        places = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
+        rod = RodInBodies(form, units, jnp.ones(2, bool), frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8))
+        bases = form.bases_at(search.point)
+        rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
+        point = form.holding(form.moved(search.point, bases, 0.3 * rotation, 3.0 * force))
+        here, coupling = linearized_with_ends(rod, form, point)
+        expected = form.linearized(point)
+        more = len(here.closure) - form.layout.size
+
+        def value(rotation, forces, motions):
+            step = RodStep(point, here.bases, rotation, form.layout.forces(forces))
+            return step.value(rod, motions.reshape(2, 6), jnp.ones(()))[0]
+
+        nowhere = jnp.zeros_like(here.gradient), jnp.zeros(form.layout.size)
+        slopes = jax.grad(value, argnums=(0, 1, 2))
+        (_, _, by_motions), changes = jax.jvp(lambda motions: slopes(*nowhere, motions), (jnp.zeros(12),), (direction,))
+        # The torque is an unknown of its own in the linearisation: eliminated here.
+        rows, system = coupling.of_closure[:more], here.system
+        torque = jnp.linalg.solve(system.compliance[:more, :more], rows @ direction)
+        of_gradient = coupling.of_gradient @ direction + jnp.einsum("bkm,k->bm", system.border[:, :more], torque)
+        second = coupling.second @ direction + rows.T @ torque
+        found = coupling.first, of_gradient, coupling.of_closure[more:] @ direction, second
+        return (here, found), (expected, (by_motions, *changes))
+
+    axes = jnp.stack([frame((0.2, -1, 0.4)), frame((0.5, 1, 0.3))])
+    offsets = jnp.asarray(random.normal(size=(2, 3))) / 10
+    (here, found), (linearized, expected) = found_and_expected(
+        scene, state, first, axes, offsets, jnp.asarray(random.normal(size=100))
+    )
+    # Roundings of second derivatives up to 1e3.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-10), here, linearized)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+        assert not other.size or np.any(np.abs(other) > 0.1)

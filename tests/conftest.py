@@ -38,9 +38,10 @@ gc.set_threshold(100_000, 50, 100)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-rodjax.enable_compilation_cache()
-# Tests replace functions of the library, of which programs kept on disk would know nothing.
-os.environ["RODJAX_CACHE"] = "off"
+cache = rodjax.enable_compilation_cache()
+# Processes that tests start share their programs. Tests themselves replace functions of the library, of which programs
+# kept on disk would know nothing.
+os.environ["RODJAX_CACHE"] = str(cache / "tests")
 # Each worker has one core; tests of threads ask for them.
 os.environ["RODJAX_THREADS"] = "1"
 rodjax.keep_programs(False)

@@ -38,9 +38,10 @@ gc.set_threshold(100_000, 50, 100)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-rodjax.enable_compilation_cache()
-# Tests replace functions of the library, of which programs kept on disk would know nothing.
-os.environ["RODJAX_CACHE"] = "off"
+cache = rodjax.enable_compilation_cache()
+# Processes that tests start share their programs. Tests themselves replace functions of the library, of which programs
+# kept on disk would know nothing.
+os.environ["RODJAX_CACHE"] = str(cache / "tests")
 # Each worker has one core; tests of threads ask for them.
 os.environ["RODJAX_THREADS"] = "1"
 rodjax.keep_programs(False)
@@ -53,21 +54,67 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the slow tests too")
 
 
-# Files whose tests share nothing: each of their tests goes to the worker that is free first, at the end. Those of all
-# other files stay together, as their fixtures and programs are in the memory of one worker.
-APART = ("test_experiments", "test_validation", "test_readme")
+# Files whose tests share nothing: each of their tests goes to the worker that is free first. Those of all other files
+# stay together, as their fixtures and programs are in the memory of one worker.
+APART = ("test_experiments", "test_validation", "test_readme", "test_docs")
+# What takes minutes begins first, so that the workers end together; by CPU seconds, those of slow tests included.
+LONGEST = (
+    "test_contact",
+    "test_experiments.py::test_engine_bay",
+    "test_framed",
+    "test_fit",
+    "test_route_optima",
+    "test_clips",
+    "test_sweep",
+    "test_clips_frames",
+    "test_continuum",
+    "test_continuum_clips",
+    "test_cluster",
+    "test_continuation",
+    "test_experiments.py::test_stress",
+    "test_implicit",
+    "test_harness",
+    "test_docs",
+    "test_continuum_frames",
+    "test_tolerances",
+    "test_window_browser",
+    "test_margins",
+    "test_route",
+    "test_hermite",
+    "test_files",
+    "test_composition",
+    "test_experiments",
+)
+
+
+def _scope(nodeid: str) -> str:
+    """What goes to a worker as a whole."""
+    path = nodeid.split("::", 1)[0]
+    return nodeid if Path(path).stem in APART else path
+
+
+def _rank(nodeid: str) -> int:
+    """In the order of `LONGEST`; a test by its own name before its file's."""
+    file = Path(nodeid.split("::", 1)[0])
+    names = f"{file.name}::{nodeid.rsplit('::', 1)[-1]}", file.stem
+    return next((LONGEST.index(name) for name in names if name in LONGEST), len(LONGEST))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     from xdist.scheduler import LoadScopeScheduling
 
-    class ByFile(LoadScopeScheduling):
+    class LongestFirst(LoadScopeScheduling):
         def _split_scope(self, nodeid):
-            path = nodeid.split("::", 1)[0]
-            return nodeid if Path(path).stem in APART else path
+            return _scope(nodeid)
 
-    return ByFile(config, log)
+        def _reschedule(self, node):
+            # A worker asks for more while it has one test left, not two: with less in hand the workers end together.
+            if node.shutting_down or not self.workqueue or self._pending_of(self.assigned_work[node]) < 2:
+                super()._reschedule(node)
+
+    config.option.loadscopereorder = False  # not by the number of tests, but as they are collected
+    return LongestFirst(config, log)
 
 
 def pytest_collection_modifyitems(config, items):
@@ -79,6 +126,8 @@ def pytest_collection_modifyitems(config, items):
             )
         if marks & {"slow", "exhaustive"} and not config.getoption("--slow"):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+    if hasattr(config, "workerinput"):  # of xdist
+        items.sort(key=lambda item: _rank(item.nodeid))
 
 
 @pytest.fixture

@@ -346,7 +346,6 @@ def test_derivatives_by_rest_shape_stiffnesses_and_jumps(discretization):
         return rj.solve(scene, segments=8, discretization=discretization, solver=solver).end_force
 
     at = jnp.array([2.0, -1.0, 1.0, 1.0, 2.0, 0.4, 0.6])
-    force = jax.jit(force)
     forward, reverse = jax.jacfwd(force)(at), jax.jacrev(force)(at)
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-10)
     for k in range(len(at)):

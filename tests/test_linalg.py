@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
@@ -48,9 +49,9 @@ def dense(system: SaddlePointSystem) -> np.ndarray:
     return np.block([[matrix.reshape(n * b, n * b), border], [border.T, -np.asarray(system.compliance)]])
 
 
-factored = jax.jit(factor)
-at_once = jax.jit(factor_and_solve, static_argnames="is_regularized")
-afterwards = jax.jit(lambda system, f, c: factor(system).solve(f, c))
+factored = by_numpy(factor)
+at_once = by_numpy(factor_and_solve)
+afterwards = by_numpy(lambda system, f, c: factor(system).solve(f, c))
 
 
 # All depths of the elimination up to five, odd and even; more columns than unknowns.
@@ -119,7 +120,7 @@ def test_a_rod_that_can_turn_as_a_whole_is_solved_to_many_digits(span):
     assert result.stable
     assert result.neutral
 
-    @jax.jit
+    @by_numpy
     def seen(result, shift):
         form, point = form_and_point(result)
         system = form.linearized(point).system.shifted(shift / 33)
@@ -278,10 +279,10 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
         f, c = system.times(unit[: 2 * m].reshape(2, m), unit[2 * m :])
         return jnp.concatenate([f.reshape(-1), c])
 
-    matrix = np.array(jax.vmap(column)(jnp.eye(2 * m + multipliers))).T
+    matrix = np.array(by_numpy(jax.vmap(column))(jnp.eye(2 * m + multipliers))).T
     assert np.allclose(matrix, matrix.T, rtol=1e-13, atol=1e-13) == (loads is None)  # roundings
     right = np.random.default_rng(1).normal(size=len(matrix))
-    factors = factor(system)
+    factors = factored(system)
     assert isinstance(factors, ChainFactors)
     given = jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :])
     places = np.arange(2 * m + 1, 2 * m + 1 + pressures)
@@ -290,7 +291,7 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
     of_nodes = np.where(np.ravel(system.contacts.is_closed[:2]), 1e-5, 0.0)
     hard[places[: of_nodes.size], places[: of_nodes.size]] += of_nodes
     for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
-        found, truth = np.concatenate([np.ravel(x) for x in solve(*given)]), np.linalg.solve(full, right)
+        found, truth = np.concatenate([np.ravel(x) for x in by_numpy(solve)(*given)]), np.linalg.solve(full, right)
         is_pressure = np.isin(np.arange(len(found)), places)
         # The contacts, of 1e5, cost the dense solve some digits; a pressure is a difference over its softness.
         np.testing.assert_allclose(found[~is_pressure], truth[~is_pressure], rtol=1e-8, atol=1e-10)

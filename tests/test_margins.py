@@ -126,7 +126,7 @@ def test_the_softest_motion_of_a_straight_rod():
         return margins.value[0], (margins.value[0], margins.margin[0])
 
     point = (jnp.array(L), jnp.array(0.0))
-    (by_length, by_pull), (value, margin) = jax.jit(jax.jacfwd(found, (0, 1), has_aux=True))(*point)
+    (by_length, by_pull), (value, margin) = jax.jacfwd(found, (0, 1), has_aux=True)(*point)
     stiffness = 4 * np.pi**2 * EI / L**2
     # Elements of fourth order, 16 of them along a whole wave: 2e-5.
     assert value == pytest.approx(stiffness, rel=4e-5)
@@ -199,15 +199,14 @@ def test_derivatives_are_those_of_solves():
         "clips.0.tangent": jnp.zeros(3),
         "end.frame": jnp.zeros(3),
     }
-    rates = jax.jit(jax.jacfwd(found))(nowhere)
-    solve = jax.jit(found)
+    rates = jax.jacfwd(found)(nowhere)
     rng = np.random.default_rng(1)
     h = 1e-6
     for _ in range(3):
         way = {name: jnp.asarray(rng.normal(size=zero.shape)) for name, zero in nowhere.items()}
         way["rod.EI"] = 0.02 * way["rod.EI"]
         along = sum(jnp.tensordot(rates[name], way[name], way[name].ndim) for name in way)
-        ends = [solve(jax.tree.map(lambda d, sign=sign: sign * h * d, way)) for sign in (1, -1)]
+        ends = [found(jax.tree.map(lambda d, sign=sign: sign * h * d, way)) for sign in (1, -1)]
         # Central differences of solves to 1e-12 EI/L^2: 1e-6 by their rounding, beside the largest.
         np.testing.assert_allclose(along, (ends[0] - ends[1]) / (2 * h), rtol=2e-6, atol=2e-6)
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 from scenes import GRAVITY, ORIGIN, loaded_scenes
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +52,7 @@ def begin(name: str, kind: str = "edges") -> tuple[MixedForm, MixedPoint]:
     return form, MixedPoint(tangents, jnp.array(force)[:, None], jnp.array(twist))
 
 
-linearized = eqx.filter_jit(MixedForm.linearized)
+linearized = by_numpy(MixedForm.linearized)
 
 
 def by_all(system: SaddlePointSystem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,7 +97,7 @@ def vector_and_closure(here: Linearization) -> tuple[jax.Array, jax.Array]:
 def test_gradient_is_the_derivative_of_the_energy(name, kind):
     form, point = begin(name, kind)
     here, energy, nowhere = derivatives(form, point, lambda here: here.energy)
-    by_rotation, by_force = jax.jit(jax.grad(energy, argnums=(0, 1)))(*nowhere)
+    by_rotation, by_force = by_numpy(jax.grad(energy, argnums=(0, 1)))(*nowhere)
     # Derivatives up to 1e3, and a few hundred roundings.
     np.testing.assert_allclose(here.gradient, by_rotation, rtol=0, atol=1e-11)
     if here.closure.size:
@@ -108,7 +109,7 @@ def test_gradient_is_the_derivative_of_the_energy(name, kind):
 def test_the_system_is_the_derivative_of_gradient_and_closure(name, kind):
     form, point = begin(name, kind)
     here, both, nowhere = derivatives(form, point, vector_and_closure)
-    (vectors, vectors_by_force), (closure, closure_by_force) = jax.jit(jax.jacfwd(both, argnums=(0, 1)))(*nowhere)
+    (vectors, vectors_by_force), (closure, closure_by_force) = by_numpy(jax.jacfwd(both, argnums=(0, 1)))(*nowhere)
     size = here.gradient.size
     by_rotation = np.einsum("cin,cnjm->nimj", here.bases, vectors).reshape(size, size)
     by_rotation += np.diag(np.einsum("cin->ni", here.bases**2).ravel() == 0)  # the unit block of a held tangent

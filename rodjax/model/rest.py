@@ -12,6 +12,7 @@ from rodjax.checks import DEFAULT_D2, direction, is_known, number_array, rotatio
 from rodjax.geometry.rotations import carried, columns, continuous, from_frame, inverse, product, rotated, screw, unit
 from rodjax.geometry.vectors import cross, dot
 from rodjax.model.along import Pair, Spline, Steps, Value, scaled, value_at
+from rodjax.programs.compilation import compiled
 
 # Steps in which a varying curvature is integrated between two neighbouring points of a mesh.
 STEPS = 4
@@ -121,19 +122,9 @@ class SpaceCurve(eqx.Module):
         if len(shape) != 2 or shape[0] < 4 or shape[1] != 3:
             raise ValueError(f"points must have the shape (m, 3) with m >= 4, got {shape}")
         points = jnp.asarray(number_array(points, "points", shape))
-        chords = jnp.sqrt(jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1))
-        if is_known(chords) and not np.all(np.asarray(chords) > 0):
+        if is_known(points) and not np.all(np.linalg.norm(np.diff(np.asarray(points), axis=0), axis=1) > 0):
             raise ValueError("points must not repeat one after another: their tangent is not known")
-        # By the sums of the chords first, then by the arclengths of that curve.
-        knots = jnp.concatenate([jnp.zeros_like(chords[:1]), jnp.cumsum(chords)])
-        spline = Spline.through(knots, points)
-        parts = jnp.array(LENGTH_POINTS, knots.dtype)
-        places = knots[:-1, None] + jnp.diff(knots)[:, None] * parts[None]
-        speed = _size(_slope(spline, places))
-        lengths = jnp.diff(knots) * jnp.sum(speed * jnp.array(LENGTH_WEIGHTS, knots.dtype)[None], axis=1)
-        s = jnp.concatenate([jnp.zeros_like(lengths[:1]), jnp.cumsum(lengths)])
-        slopes = _slope(Spline.through(s, points), s)
-        tangents = slopes / _size(slopes)[None]
+        s, tangents = _arclengths_and_tangents(points)
         if frames is not None:
             given = jnp.asarray(number_array(frames, "frames", (shape[0], 3, 3)))
             for k, frame in enumerate(given if is_known(given) else ()):
@@ -182,6 +173,23 @@ class SpaceCurve(eqx.Module):
 RestShape = RestStrain | SpaceCurve
 
 
+@compiled
+def _arclengths_and_tangents(points: Float[Array, "k 3"]) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
+    """Of the curve through points, at these."""
+    # By the sums of the chords first, then by the arclengths of that curve.
+    chords = jnp.sqrt(jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1))
+    knots = jnp.concatenate([jnp.zeros_like(chords[:1]), jnp.cumsum(chords)])
+    spline = Spline.through(knots, points)
+    parts = jnp.array(LENGTH_POINTS, knots.dtype)
+    places = knots[:-1, None] + jnp.diff(knots)[:, None] * parts[None]
+    speed = _size(_slope(spline, places))
+    lengths = jnp.diff(knots) * jnp.sum(speed * jnp.array(LENGTH_WEIGHTS, knots.dtype)[None], axis=1)
+    s = jnp.concatenate([jnp.zeros_like(lengths[:1]), jnp.cumsum(lengths)])
+    slopes = _slope(Spline.through(s, points), s)
+    return s, slopes / _size(slopes)[None]
+
+
+@compiled
 def _carried(d1: Float[Array, "3"], tangents: Float[Array, "3 k"]) -> Float[Array, "3 k"]:
     """A director at the first tangent, carried along all of them without twist."""
     first = from_frame(jnp.stack([d1, jnp.cross(tangents[:, 0], d1), tangents[:, 0]], axis=1))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 from scipy.integrate import solve_bvp
 
 import rodjax as rj
@@ -234,16 +235,16 @@ def test_contact_points_within_elements_have_exact_derivatives():
         return jnp.sum(middles.points.T * forces)
 
     nothing = jnp.zeros((3, 5))
-    middles = Middles.of(*map(jnp.asarray, (places, tangents, axes)), jnp.ones(3), jnp.asarray(h))
+    middles = by_numpy(Middles.of)(*map(jnp.asarray, (places, tangents, axes)), jnp.ones(3), jnp.asarray(h))
     rates = np.einsum("cn,cemn->enm", forces, middles.rates)
     first = np.zeros((3, 5))
     first[:-1] += rates[0]
     first[1:] += rates[1]
-    np.testing.assert_allclose(first, jax.grad(moved)(nothing), rtol=0, atol=1e-14)
-    blocks, second = np.asarray(middles.second(jnp.asarray(forces))), np.zeros((3, 5, 3, 5))
+    np.testing.assert_allclose(first, by_numpy(jax.grad(moved))(nothing), rtol=0, atol=1e-14)
+    blocks, second = np.asarray(by_numpy(middles.second)(jnp.asarray(forces))), np.zeros((3, 5, 3, 5))
     for k in range(2):
         second[k : k + 2, :, k : k + 2, :] += blocks[..., k].reshape(2, 5, 2, 5)
-    np.testing.assert_allclose(second, jax.hessian(moved)(nothing), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(second, by_numpy(jax.hessian(moved))(nothing), rtol=0, atol=1e-14)
     # On a circle of an element's length/8 it is where the circle is, to the sixth order.
     angle, turn = np.array([0.0, 0.125]), np.zeros((3, 2, 2))
     circle = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)
@@ -393,7 +394,7 @@ def test_derivatives_are_those_of_differences(touching):
 def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
     """With what the curvature of the cylinder changes as nodes slide on it."""
     form, point = form_and_point(touching)
-    here = form.linearized(point)
+    here = by_numpy(form.linearized)(point)
     generator = np.random.default_rng(0)
     rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
     change = jnp.asarray(generator.normal(size=point.end_force.shape))
@@ -406,16 +407,16 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
         others = jax.tree.map(lambda change: part * change, step)
         return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
 
-    (_, rows), (_, expected) = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
+    (_, rows), (_, expected) = by_numpy(lambda: jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),)))()
     before = len(rows) - form.layout.size - displacements.size - step.pressures.size
     multipliers = jnp.concatenate(
         [jnp.zeros(before), step.pressures.ravel(), displacements.ravel(), form.layout.components(change)]
     )
-    _, found = here.system.times(rotation, multipliers)
+    _, found = by_numpy(here.system.times)(rotation, multipliers)
     nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
     # Where a node is held the system holds its displacement, which is none.
     np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
-    assert float(jnp.max(jnp.abs(form.contacts(point).stiffness))) > 1.0  # the cylinder curves where it is touched
+    assert float(jnp.max(jnp.abs(by_numpy(form.contacts)(point).stiffness))) > 1.0  # the cylinder curves where it is touched
 
 
 def test_what_is_far_away_changes_nothing():

@@ -232,16 +232,14 @@ def random_chain(elements: int, seed: int = 0) -> ChainSystem:
 
 
 def with_inner_contacts(system: ChainSystem) -> ChainSystem:
-    """And with a third obstacle that touches every second element, itself as soft as 0.05, and what couples both nodes
-    of each element beside it.
+    """And with a third obstacle that touches every second element, and what couples both nodes of each element beside
+    it.
     """
     rng = np.random.default_rng(3)
     elements = system.across.shape[-1]
     free = np.where(system.held, 0.0, 1.0)
     places = rng.normal(size=(1, 3, 2, elements)) * np.stack([free[:-1], free[1:]])
-    inner = InnerRows(
-        jnp.asarray(rng.normal(size=(1, 2, 2, elements))), jnp.asarray(places), jnp.full(elements, 0.05), 2
-    )
+    inner = InnerRows(jnp.asarray(rng.normal(size=(1, 2, 2, elements))), jnp.asarray(places), 2)
     contacts = system.contacts
     is_closed = np.append(np.arange(elements) % 2 == 0, False)[None]
     contacts = ContactRows(
@@ -288,8 +286,7 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
     places = np.arange(2 * m + 1, 2 * m + 1 + pressures)
     # As soft as 1e-5, and as if they were hard.
     hard = np.array(matrix)
-    of_nodes = np.where(np.ravel(system.contacts.is_closed[:2]), 1e-5, 0.0)
-    hard[places[: of_nodes.size], places[: of_nodes.size]] += of_nodes
+    hard[places, places] += np.where(np.ravel(system.contacts.is_closed), 1e-5, 0.0)
     for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
         found, truth = np.concatenate([np.ravel(x) for x in by_numpy(solve)(*given)]), np.linalg.solve(full, right)
         is_pressure = np.isin(np.arange(len(found)), places)

@@ -306,15 +306,26 @@ class ChainFactors(eqx.Module):
 
         def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
             left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
-            return jax.tree.map(jnp.add, found, self.solve_softly(*left)), None
+            return jax.tree.map(jnp.add, found, self._solved_once(*left)), None
 
-        found, _ = jax.lax.scan(nearer, self.solve_softly(f, c), None, length=HARDENINGS)
+        found, _ = jax.lax.scan(nearer, self._solved_once(f, c), None, length=HARDENINGS)
         return found
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        """With the softness of the contacts."""
+        """With the softness of the contacts. Those within elements couple their nodes so stiffly that elimination loses
+        half of the digits; what is left is asked for again.
+        """
+        found = self._solved_once(f, c)
+        if self.contacts.inner is None:
+            return found
+        left = jax.tree.map(jnp.subtract, (f, c), self.whole.times(*found))
+        return jax.tree.map(jnp.add, found, self._solved_once(*left))
+
+    def _solved_once(
+        self, f: Float[Array, "b m"], c: Float[Array, "j"]
+    ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
         pulling = -jnp.where(contacts.is_closed, given / contacts.softness, 0.0)

@@ -30,7 +30,7 @@ def connected(address: str | None, say: Callable[[str], None]) -> Iterator[Execu
             f"--scheduler needs Dask, which is not installed ({error}): pip install 'rodjax[cluster]'"
         ) from None
     # Lost connections are told by the command in its own way.
-    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=TIMEOUT, set_as_default=False)

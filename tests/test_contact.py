@@ -416,7 +416,8 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
     nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
     # Where a node is held the system holds its displacement, which is none.
     np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
-    assert float(jnp.max(jnp.abs(by_numpy(form.contacts)(point).stiffness))) > 1.0  # the cylinder curves where it is touched
+    # The cylinder curves where it is touched.
+    assert float(jnp.max(jnp.abs(by_numpy(form.contacts)(point).stiffness))) > 1.0
 
 
 def test_what_is_far_away_changes_nothing():

@@ -24,6 +24,8 @@ from rodjax.window.opening import session_of, view
 from rodjax.window.session import SNAP_WAY, Session
 
 SEGMENTS = 10
+# Between the ends of `hanging`, too large to go around.
+WALL = rj.Box((0.4, 0.0, 0.0), (0.02, 20.0, 20.0))
 LEVEL = rj.frame((1.0, 0.0, 0.0))
 
 
@@ -460,7 +462,7 @@ def test_arguments_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="segments must be a whole number from 2"):
         Session(hanging(), segments=1)
     with pytest.raises(ValueError, match="scene must have an equilibrium to begin with, got none: not converged"):
-        Session(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), segments=SEGMENTS)  # too large to go around
+        Session(hanging(obstacles=[WALL]), segments=SEGMENTS)
 
 
 @pytest.fixture
@@ -504,6 +506,6 @@ def test_without_viser_the_command_says_what_to_install(scene_toml, capsys, monk
 
 
 def test_a_scene_without_an_equilibrium_exits_with_3(tmp_path, capsys):
-    rj.write_scene(hanging(obstacles=[rj.Sphere((0.4, 0.0, 0.0), 0.39)]), tmp_path / "scene.toml", segments=SEGMENTS)
+    rj.write_scene(hanging(obstacles=[WALL]), tmp_path / "scene.toml", segments=SEGMENTS)
     assert main(["view", str(tmp_path / "scene.toml")]) == 3
     assert "scene must have an equilibrium to begin with, got none: not converged" in capsys.readouterr().err

@@ -753,9 +753,19 @@ def _outcome(equilibrium: Equilibrium) -> str:
     if equilibrium.status.ndim == 0:
         return (
             f"{messages[codes[0]]}; residual {float(equilibrium.residual):.1e} EI/L^2 "
-            f"after {int(equilibrium.iterations)} iterations{_too_short(equilibrium)}"
+            f"after {int(equilibrium.iterations)} iterations{_stuck_within(equilibrium)}{_too_short(equilibrium)}"
         )
     return "\n".join(f"{count} {messages[code]}" for code, count in zip(codes, counts, strict=True))
+
+
+def _stuck_within(equilibrium: Equilibrium) -> str:
+    """In which obstacle a rod lies that found no equilibrium, and where."""
+    if bool(equilibrium.converged) or equilibrium.status == Status.PASSED_THROUGH or not equilibrium.scene.obstacles:
+        return ""
+    found = _passage_of(equilibrium)
+    if not found.is_within:
+        return ""
+    return f"; the rod lies {_place_of(found, equilibrium)}"
 
 
 def _too_short(equilibrium: Equilibrium) -> str:
@@ -796,13 +806,16 @@ def _passages(equilibrium: Equilibrium) -> str:
     passed = np.argwhere((np.asarray(equilibrium.status) == Status.PASSED_THROUGH) & ~np.asarray(found.is_sound))
     named = []
     for index in map(tuple, passed[:MOST_NAMED]):
-        k, length = int(found.obstacle[index]), float(equilibrium.scene.rod.length[index])
-        how = "within" if found.is_within[index] else "through"
         which = f"{list(map(int, index))}: " if index else ""
-        kind = type(equilibrium.scene.obstacles[k]).__name__
-        named.append(f"{which}{how} obstacles[{k}] ({kind}) at s = {float(found.place[index]) * length:.4g} m")
+        named.append(which + _place_of(found, equilibrium, index))
     more = [f"and {len(passed) - MOST_NAMED} more"] if len(passed) > MOST_NAMED else []
     return "".join(f" ({part})" for part in [", ".join([*named, *more])] if part)
+
+
+def _place_of(found: Passage, equilibrium: Equilibrium, index: tuple[int, ...] = ()) -> str:
+    k, s = int(found.obstacle[index]), float(found.place[index] * equilibrium.scene.rod.length[index])
+    how = "within" if found.is_within[index] else "through"
+    return f"{how} obstacles[{k}] ({type(equilibrium.scene.obstacles[k]).__name__}) at s = {s:.4g} m"
 
 
 @over_leading_axes

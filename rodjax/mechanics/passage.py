@@ -34,7 +34,7 @@ WITHIN = 0.05
 
 
 class Before(eqx.Module):
-    """Where a rod was when it last was sound, at equal steps of its arclength, and the obstacles then, in SI units."""
+    """Where a rod last was sound, at places along it (`NodalForm.places`), and the obstacles then, in SI units."""
 
     points: Float[Array, "... places 3"]
     obstacles: tuple[Obstacle, ...]

@@ -1,6 +1,9 @@
 """Scenes that several tests look at."""
 
-from rodjax import Clamp, Free, Pin, PointForce, Scene, Swivel, frame, problems
+import itertools
+from collections.abc import Sequence
+
+from rodjax import Clamp, Free, Mesh, Pin, PointForce, Scene, Swivel, frame, problems
 
 GRAVITY = (0.0, 3.0, -9.81)
 ORIGIN = (0.0, 0.0, 0.0)
@@ -41,3 +44,10 @@ def loaded_scenes() -> dict[str, Scene]:
         "end moment": Scene(rod, clamp, Free(force=(0.0, EI, 0.0), moment=(EI, 2 * EI, -EI))),
         "start moment": Scene(rod, Free(moment=(EI, 2 * EI, -EI)), other, GRAVITY),
     }
+
+
+def box_mesh(low: Sequence[float], high: Sequence[float]) -> Mesh:
+    """A box along the axes between two corners, as triangles."""
+    corners = list(itertools.product(*zip(low, high, strict=True)))
+    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    return Mesh(corners, [triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))])

@@ -854,7 +854,8 @@ def warn_if_coarse(equilibrium: Equilibrium) -> None:
     is_coarse &= np.asarray(equilibrium.converged)
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
-        most = f"{np.max(turn[is_coarse]):.1f} rad"
+        most = np.max(turn[is_coarse])
+        most = f"{most:.1f} rad" if most < 2 * math.pi else "more than a whole turn"  # no figure on such a mesh
         warn(
             f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {most} along one of them; "
             "more segments, or rtol in the place of segments, may help; rodjax.describe tells the errors",

@@ -4,15 +4,18 @@ a scene lies in space.
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import BRANCHES
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax.cli import main
 from rodjax.identification.files import read_fit_files
+from rodjax.io.harness_file import harness_file
 from rodjax.io.scene_file import SceneFileError, SceneReader, read_scene_file
 from rodjax.io.scene_keys import SceneVariations
 from rodjax.io.scene_writing import write_scene
@@ -44,12 +47,14 @@ def scene(rod=HOSE, start=START, end=END, loads=GRAVITY, **others):
 # --- in any place of space -------------------------------------------------------------------------------------------
 
 PLACES = ("position", "point", "points")
-VECTORS = (*PLACES, "tangent", "d2", "force", "moment", "couple", "gravity", "normal")
+VECTORS = (*PLACES, "tangent", "d2", "force", "moment", "couple", "gravity", "normal", "axis", "directions")
 
 
 def moved(value, turn, shift, key=""):
     """The tables of a scene, turned and shifted as a whole: vectors as they are written, with their units."""
     if isinstance(value, dict):
+        if value.get("support") == "joint":  # in the axes of a body, whose pose is unknown
+            return value
         # Loads that follow are along the frames of the rod.
         keep = ("force", "moment", "couple") if value.get("follower") else ()
         return {name: entry if name in keep else moved(entry, turn, shift, name) for name, entry in value.items()}
@@ -61,7 +66,7 @@ def moved(value, turn, shift, key=""):
         return value
     numbers, unit = (value, "") if isinstance(value, list) else value.rsplit("] ", 1)
     vectors = np.array(numbers if isinstance(numbers, list) else eval(f"{numbers}]"))
-    vectors = vectors @ turn.T + (shift if key in PLACES else 0)
+    vectors = vectors @ turn.T + (shift * {"m": 1, "cm": 100}[unit] if key in PLACES else 0)
     return f"{vectors.tolist()} {unit}" if unit else vectors.tolist()
 
 
@@ -87,11 +92,30 @@ SCENES = {
         end=FREE | dict(moment="[1e-3, 2e-3, 1e-3] N m", force="[0, 4e-3, 2e-3] N"), loads={}
     ),
     "couples on one clamp": scene(end=PIN, loads=GRAVITY | dict(distributed_couple=[dict(couple="[1e-3, 0, 1e-3] N")])),
+    "loads within": scene(
+        HOSE | dict(GA="300 N", rest_strain=0.01),
+        START | LEVEL,
+        END | dict(d2=[0, 0.2, 1]),
+        loads=dict(
+            point_force=[dict(at="0.4 m", force="[0, 0.1, 0.02] N", follower=True)],
+            distributed_force=[dict(force="[0.1, 0, 0.3] N/m", part="[0.4, 0.7] m")],
+            distributed_couple=[dict(couple="[1e-3, 0, 1e-3] N", part="[0.2, 0.7] m", follower=True)],
+            point_couple=[dict(at="0.7 m", couple="[1e-3, 2e-3, 0] N m")],
+        ),
+    ),
+    "followers on a free end": scene(
+        start=START | LEVEL,
+        end=FREE | dict(moment="[1e-3, 2e-3, 1e-3] N m", force="[0, 4e-3, 2e-3] N", follower=True),
+    ),
+    "sliding clips": scene(clips=[clip | dict(sliding=True) for clip in CLIPS]),
     "strip": scene(STRIP, START | LEVEL, END | dict(d2=[0, 0.2, 1])),
     "curved": scene(CENTERLINE, START | LEVEL, END | dict(d2=[0, 0.2, 1])),
 }
 # Those that share a program with no other are solved in the long run.
-SLOW = ("clips", "a clip with a frame", "couples on one clamp", "moment on a free end", "curved", "one stated")
+SLOW = (
+    *("clips", "sliding clips", "a clip with a frame", "couples on one clamp", "moment on a free end"),
+    *("followers on a free end", "curved", "one stated"),
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in SCENES])
@@ -116,6 +140,42 @@ def test_a_scene_turned_and_shifted_gives_the_same(name):
         vectors = np.asarray(getattr(found, key))
         back = np.einsum("kji,kj->ki", np.stack(turns), vectors)
         np.testing.assert_allclose(back, vectors[:1].repeat(5, axis=0), atol=1e-6 * size, err_msg=key)
+
+
+HINGE = dict(support="hinge", position="[0.7, 0.2, -0.1] m", tangent=[0.3, 1, 0], d2=[0, 0.2, 1], axis=[0, 0.2, 1])
+SLIDER = dict(support="slider", position="[0.7, 0.2, -0.1] m", directions=[[0, 1, 0.2], [0, 0, 1]])
+SOFT = END | dict(d2=[0, 0.2, 1], translation="2 N/m", rotation="1e-2 N m/rad")
+MOVABLE = {
+    "hinge": scene(start=START | LEVEL, end=HINGE),
+    "slider": scene(start=START | LEVEL, end=SLIDER),
+    "springs": scene(start=START | LEVEL, end=SOFT),
+    "harness": tomllib.loads(BRANCHES),
+}
+
+
+@pytest.mark.parametrize("name", MOVABLE)
+def test_ends_and_joints_of_unknown_pose_turn_with_the_scene(name):
+    """To 1e-6 of their scale, as above."""
+    rng = np.random.default_rng(4)
+    turns, shifts = [np.eye(3), *Rotation.random(2, rng).as_matrix()], [np.zeros(3), *rng.uniform(-1, 1, (2, 3))]
+    found = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        content = moved(MOVABLE[name], turn, shift)
+        assert isinstance(content, dict)
+        if "cables" in content:
+            result = rj.solve(harness_file(content).harness, segments=8)
+            rods = [result[one] for one in result.names]
+        else:
+            result = rj.solve(read(content).scenes[0], segments=8)
+            rods = [result]
+        assert np.all(result.converged)
+        nodes = np.concatenate([rod.nodes for rod in rods])
+        forces = np.concatenate([[rod.start_force, rod.end_force] for rod in rods])
+        found.append(((nodes - shift) @ turn, forces @ turn, sum(float(rod.elastic_energy) for rod in rods)))
+    for nodes, forces, energy in found[1:]:
+        np.testing.assert_allclose(nodes, found[0][0], atol=1e-6)
+        np.testing.assert_allclose(forces, found[0][1], atol=1e-6 * np.max(np.abs(forces)))
+        assert energy == pytest.approx(found[0][2], rel=1e-6)
 
 
 def test_an_unstated_clocking_is_fitted_without_torsion():

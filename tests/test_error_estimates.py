@@ -1,5 +1,6 @@
 """Estimated errors of shape, forces, moments and curvature against those that finer meshes show."""
 
+import dataclasses
 import functools
 import re
 import warnings
@@ -14,7 +15,7 @@ from rodjax.discretization.error import bulge
 from rodjax.geometry.rotations import columns
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.refinement import SECTION_FACTOR
-from rodjax.solving.result import warn_of_unknown_mesh
+from rodjax.solving.result import warn_if_coarse, warn_of_unknown_mesh
 
 # Rods as soft as EA L^2/EI = 1e3 in tight spans are strained by up to 0.4.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
@@ -173,6 +174,8 @@ def test_a_mesh_far_too_coarse_is_told_without_an_estimate():
     with pytest.warns(rj.MeshWarning, match=r"the mesh of 4 segments is too coarse: the rod turns by 3\.\d rad"):
         found = rj.solve(coil, segments=4)
     assert found.converged
+    with pytest.warns(rj.MeshWarning, match="the rod turns by more than a whole turn along one of them"):
+        warn_if_coarse(dataclasses.replace(found, curvature=2 * found.curvature))
     # Of an edge as long it is 2 arctan(14/8), as their curvature is that of a tangent.
     with pytest.warns(rj.MeshWarning, match=r"the rod turns by 2\.1 rad"):
         rj.solve(coil, segments=4, discretization="finite_difference")

@@ -5,29 +5,11 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import BRANCHES, ROD
 
 import rodjax
 from rodjax import Clamp, Hinge, Joint, Scene, SceneFileError, Slider, Spring, cli
 
-ROD = '{ section = "circular", length = "30 cm", radius = "3 mm", youngs_modulus = "10 MPa", poisson_ratio = 0.5 }'
-BRANCHES = f"""
-[cables.trunk]
-rod = {ROD}
-start = {{ support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }}
-end = {{ support = "joint", joint = "y", tangent = [1, 0, 0], d2 = [0, 1, 0], offset = "[-5, 0, 0] mm" }}
-[cables.left]
-rod = {ROD}
-start = {{ support = "joint", joint = "y", tangent = [1, 1, 0], d2 = [0, 0, 1] }}
-end = {{ support = "clamp", position = "[50, 15, 0] cm", tangent = [1, 0, 0], d2 = [0, 0, 1] }}
-[cables.right]
-rod = {ROD}
-start = {{ support = "joint", joint = "y", tangent = [1, -1, 0], d2 = [0, 0, 1] }}
-end = {{ support = "pin", position = "[50, -15, 0] cm" }}
-[joints.y]
-force = "[0, 0, -0.1] N"
-[loads]
-gravity = "[0, 0, -9.81] m/s^2"
-"""
 ONE = f"""
 rod = {ROD}
 start = {{ support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }}

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import box_mesh
 
 import rodjax as rj
 from rodjax import Pin, Rod, Scene
@@ -41,19 +42,13 @@ def found(before, after, obstacle, raised=0.0):
     return judged(Before(jnp.asarray(before), (here,)), jnp.asarray(after), (there,), radius, nowhere)
 
 
-def cube() -> rj.Mesh:
-    corners = np.array([(x, y, z) for x in (0.3, 0.5) for y in (-1, 1) for z in (-0.15, 0.05)])
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return rj.Mesh(corners, [triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))])
-
-
 SOLID = {
     "capsule": PIPE,
     "box": rj.Box((0.4, 0, -0.05), (0.2, 4, 0.2)),
     "ball": rj.Sphere((0.4, 0, -0.05), 0.1),
     "plate": rj.Box((0.4, 0, 0.0), (0.3, 4, 0.002)),
     "wire": rj.Capsule((0.4, -2, 0), (0.4, 2, 0), 0.0005),
-    "mesh": cube(),
+    "mesh": box_mesh((0.3, -1, -0.15), (0.5, 1, 0.05)),
 }
 
 

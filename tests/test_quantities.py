@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import BRANCHES
 
+import rodjax
 from rodjax.identification.files import read_fit_files
 from rodjax.io.quantities import LISTS, OF_TABLES, QUANTITIES, SceneFileError, is_unit, number_in, si_value, si_values
 from rodjax.io.scene_file import read_scene_file
@@ -136,14 +138,20 @@ WAYS = {"decimal comma": "1,1 {unit}", "zero": "0,1 {unit}", "two numbers": "1 1
     "name",
     [
         *("scenes/figure_1.toml", "scenes/hanging_cable.toml", "fits/fit.toml", "fits/scene.toml"),
-        *("routes/brake_line.toml", "routes/scene.toml"),
+        *("routes/brake_line.toml", "routes/scene.toml", "harness/harness.toml"),
     ],
 )
 def test_a_decimal_comma_in_a_file_is_refused_in_one_line(name, way, tmp_path):
-    folder = shutil.copytree((EXPERIMENTS / name).parent, tmp_path / "files")
+    folder = tmp_path / "files"
+    if name.startswith("harness"):
+        folder.mkdir()
+        (folder / "harness.toml").write_text(BRANCHES)
+    else:
+        shutil.copytree((EXPERIMENTS / name).parent, folder)
     path = folder / Path(name).name
     read = {
         "scenes": lambda: read_scene_file(path),
+        "harness": lambda: rodjax.read_scene(path),
         "fits": lambda: read_fit_files(folder / "fit.toml", folder / "data.csv"),
         "routes": lambda: read_route_file(folder / "brake_line.toml", for_route=True),
     }[name.partition("/")[0]]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import box_mesh
 
 import rodjax as rj
 from rodjax.paths.batch import solve_batch
@@ -17,16 +18,10 @@ RANGES = [
 ]
 
 
-def box(low, high) -> rj.Mesh:
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    return rj.Mesh(corners, [(a, b, c) for a, b, c, _ in sides] + [(a, c, d) for a, _, c, d in sides])
-
-
 OBSTACLES = [
     rj.Capsule((0.2, -0.1, 0.02), (0.2, 0.2, 0.02), 0.02),
     rj.Plane((0, 0, -0.12), (0, 0, 1)),
-    box((0.55, -0.03, -0.02), (0.62, 0.05, 0.03)),
+    box_mesh((0.55, -0.03, -0.02), (0.62, 0.05, 0.03)),
 ]
 
 

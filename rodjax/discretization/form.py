@@ -114,6 +114,15 @@ class Form(eqx.Module):
     def settled(self, point: Any) -> Any:
         """The point where a solver stopped, with all that is known of it."""
 
+    @property
+    def carries_twist(self) -> bool:
+        """Whether the total twist is an unknown that steps carry, and not read off the frames."""
+        return False
+
+    def allowed_twist(self, point: Any) -> Float[Array, ""]:
+        """Where it is: the total twist of a balanced point [rad], which the frames of its ends allow."""
+        return point.total_twist
+
     @abstractmethod
     def moved(
         self,

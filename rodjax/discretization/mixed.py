@@ -45,6 +45,10 @@ from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene, dead_end_moment, with_pins
 from rodjax.model.supports import Clamp, Free
 
+# A total twist further than this [rad] from those that the end frames allow has lost a part of a turn: others are off
+# by roundings.
+SLIP = 1.0
+
 
 class MixedPoint(eqx.Module):
     """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero; with
@@ -155,6 +159,20 @@ class MixedForm(Form):
     def settled(self, point: MixedPoint) -> MixedPoint:
         """The point where a solver stopped, with all that is known of it."""
         return point
+
+    @property
+    def carries_twist(self) -> bool:
+        return self.has_torsion
+
+    def allowed_twist(self, point: MixedPoint) -> Float[Array, ""]:
+        """The areas that an element sweeps are carried with weights that are no whole numbers: where it once turned by
+        more than pi, a third of a sphere, twice 2 pi/3, may stay in the total twist.
+        """
+        principal = self.field.principal_twist(self.scene, point.tangents)
+        off = point.total_twist - nearest_twist(principal, point.total_twist, None)
+        # By 4 pi/3 beyond whole turns it seems to be 2 pi/3 short of them.
+        twist = nearest_twist(principal, point.total_twist + 2 * off, None)
+        return jnp.where(jnp.abs(off) > SLIP, twist, point.total_twist)
 
     @property
     def has_torsion(self) -> bool:

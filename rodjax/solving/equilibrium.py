@@ -623,14 +623,15 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
     before, pressures, friction = _before(given, guess), _pressures(given, options), _from_rest(given, options)
 
-    def state(shape: FramedCurve) -> SolverState:
-        return SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
+    def state(shape: FramedCurve, end_force: Float[Array, "3 parts"] = no_force) -> SolverState:
+        return SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
 
     if guess is None:
-        shape, first = first_frames(scene, s, of_joints), FirstTwist(rest_twist(scene))
         if _begins_plain(given, options):
-            shape, first = _as_plain(given, options)
-        return state(shape), first
+            shape, force, first = _as_plain(given, options)
+            # Loads without a potential are put on by `loading` where a search begins without a force.
+            return state(shape, in_parts(force, parts) if has_potential(scene) else no_force), first
+        return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
     if isinstance(guess, Guess):
         shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
         return state(shape), FirstTwist(guess.total_twist)
@@ -648,11 +649,12 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         return begin, first
     if has_friction(given):
         friction = _friction(given, guess.position_at(s * guess.scene.rod.length))
-    points = _in_units(guess.state, units).shape.points(pieces)
+    last = _in_units(guess.state, units)
+    points, end_force = last.shape.points(pieces), in_parts(last.end_force, parts)
     start = guess.scene.start
     if isinstance(start, Clamp):
-        return state(framed_through(scene, points, of_joints, (start.frame, guess.total_twist))), first
-    return state(framed_through(scene, points, of_joints)), FirstTwist(guess.total_twist)
+        return state(framed_through(scene, points, of_joints, (start.frame, guess.total_twist)), end_force), first
+    return state(framed_through(scene, points, of_joints), end_force), FirstTwist(guess.total_twist)
 
 
 def _begins_plain(scene: Scene, options: Options) -> bool:
@@ -663,18 +665,20 @@ def _begins_plain(scene: Scene, options: Options) -> bool:
     return scene.turns is not None and scene.rod.rest_shape is None and not others and not options.planar
 
 
-def _as_plain(scene: Scene, options: Options) -> tuple[FramedCurve, FirstTwist]:
-    """The frames of the plain rod, and its total twist."""
+def _as_plain(scene: Scene, options: Options) -> tuple[FramedCurve, Float[Array, "3 parts"], FirstTwist]:
+    """The frames of the plain rod, the force through it, without which they are no minimum, and its total twist."""
     plain = with_plain_rod(scene)
     state, twist = _unsettled_state(plain, None, options)
     state, total_twist = settled_state(plain, state, twist)
     found = solve_from(plain, state, FirstTwist(total_twist, last_of(plain)), options)
     of_joints = options.discretization == "finite_difference"
-    points = found.state.shape.points(options.segments if of_joints else 2 * options.segments)
+    scaled, units = nondimensional(scene)
+    begin = _in_units(found.state, units)
+    points = begin.shape.points(options.segments if of_joints else 2 * options.segments)
     twist = found.point.total_twist
     assert isinstance(scene.start, Clamp)
-    shape = framed_through(nondimensional(scene)[0], points, of_joints, (scene.start.frame, twist))
-    return shape, FirstTwist(twist, last_of(scene))
+    shape = framed_through(scaled, points, of_joints, (scene.start.frame, twist))
+    return shape, begin.end_force, FirstTwist(twist, last_of(scene))
 
 
 def solve_from(scene: Scene, state: SolverState, first: FirstTwist, options: Options) -> Found:

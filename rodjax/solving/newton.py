@@ -226,6 +226,13 @@ def _advanced(
     status = jnp.where(is_balanced & is_sought, balanced, status)
     # A zero-iteration solve ends before its step is known to be finite, or needed.
     status = jnp.where(is_finite & (may_go_on | is_balanced), status, Status.NOT_FINITE)
+    is_lost = jnp.array(False)
+    if form.carries_twist:
+        # The search goes on where the total twist has lost a part of a turn on the way.
+        twist = jax.lax.cond(is_balanced & ~again, lambda: form.allowed_twist(point), lambda: point.total_twist)
+        is_lost = jnp.abs(twist - point.total_twist) > 0  # not where it is not a number
+        point = eqx.tree_at(lambda point: point.total_twist, point, twist)
+    again |= is_lost
     status = jnp.where(again, Status.RUNNING, status)
     return NewtonState(
         point=point,
@@ -242,7 +249,7 @@ def _advanced(
         step=step,
         halvings=jnp.zeros((), int),
         restart=again,
-        tries=jnp.where(again, state.tries + 1, 0),
+        tries=jnp.where(again & ~is_lost, state.tries + 1, 0),
         is_pushed=is_pushed,
         pushes=state.pushes + jnp.where(is_pushed, 1, 0),
         iterations=iterations,

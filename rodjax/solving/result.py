@@ -155,8 +155,8 @@ class Equilibrium(eqx.Module):
     - `start_force`, `start_moment`, `end_force`, `end_moment` [..., 3] N, N m
     - `clip_forces`, `clip_moments` [..., clips, 3] N, N m: what each clip applies to the rod, moments about its
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
-      when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain at a clip are
-      those just beyond it, and tension the mean of both sides
+      when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain are those just
+      beyond a node where they jump, at a clip, a load or another section, and tension the mean of both sides
     - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node, and half of what they apply in the
       middle of each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
@@ -854,7 +854,8 @@ def warn_if_coarse(equilibrium: Equilibrium) -> None:
     is_coarse &= np.asarray(equilibrium.converged)
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
-        most = f"{np.max(turn[is_coarse]):.1f} rad"
+        most = np.max(turn[is_coarse])
+        most = f"{most:.1f} rad" if most < 2 * math.pi else "more than a whole turn"  # no figure on such a mesh
         warn(
             f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {most} along one of them; "
             "more segments, or rtol in the place of segments, may help; rodjax.describe tells the errors",

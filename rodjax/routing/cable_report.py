@@ -33,6 +33,7 @@ class Gradients(NamedTuple):
     - `margins`: names, as of `rodjax.Margins`
     - `derivatives` (m, v): of each relative margin by each variable, by its unit
     - `remark`: told beside them; of a route whether it is an optimum, and what holds it
+    - `ranges` (v, 2): between which a route sought the values, and `active`: at which end of it each is held, or ""
     """
 
     variables: tuple[str, ...]
@@ -41,6 +42,8 @@ class Gradients(NamedTuple):
     margins: tuple[str, ...]
     derivatives: Float[np.ndarray, "m v"]
     remark: str = ""
+    ranges: Float[np.ndarray, "v 2"] | None = None
+    active: tuple[str, ...] = ()
 
     @staticmethod
     def of(route: Route) -> "Gradients":
@@ -48,7 +51,21 @@ class Gradients(NamedTuple):
         margins = tuple(name for name in route.gradients if name != "objective")
         rows = [np.asarray(route.gradients[name]) for name in margins]
         derivatives = np.reshape(rows, (len(rows), len(route.names)))
-        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives, route.optimality)
+        ranges = np.stack([np.asarray(route.lower), np.asarray(route.upper)], axis=-1)
+        ends = [
+            [end for end in ("lower", "upper") if f"{name} at its {end} bound" in route.multipliers]
+            for name in route.names
+        ]
+        return Gradients(
+            route.names,
+            route.units,
+            np.asarray(route.numbers),
+            margins,
+            derivatives,
+            route.optimality,
+            ranges,
+            tuple(" and ".join(end) for end in ends),
+        )
 
 
 class Fact(NamedTuple):

@@ -9,7 +9,7 @@ from rodjax.checks import leaf, not_negative, number_list, positive, shown
 
 
 class Limits(eqx.Module):
-    """What the shape and the forces of a route shall keep to; what is not given is not asked.
+    """Limits on the shape and the forces of a route; a limit that is not given is not checked.
 
     **Arguments:**
 

@@ -191,7 +191,7 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
     facts += [
         Fact("largest twist rate", *_finite(measured["twist"][0], "rad/m", measured["twist"][1])),
         Fact("total twist", float(equilibrium.total_twist), "rad"),
-        Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="either way"),
+        Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="of either sign"),
         _axial(float(tension[most]), float(s[most]), "largest tension", "least compression"),
         _axial(float(tension[least]), float(s[least]), "least tension", "largest compression"),
         Fact("elastic energy", float(equilibrium.elastic_energy), "J"),
@@ -212,7 +212,7 @@ def _somewhere(equilibrium: Equilibrium) -> str:
     first, last = np.asarray(most_curved(equilibrium))
     if not (bool(equilibrium.converged) and np.isfinite(first)):
         return ""
-    return f", by its error anywhere from s = {1e3 * first:.4g} to {1e3 * last:.4g} mm"
+    return f", within its error between s = {1e3 * first:.4g} and {1e3 * last:.4g} mm"
 
 
 def _finite(value: float, unit: str, s: float) -> tuple[float | None, str, float | None]:

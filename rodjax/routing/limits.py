@@ -19,8 +19,8 @@ class Limits(eqx.Module):
         one for each.
     - `clip_force` [N], `clip_moment` [N m]: largest of each clip.
     - `end_force` [N], `end_moment` [N m]: largest at each end.
-    - `twist` [rad/m]: largest, either way.
-    - `strain`: largest axial strain, either way.
+    - `twist` [rad/m]: largest magnitude.
+    - `strain`: largest magnitude of the axial strain.
     - `stability` [N]: least stiffness of the softest motion, as by `rodjax.lowest_mode`.
     - `length` [m], `mass` [kg], `energy` [J]: largest; of the energy, the elastic one.
 

@@ -232,7 +232,7 @@ def _warm(arguments: argparse.Namespace) -> int:
     from rodjax.warm import command_for, usual_jobs, warm
 
     if arguments.file is None:
-        warm(usual_jobs(), sys.stderr.isatty())
+        warm(usual_jobs())
     else:
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
             code = main(command_for(arguments.file, arguments.data, Path(folder)))

@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-from tqdm import tqdm
-
 from rodjax.checks import instance
 
 # Seconds after which a call that is not done says what it does, and the least between two lines of that.
@@ -64,6 +62,10 @@ class Bar:
         self._shown -= known
         self._draw(count - known)
 
+    def describe(self, text: str) -> None:
+        if self._drawn is not None:
+            self._drawn.set_description(text)
+
     def ahead(self, count: int) -> None:
         if self._drawn is not None and self._drawn.total is not None:
             count = min(count, self._drawn.total - self._drawn.n)
@@ -96,6 +98,8 @@ def bar(total: int | None, unit: str, initial: int = 0) -> Iterator[Bar]:
     elif narrator.bar is not None:
         yield _Within(unit, narrator.bar)
     else:
+        from tqdm import tqdm  # which a solve need not wait for
+
         delay = 0.0 if narrator.bars_at_once else max(narrator.begin + QUIET - time.monotonic(), 0.0)
         with tqdm(total=total, initial=initial, unit=f" {unit}", delay=delay, file=narrator.stream) as drawn:
             narrator.bar = Bar(unit, drawn)

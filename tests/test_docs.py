@@ -17,7 +17,7 @@ DOCS = ROOT / "docs"
 pytestmark = pytest.mark.skipif(not DOCS.exists(), reason="the tests run without the repository")
 PAGES = [
     "index.md",
-    "how-to/index.md",
+    pytest.param("how-to/index.md", marks=pytest.mark.slow),
     pytest.param("tutorials/stiffness.md", marks=pytest.mark.slow),
     pytest.param("tutorials/design.md", marks=pytest.mark.slow),
     pytest.param("tutorials/route.md", marks=pytest.mark.slow),

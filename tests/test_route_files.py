@@ -345,7 +345,7 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     assert [start["optimal"] for start in told["starts"]] == [True, False]
     assert told["values"] == {"clips.0.at": 0.2, "clips.0.position": [0, 0, 0]}
     assert told["starts"][1]["objective"] is None
-    assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m"}
+    assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m", "lower": 0.1, "upper": 0.3}
     report = json.loads((files / "out" / "report.json").read_text())
     assert report["margins"] == pytest.approx(told["margins"], rel=1e-9)
     # The second variable's derivatives are all 1.
@@ -353,6 +353,17 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     written = rj.read_scene(files / "out" / "scene.toml")
     assert written.clips[0].at == 0.2
     assert "Change of each margin" in (files / "out" / "report.html").read_text()
+
+
+def test_a_report_of_a_route_knows_what_was_asked(found, files):
+    file = read_route_file("brake_line.toml", for_route=True)
+    asked = {"limits": file.limits, "obstacles": file.obstacles, "names": file.names}
+    (scene,) = file.cables.values()
+    route = rj.route(scene.scenes[0], file.variables, **asked)
+    assert str(rj.report(route)) == str(rj.report(route.verified, **asked, gradients=route))
+    # What is given goes first.
+    wider = rj.report(route, limits=rj.Limits(bend_radius=1.0))
+    assert set(wider.margins) == {"bend radius"}
 
 
 def test_a_route_that_is_not_found_exits_with_3(found, files, capsys):

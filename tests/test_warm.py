@@ -56,5 +56,5 @@ def test_the_usual_scenes_are_done_one_after_another(monkeypatch):
     monkeypatch.setattr(warm, "solve", lambda scene, guess=None: done.append(scene))
     monkeypatch.setattr(warm, "describe", lambda result: None)
     monkeypatch.setattr(warm, "solve_path", lambda scenes, **settings: done.extend(scenes))
-    warm.warm(warm.usual_jobs(), progress=False)
+    warm.warm(warm.usual_jobs())
     assert len(done) == 2 * (2 * 5 + 25)  # as NumPy code and compiled

@@ -87,6 +87,7 @@ def follow(
     step: float = DEFAULT_STEPS.first,
     max_step: float = DEFAULT_STEPS.longest,
     max_points: int = DEFAULT_STEPS.most,
+    progress: bool | None = None,
 ) -> Branch:
     """One branch of equilibria through a sequence of scenes, stable or not, and through folds: pseudo-arclength.
 
@@ -104,6 +105,8 @@ def follow(
         [rad], and of the change of the parameter as a part of m - 1. Two critical points within a step are found where
         they change the index, or the direction of the parameter.
     - `max_points`: the most equilibria.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+        notebook.
 
     Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential.
     Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).

@@ -398,9 +398,9 @@ COST_HEADINGS = ("by", "mesh", "start", "iterations", "solve [ms]", "with gradie
 INTRODUCTION = """\
 # Derivatives
 
-Inside `jax.jit`, `vmap` and `grad` numbers are not known, so that no mesh can be chosen for `rtol`: without `segments=`
-it is one of 32 elements (50 edges), and derivatives differ by its errors from those on another mesh (a `MeshWarning`
-tells once). State `segments=` where that matters.
+Inside `jax.jit`, `vmap` and `grad` the numbers of a scene are traced, so that no mesh can be chosen for `rtol`. Without
+`segments=` the mesh has 32 elements (50 edges), and derivatives deviate by its errors from those on another mesh; a
+`MeshWarning` says so once. State `segments=` where that matters.
 
 Printed by `experiments/derivative_table.py`, on {conditions}.
 

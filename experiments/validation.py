@@ -74,7 +74,7 @@ STAGES = {"a": 0, "b": 9, "c": 13, "d": 17, "e": 21, "f": 25}  # in the sequence
 
 
 class Row(NamedTuple):
-    """A line of the table. Lengths in L, forces in EI/L^2, unless `case` says otherwise; vectors by their size."""
+    """A line of the table. Lengths in L, forces in EI/L^2, unless `case` says otherwise; vectors by magnitude."""
 
     source: str
     quantity: str
@@ -541,8 +541,8 @@ Published and closed-form results beside those of rodjax, printed by `experiment
 
 **Conditions.** Hermite elements of equal length, N of them; Newton with its default tolerance; double precision.
 Straight isotropic rods with EI = L = 1 and, where the reference is inextensible, EA L²/EI = 1e10, for the
-helix 1e12. Lengths in L, forces in EI/L², angles in rad, unless the case says otherwise; vectors by their size. The
-error is relative to the reference, of vectors the size of the difference; where the reference is zero it is absolute.
+helix 1e12. Lengths in L, forces in EI/L², angles in rad, unless the case says otherwise; vectors by magnitude. The
+error is relative to the reference, of vectors the norm of the difference; where the reference is zero it is absolute.
 `ms` is one warm solve, without compiling: where a row is one of a sequence, the mean of the sequence; of a critical
 load, the median of the solves of its bisection.
 

@@ -7,15 +7,13 @@ what.
 
 import argparse
 import contextlib
-import functools
 import io
 import json
 import os
 import sys
 import tempfile
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -33,15 +31,15 @@ from rodjax.io.harness_file import HarnessFile, is_harness_file, read_harness_fi
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
-from rodjax.notes import Narrator, note
-from rodjax.programs import answers, kept
+from rodjax.notes import note, told
+from rodjax.programs import kept
 from rodjax.programs.tasks import TaskError
 from rodjax.solving.equilibrium import DEFAULT_RTOL, MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
 from rodjax.sweeps.quantities import QUANTITIES
-from rodjax.sweeps.result import Summary, merge, write_csv
+from rodjax.sweeps.result import PARQUET_SUFFIX, Summary, check_parquet, merge, write_csv, write_parquet
 from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX
 from rodjax.sweeps.sweep import sweep
 
@@ -55,8 +53,6 @@ if TYPE_CHECKING:
 Result = TypeVar("Result", Equilibrium, rodjax.HarnessEquilibrium)
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
-# Seconds of compiling after which a terminal is told what the wait is.
-TOLD_AFTER = 2.0
 
 
 class CommandError(ValueError):
@@ -68,9 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
-        # Commands with a bar of their own, or that ask again and again, need no other words.
-        is_told = sys.stderr.isatty() and arguments.run in (_solve, _report, _fit)
-        with Narrator() if is_told else contextlib.nullcontext():
+        # A window lives for hours, and tells of each of its solves.
+        with contextlib.nullcontext() if arguments.run is _view else told(None):
             code = arguments.run(arguments)
         sys.stdout.flush()
         return code
@@ -159,6 +154,7 @@ def _add_sweep(commands: Any) -> None:
         "--also", metavar="NAME,...", default="", help=f"further quantities to write: {', '.join(QUANTITIES)}"
     )
     run.add_argument("--csv", metavar="OUT.csv", type=Path, help="write all but the nodes as a table too")
+    run.add_argument("--parquet", metavar="OUT.parquet", type=Path, help="the same as an Apache Parquet file")
     _add_scheduler(run)
     run.set_defaults(run=_sweep)
     join = commands.add_parser("merge", help="merge the shards of a sweep")
@@ -230,15 +226,13 @@ def _segments(text: str) -> int:
 
 def _set_up_jax() -> None:
     jax.config.update("jax_enable_x64", True)
-    if sys.stderr.isatty():
-        answers.waiting = _told
 
 
 def _warm(arguments: argparse.Namespace) -> int:
     from rodjax.warm import command_for, usual_jobs, warm
 
     if arguments.file is None:
-        warm(usual_jobs(), sys.stderr.isatty())
+        warm(usual_jobs())
     else:
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
             code = main(command_for(arguments.file, arguments.data, Path(folder)))
@@ -247,23 +241,6 @@ def _warm(arguments: argparse.Namespace) -> int:
     folder = kept.folder()
     print("no programs are kept" if folder is None else f"programs are kept in {folder}")
     return 0
-
-
-@contextlib.contextmanager
-def _told() -> Iterator[None]:
-    """A wait that lasts says what it is, once."""
-    timer = threading.Timer(TOLD_AFTER, _tell)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-@functools.cache
-def _tell() -> None:
-    print("rodjax: compiling, once for this kind of scene and mesh: a few seconds each", file=sys.stderr, flush=True)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -388,6 +365,12 @@ def _view(arguments: argparse.Namespace) -> int:
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_output(arguments.output, "-o", (SWEEP_SUFFIX,))
     _check_output(arguments.csv, "--csv", (TABLE_SUFFIX,))
+    _check_output(arguments.parquet, "--parquet", (PARQUET_SUFFIX,))
+    if arguments.parquet:
+        try:
+            check_parquet()
+        except ImportError as error:
+            raise CommandError(str(error)) from None
     with _connected(arguments.scheduler) as executor:
         summary = sweep(
             arguments.scene,
@@ -398,11 +381,12 @@ def _sweep(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             also=[name.strip() for name in arguments.also.split(",") if name.strip()],
             executor=executor,
-            progress=sys.stderr.isatty(),
             say=lambda line: print(line, flush=True),
         )
     if arguments.csv:
         write_csv(arguments.output, arguments.csv)
+    if arguments.parquet:
+        write_parquet(arguments.output, arguments.parquet)
     return _swept(arguments.output, summary)
 
 
@@ -549,7 +533,6 @@ def _route(arguments: argparse.Namespace) -> int:
                     names=file.names,
                     segments=scene.segments,
                     executor=executor,
-                    progress=sys.stderr.isatty(),
                     **options,
                 )
         except ClusterError:
@@ -558,11 +541,9 @@ def _route(arguments: argparse.Namespace) -> int:
             raise CommandError(f"{arguments.file}: {error}") from None
     title = file.title or str(arguments.file)
     report = rodjax.report(
-        route.verified,
-        limits=file.limits,
+        route,
         obstacles=file.obstacles,
         names=file.names,
-        gradients=route,
         title=title,
         source=_source(arguments.file, scene),
     )

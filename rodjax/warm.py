@@ -4,14 +4,13 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from rodjax.io.quantities import in_file
 from rodjax.io.scene_file import read_text, toml_tables
 from rodjax.model.obstacles import Plane
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clip
+from rodjax.notes import bar
 from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
 from rodjax.programs.answers import numpy_first
@@ -60,12 +59,13 @@ def command_for(file: Path, data: Sequence[Path], folder: Path) -> list[str]:
     return [command, str(file), *map(str, data), *output]
 
 
-def warm(jobs: dict[str, Callable[[], object]], progress: bool) -> None:
+def warm(jobs: dict[str, Callable[[], object]]) -> None:
     """Does each of the jobs, with a bar that names it."""
-    with tqdm(jobs.items(), disable=not progress, unit="job") as bar, warnings.catch_warnings():
+    with bar(len(jobs), "jobs") as drawn, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, job in bar:
-            bar.set_description(name)
+        for name, job in jobs.items():
+            drawn.describe(name)
             job()  # what a first answer needs
             with numpy_first(False):  # and all others
                 job()
+            drawn.update()

@@ -490,7 +490,7 @@ ALIENS_TO_A_CALL: dict[str, st.SearchStrategy] = {
     ),
     "equilibrium": ANYTHING,
     "scenes": st.one_of(st.integers(), st.floats(), st.booleans(), st.none(), st.builds(object)),
-    "progress": ANYTHING.filter(lambda value: not isinstance(value, bool)),
+    "progress": ANYTHING.filter(lambda value: value is not None and not isinstance(value, bool)),
     "of": st.one_of(st.integers(), st.none(), st.just([]), st.just("nodes"), st.builds(object)),
 }
 
@@ -507,6 +507,7 @@ def results_and_sequences(example, world):
         "progress": [
             lambda: rj.solve_path([SCENE], segments=4, progress=value),
             lambda: rj.solve_batch([SCENE], segments=4, progress=value),
+            lambda: rj.solve(SCENE, segments=4, progress=value),
         ],
         "of": [lambda: rj.sensitivities(SCENE, of=value, wrt=["rod.EI"])],
     }

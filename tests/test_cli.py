@@ -1,9 +1,7 @@
 """The command `rodjax`: its output, its exit codes and its one-line messages."""
 
-import io
 import subprocess
 import sys
-import time
 import types
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import rodjax
 from rodjax.cli import main
 from rodjax.io.files import load
 from rodjax.io.scene_writing import write_scene
-from rodjax.notes import Narrator, note
 
 SCENES = Path(__file__).parents[1] / "experiments" / "scenes"
 HANGING = str(SCENES / "hanging_cable.toml")
@@ -176,21 +173,3 @@ def test_python_m_rodjax(tmp_path):
     failed = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, check=False)
     assert failed.returncode == 2
     assert failed.stderr == f"rodjax: {tmp_path}: cannot be read: Is a directory\n"
-
-
-def test_a_long_call_says_what_it_does(monkeypatch):
-    """Once it has taken a while, what has begun last; and nothing outside of the block."""
-    monkeypatch.setattr("rodjax.notes.QUIET", 0.05)
-    monkeypatch.setattr("rodjax.notes.BETWEEN", 0.0)
-    stream = io.StringIO()
-    with Narrator(stream):
-        note("first")
-        note("second")
-        assert stream.getvalue() == ""
-        time.sleep(0.3)
-        assert stream.getvalue() == "rodjax: second (0 s)\n"
-        rodjax.solve(rodjax.problems.hanging_cable(), segments=8)
-        note("third")
-    note("fourth")
-    said = [line.split(" (")[0] for line in stream.getvalue().splitlines()]
-    assert said == ["rodjax: second", "rodjax: solving on 8 segments", "rodjax: third"]

@@ -1,6 +1,7 @@
 """Sweeps on a real Dask scheduler with worker processes, on this machine: the bits of one process, whoever dies."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -16,9 +17,12 @@ from test_sweep import GRID, SCENE, assert_same
 
 import rodjax as rj
 from rodjax.cli import main
+from rodjax.io.harness_file import read_scene
+from rodjax.sweeps.result import summary
 from rodjax.sweeps.sweep import sweep
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install 'rodjax[cluster]'")
+PAGE = Path(__file__).parents[1] / "docs" / "cluster.md"
 CHUNK = 4
 # 400 cases in 100 chunks, so that there is time to kill somebody.
 MANY = GRID.replace("count = 5", "count = 200")
@@ -106,6 +110,24 @@ def started(cluster: Cluster) -> subprocess.Popen:
     wait_until(lambda: len(list(Path("out.h5.parts").glob("chunk-*.h5"))) > 5 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
     return process
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PAGE.exists(), reason="the tests run without the repository")
+def test_the_block_of_the_documentation_runs(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(SCENE)
+    Path("table.csv").write_text("rod.EI\n0.004\n0.005\n")
+    scene = read_scene("scene.toml")
+    points = rj.solve(scene, segments=4).nodes[1:-1]
+    experiments = [rj.Experiment(scene, [rj.Centerline(points, sd=1e-3)])] * 2
+    cluster.scheduler()
+    cluster.worker()
+    block = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)[0]
+    assert "tcp://10.0.0.1:8786" in block
+    variables = {"__name__": "__main__", "experiments": experiments}
+    exec(block.replace("tcp://10.0.0.1:8786", cluster.address), variables)
+    assert summary(Path("sweep.h5")).cases == 2
 
 
 @pytest.mark.slow

@@ -8,7 +8,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1] / "rodjax"
 # Folders, and modules beside them, each of which may import from those in the lines above it.
 ORDER = (
-    ("atomic_write", "checks", "file_lock", "notes", "units", "version", "warn"),
+    ("atomic_write", "checks", "file_lock", "units", "version", "warn"),
+    ("notes",),
     ("programs",),
     ("linalg",),
     ("geometry",),

@@ -1,6 +1,8 @@
-"""What is published: a wheel and a source distribution that build, install and run from the file."""
+"""What is published: a wheel and a source distribution that build, install and run from the file; licences."""
 
+import importlib.metadata
 import os
+import re
 import site
 import subprocess
 import sys
@@ -10,10 +12,55 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import rodjax
 
 ROOT = Path(__file__).parents[1]
+
+# Licences that allow what Apache-2.0 allows; MPL-2.0 binds changes to files of its own alone (tqdm, certifi).
+PERMISSIVE = r"Apache|MIT|BSD|ISC|Python Software Foundation|PSF|MPL|Mozilla|HPND|Zlib|CC0|Unlicense"
+# What this environment need not have of the extras: `peers` are programs that experiments compare with.
+EXTRAS = ("view", "cad", "meshes", "parquet", "cluster", "docs")
+
+
+def dependencies(name: str, extras: tuple[str, ...] = ()) -> set[str]:
+    """All packages that one needs here, those of its dependencies too, without those that are not installed."""
+    found, waiting = set(), [(name, extras)]
+    while waiting:
+        package, wanted = waiting.pop()
+        for line in importlib.metadata.requires(package) or []:
+            needed = Requirement(line)
+            is_needed = needed.marker is None or any(needed.marker.evaluate({"extra": e}) for e in ("", *wanted))
+            if is_needed and needed.name not in found:
+                try:
+                    importlib.metadata.distribution(needed.name)
+                except importlib.metadata.PackageNotFoundError:
+                    continue
+                found.add(needed.name)
+                waiting.append((needed.name, tuple(needed.extras)))
+    return found
+
+
+def licence(package: str) -> str:
+    """What a package says of its licence, or the first lines of the file that is it."""
+    about = importlib.metadata.metadata(package)
+    classifiers = [line for line in about.get_all("Classifier") or [] if line.startswith("License")]
+    told = " ".join([about.get("License-Expression") or "", (about.get("License") or "")[:400], *classifiers]).strip()
+    if told:
+        return told
+    files = importlib.metadata.files(package) or []
+    texts = [file.read_text()[:400] for file in files if re.search(r"licen[cs]e|copying", file.name, re.I)]
+    return " ".join(texts)
+
+
+def test_licences_of_dependencies_are_permissive():
+    packages = dependencies("rodjax", EXTRAS)
+    assert {"jax", "numpy", "tqdm"} < packages
+    for package in sorted(packages):
+        told = licence(package)
+        assert re.search(PERMISSIVE, told), f"{package}: {told!r}"
+        assert not re.search(r"(?<!L)GPL|GNU General", told), f"{package}: {told!r}"
 
 
 @pytest.mark.slow

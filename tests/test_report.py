@@ -97,7 +97,7 @@ def test_numbers_are_those_of_the_equilibrium(report, equilibrium):
         told["smallest inside bend radius"].note
     )
     first, last = 1e3 * np.asarray(rj.most_curved(equilibrium))
-    assert f"by its error anywhere from s = {first:.4g} to {last:.4g} mm" in told["smallest inside bend radius"].note
+    assert f"within its error between s = {first:.4g} and {last:.4g} mm" in told["smallest inside bend radius"].note
     assert first <= 1e3 * told["smallest inside bend radius"].s <= last
     clearance = rj.clearance(equilibrium, OBSTACLES)
     nearest = int(np.argmin(clearance.distance))

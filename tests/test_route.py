@@ -76,8 +76,8 @@ def test_the_shortest_turn_is_an_arc(shortest):
 def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
-    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0), False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE)
+    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0))
 
     def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         numbers = group.evaluate({1: Asked(design, False)})[1]
@@ -104,7 +104,7 @@ def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):
 
     monkeypatch.setattr(_Fleet, "_solved_cold", missing_one)
     problem, _ = _problem(corner(), VARIABLES, rj.Limits(bend_radius=9.0), None, (), None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE, False)
+    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE)
     assert fleet.redrawn == 2
     np.testing.assert_array_equal(fleet.solves, [1, 1, 3, 1])
     others = [0, 1, 3]

@@ -276,6 +276,9 @@ def found(reported, files, monkeypatch):
         count = 2
         return rj.Route(
             feasible=asked.get("feasible", True),
+            limits=options["limits"],
+            obstacles=tuple(options["obstacles"]),
+            obstacle_names=tuple(options["names"]),
             scene=result.scene,
             equilibrium=result,
             verified=result,
@@ -283,10 +286,12 @@ def found(reported, files, monkeypatch):
             objective=0.62,
             optimal=asked.get("feasible", True),
             gain=1e-8,
-            multipliers={"bend radius": 0.05},
+            multipliers={"bend radius": 0.05, "clips.0.at at its lower bound": 0.01},
             names=names,
             units=tuple(unit for variable in variables for unit in variable.units()),
             numbers=np.linspace(0.1, 0.2, len(names)),
+            lower=np.full(len(names), 0.1),
+            upper=np.full(len(names), 0.3),
             values={"clips.0.at": np.asarray(0.2), "clips.0.position": np.zeros(3)},
             gradients=rates,
             starts=Starts(
@@ -325,6 +330,7 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     assert "active limits: bend radius (0.0005 for 1 %)" in out
     assert re.search(r"clips\.0\.at +100 mm\n", out)
     assert re.search(r"1 +inf +4 +6  fails in bend radius by 25 %; limit of iterations reached\n", out)
+    assert re.search(r"clips\.0\.at +100 mm +100 mm +300 mm  at its lower bound\n", out)
     assert "Change of each margin by the design variables:" in out
     names = [*FILES, "route.json", "result.vtkhdf", "scene.toml"]
     assert out.endswith(f"written: {', '.join(f'out/{name}' for name in names)}\n")
@@ -335,11 +341,11 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     told = json.loads((files / "out" / "route.json").read_text(), parse_constant=refuse)
     assert told["feasible"] is True
     assert told["optimal"] is True
-    assert told["multipliers"] == {"bend radius": 0.05}
+    assert told["multipliers"] == {"bend radius": 0.05, "clips.0.at at its lower bound": 0.01}
     assert [start["optimal"] for start in told["starts"]] == [True, False]
     assert told["values"] == {"clips.0.at": 0.2, "clips.0.position": [0, 0, 0]}
     assert told["starts"][1]["objective"] is None
-    assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m"}
+    assert told["numbers"]["clips.0.at"] == {"value": 0.1, "unit": "m", "lower": 0.1, "upper": 0.3}
     report = json.loads((files / "out" / "report.json").read_text())
     assert report["margins"] == pytest.approx(told["margins"], rel=1e-9)
     # The second variable's derivatives are all 1.
@@ -347,6 +353,17 @@ def test_route_tells_and_writes_what_was_found(found, files, capsys):
     written = rj.read_scene(files / "out" / "scene.toml")
     assert written.clips[0].at == 0.2
     assert "Change of each margin" in (files / "out" / "report.html").read_text()
+
+
+def test_a_report_of_a_route_knows_what_was_asked(found, files):
+    file = read_route_file("brake_line.toml", for_route=True)
+    asked = {"limits": file.limits, "obstacles": file.obstacles, "names": file.names}
+    (scene,) = file.cables.values()
+    route = rj.route(scene.scenes[0], file.variables, **asked)
+    assert str(rj.report(route)) == str(rj.report(route.verified, **asked, gradients=route))
+    # What is given goes first.
+    wider = rj.report(route, limits=rj.Limits(bend_radius=1.0))
+    assert set(wider.margins) == {"bend radius"}
 
 
 def test_a_route_that_is_not_found_exits_with_3(found, files, capsys):

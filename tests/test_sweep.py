@@ -15,6 +15,7 @@ import equinox as eqx
 import h5py
 import jax
 import numpy as np
+import pyarrow.parquet
 import pytest
 from test_tasks import Unreliable
 
@@ -634,7 +635,18 @@ def test_quantities_are_chosen_by_name(files, capsys):
     clip, floor = '\n[[clips]]\nat = "0.3 m"\nposition = "[0.25, 0, -0.02] m"\n', '\n[[obstacles]]\nkind = "plane"\n'
     Path("scene.toml").write_text(scene + clip + floor + 'point = "[0, 0, -0.15] m"\nnormal = [0, 0, 1]\n')
     Path("grid.toml").write_text('"rod.EI" = [0.004, 0.005]\n')
-    command = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--csv", "out.csv"]
+    command = [
+        "sweep",
+        "scene.toml",
+        "--over",
+        "grid.toml",
+        "-o",
+        "out.h5",
+        "--csv",
+        "out.csv",
+        "--parquet",
+        "out.parquet",
+    ]
     assert main([*command, "--also", ",".join(QUANTITIES)]) == 0
     found = contents("out.h5")
     scenes = CaseReader(Path("scene.toml"), Path("grid.toml")).scenes(np.arange(2))
@@ -651,10 +663,22 @@ def test_quantities_are_chosen_by_name(files, capsys):
     np.testing.assert_array_equal(table["clip_forces.0.2 [N]"], found["clip_forces"][:, 0, 2])
     np.testing.assert_array_equal(table["rod.EI [N m^2]"], [0.004, 0.005])
     assert table.dtype.names[0] == "case [1]"
+    typed = pyarrow.parquet.read_table("out.parquet")
+    assert typed.column_names == list(table.dtype.names)
+    np.testing.assert_array_equal(typed["clip_forces.0.2 [N]"], found["clip_forces"][:, 0, 2])
+    assert typed.schema.field("converged [1]").type == pyarrow.bool_()
     # Another choice is another sweep.
     capsys.readouterr()
     assert main([*command, "--resume", "--also", "clip_forces"]) == 2
     assert "different in also" in capsys.readouterr().err
+
+
+def test_without_pyarrow_a_parquet_file_is_refused_before_the_sweep(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    command = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--parquet", "out.parquet"]
+    assert main(command) == 2
+    assert capsys.readouterr().err == "rodjax: Parquet files need pyarrow: pip install 'rodjax[parquet]'\n"
+    assert not Path("out.h5").exists()
 
 
 def test_quantities_that_a_scene_lacks_are_named(files):

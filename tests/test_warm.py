@@ -1,6 +1,5 @@
-"""`rodjax warm`: compiles what a file will need, or the usual scenes, and says what a wait is."""
+"""`rodjax warm`: compiles what a file will need, or the usual scenes."""
 
-import time
 from pathlib import Path
 
 from rodjax import cli, warm
@@ -57,19 +56,5 @@ def test_the_usual_scenes_are_done_one_after_another(monkeypatch):
     monkeypatch.setattr(warm, "solve", lambda scene, guess=None: done.append(scene))
     monkeypatch.setattr(warm, "describe", lambda result: None)
     monkeypatch.setattr(warm, "solve_path", lambda scenes, **settings: done.extend(scenes))
-    warm.warm(warm.usual_jobs(), progress=False)
+    warm.warm(warm.usual_jobs())
     assert len(done) == 2 * (2 * 5 + 25)  # as NumPy code and compiled
-
-
-def test_a_wait_says_what_it_is(monkeypatch, capsys):
-    monkeypatch.setattr(cli, "TOLD_AFTER", 0.01)
-    cli._tell.cache_clear()
-    for _ in range(2):
-        with cli._told():
-            time.sleep(0.2)
-    assert capsys.readouterr().err.count("rodjax: compiling, once for this kind of scene") == 1
-    monkeypatch.setattr(cli, "TOLD_AFTER", 10.0)
-    cli._tell.cache_clear()
-    with cli._told():
-        pass
-    assert not capsys.readouterr().err

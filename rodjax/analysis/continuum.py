@@ -99,11 +99,11 @@ def solve_continuum(
       point force; `None`: as many as those of the guess, else 50.
 
     At a point force or clip tension and curvature are those beyond it. `stable` is not examined and False; `residual`
-    is the largest miss of a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest force
-    and moment in the rod. Above 1e-10 the result is marked as not converged, and outside `jit` a `NotConvergedWarning`
-    says so.
+    is the largest mismatch at a support or between two intervals, in L, rad, and in EI/L^2 and EI/L or the largest
+    force and moment in the rod. Above 1e-10 the result is marked as not converged, and outside `jit` a
+    `NotConvergedWarning` says so.
 
-    Raises `ValueError` or `TypeError` for arguments that make no sense.
+    Raises `ValueError` or `TypeError` for invalid arguments.
     """
     instance(scene, "scene", Scene)
     if scene.rod.length.ndim:

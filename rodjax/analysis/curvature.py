@@ -14,10 +14,10 @@ from rodjax.solving.result import Equilibrium, beside_nodes, estimated_errors, o
 
 
 def most_curved(equilibrium: Equilibrium) -> Float[Array, "... 2"]:
-    """From where to where along the rod its curvature may be the largest [m], by `Equilibrium.curvature_error` and by
-    what it may be between the places where it is known. Of the continuum not a number.
+    """The interval of arclength [m] in which the largest curvature lies, given `Equilibrium.curvature_error` and the
+    bounds on the curvature between the places where it is known. NaN for the continuum.
 
-    Where several places are about as curved it is all that lies between them. Not inside `jit`.
+    Where several places are about equally curved, the interval spans all of them. Not inside `jit`.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     s, curvature = (np.asarray(x) for x in curvature_along(equilibrium))

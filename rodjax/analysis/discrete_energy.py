@@ -52,8 +52,8 @@ def energy(scene: Scene, nodes: Any, total_twist: Any = 0.0) -> Float[Array, ""]
 
 
 def residual(scene: Scene, nodes: Any, total_twist: Any = 0.0) -> Float[Array, "n+1 3"]:
-    """What is out of balance at each node of a polyline [N]: the gradient of `energy` by the nodes, with zeros at held
-    ends. Zero at an equilibrium. Arguments and errors as for `energy`.
+    """The force out of balance at each node of a polyline [N]: the gradient of `energy` by the nodes, with zeros at
+    held ends. Zero at an equilibrium. Arguments and errors as for `energy`.
     """
     _check(scene)
     held = np.ones((np.shape(nodes)[0], 1))

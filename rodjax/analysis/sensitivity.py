@@ -64,8 +64,8 @@ def sensitivities(
     - `options`: of `rodjax.solve`. They choose the mesh, on which the derivatives are exact.
 
     Each array has the shape of the field followed by that of the number, (3,) for a frame, in SI units of the one over
-    those of the other. Where the solve did not converge, or at a critical equilibrium, they are not numbers.
-    Raises `ValueError` or `TypeError` for names that are not among these, or options that `rodjax.solve` refuses.
+    those of the other. Where the solve did not converge, or at a critical equilibrium, they are NaN. Raises
+    `ValueError` or `TypeError` for names that are not among these, or options that `rodjax.solve` refuses.
     """
     if isinstance(scene, Harness):
         raise ValueError("sensitivities is for a Scene; of a Harness jax.jacfwd of rodjax.solve gives any derivative")
@@ -89,7 +89,7 @@ def end_stiffness(scene: Scene | Harness, cable: str | None = None, **options: A
     Rows are the changes of `end_force` and `end_moment`, save that of the moment by a rotation: rotations do not
     commute, so dM/dr is the symmetric second derivative of the energy less half of the matrix [M x] of the cross
     product with `end_moment`, which is added here. The whole is symmetric unless a dead moment acts on the other end,
-    which has no energy. Not numbers where `sensitivities` are not.
+    which has no energy. NaN where `sensitivities` are NaN.
 
     Raises `ValueError` for an end that is `Free`, a `Swivel` or a `Joint`, or a `cable` that is not there.
     """

@@ -92,6 +92,7 @@ def fit_each(
     max_steps: int = MAX_STEPS,
     executor: Executor | None = None,
     threads: int | None = None,
+    progress: bool | None = None,
 ) -> Fits:
     """The unknowns of each experiment from its own measurements alone, sixteen at a time in one compiled program.
 
@@ -106,9 +107,10 @@ def fit_each(
         `client.get_executor()` of Dask; `None`: threads of this process.
     - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
         result.
+    - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
 
     Returns `Fits`; an experiment that does not converge is marked and does not affect others. Raises `ValueError` or
-    `TypeError` for arguments that make no sense.
+    `TypeError` for invalid arguments.
     """
     executor, threads = checked_executor(executor), checked_threads(threads)
     threshold = checked_threshold(loss, threshold)
@@ -194,7 +196,7 @@ def _in_parts(
         return structure, here, *others
 
     parts = [part(first) for first in range(0, count, size)]
-    found = in_order(_part_fitted, parts, executor=executor, threads=threads)
+    found = in_order(_part_fitted, parts, executor=executor, threads=threads, unit="parts of the experiments")
     return jax.tree.map(lambda *leaves: leaf(np.concatenate(leaves)[:count]), *found)
 
 

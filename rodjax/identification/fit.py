@@ -55,8 +55,9 @@ def fit(
     discretization: Discretization | None = None,
     planar: bool = False,
     max_steps: int = MAX_STEPS,
+    progress: bool | None = None,
 ) -> Fit:
-    """The numbers of scenes and rigs with which the computed rods agree best with the measured ones.
+    """The parameters of scenes and rigs with which the computed rods agree best with the measured ones.
 
     Levenberg and Marquardt's method on implicit derivatives: all experiments of one structure are one batch, compiled
     once, each solve warm-started from the last.
@@ -71,10 +72,12 @@ def fit(
     - `rtol`: relative error of the shapes from the mesh, 1e-4; or `segments`: a fixed mesh. `discretization`, `planar`:
         as for `rodjax.solve`.
     - `max_steps`: of the method, evaluations of all experiments.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+        notebook.
 
     Returns a `Fit`. Raises `NotIdentifiableError` where the data do not determine a combination of the unknowns, which
-    it names; `ValueError` or `TypeError` for arguments that make no sense. Experiments without an equilibrium at the
-    start are left out, with a `NotConvergedWarning`.
+    it names; `ValueError` or `TypeError` for invalid arguments. Experiments without an equilibrium at the start are
+    left out, with a `NotConvergedWarning`.
     """
     threshold = checked_threshold(loss, threshold)
     setup = prepared(experiments, unknowns)

@@ -324,7 +324,7 @@ class Experiment(eqx.Module):
 
     - `scene`: `Scene`, as nominal; unknowns replace numbers of it.
     - `measured`: one measurement or a list: `Centerline`, `EndForce`, `EndMoment`, `Reading`.
-    - `cluster`: name of the repeat, day or specimen, whose measurements go astray together; `None`: the experiment is a
+    - `cluster`: name of the repeat, day or specimen, whose measurements share their errors; `None`: the experiment is a
       cluster of its own.
     - `guess`: `Guess` for the first solve; `None`: the measured centerline, where it has arclengths, three coordinates
       and spans nine tenths of the rod, else the library's own.

@@ -76,8 +76,8 @@ class HarnessFile(NamedTuple):
 def read_scene(path: str | os.PathLike[str]) -> Scene | list[Scene] | Harness:
     """The scene in a TOML file, the list of scenes where the file has a `[[path]]`, or the harness where it has cables.
 
-    Raises `SceneFileError` where the file cannot be read or says what makes no sense. See `rodjax.io.scene_file` and
-    this module for the formats.
+    Raises `SceneFileError` where the file cannot be read or holds invalid values. See `rodjax.io.scene_file` and this
+    module for the formats.
     """
     if is_harness_file(path):
         return read_harness_file(path).harness
@@ -92,7 +92,7 @@ def is_harness_file(path: str | os.PathLike[str]) -> bool:
 
 
 def read_harness_file(path: str | os.PathLike[str]) -> HarnessFile:
-    """Raises `SceneFileError` where the file cannot be read or says what makes no sense."""
+    """Raises `SceneFileError` where the file cannot be read or holds invalid values."""
     path = file_path(path, "path")
     with in_file(path):
         return harness_file(toml_tables(read_text(path)))

@@ -22,7 +22,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], segments: int | None
     """Writes one scene to a TOML file, from which `read_scene` makes the same numbers to the last bit.
 
     The file is replaced as a whole. Raises `ValueError` or `TypeError` for what is not one scene, for a rod of
-    `Rod.from_centerline` or with a law, and for potentials, meshes and obstacles of one's own, which a file cannot
+    `Rod.from_centerline` or with a law, and for potentials, meshes and user-defined obstacles, which a file cannot
     hold; `OSError` where it cannot be written.
 
     Of the loads along the rod the file keeps the order among the forces and among the couples.

@@ -131,10 +131,10 @@ class Potential(eqx.Module):
     """A field of forces all along the rod: buoyancy, an elastic bedding, a magnet.
 
     `density`: from a position (3,) [m] and the arclength [m] to the energy per reference length () [J/m], in JAX; the
-    force per length on the rod is the reverse of its gradient by the position. It is differentiated three times, and
-    must be smooth: the error of a field that has kinks is of lower order. Numbers in it are differentiable where it is
-    a pytree, such as an `equinox.Module` with a `__call__` or a `jax.tree_util.Partial` of a function and its numbers;
-    a plain function is part of the program, compiled for it: make it once, not for each scene.
+    force per length on the rod is minus its gradient by the position. It is differentiated three times, and must be
+    smooth: the error of a field that has kinks is of lower order. Numbers in it are differentiable where it is a
+    pytree, such as an `equinox.Module` with a `__call__` or a `jax.tree_util.Partial` of a function and its numbers; a
+    plain function is part of the program, compiled for it: make it once, not for each scene.
 
     Raises `TypeError` or `ValueError` for a density that cannot be called so or gives no single real number.
     """

@@ -47,7 +47,7 @@ def coefficient(friction: Any) -> Float[Array, ""] | None:
 
 
 class Obstacle(eqx.Module):
-    """A body, or several. Its numbers are differentiable; subclass it, with numbers for fields, for one's own.
+    """A body, or several. Its numbers are differentiable; subclass it, with numbers as fields, to define another kind.
 
     `friction`: Coulomb's coefficient mu >= 0 between it and a rod, by keyword, of every obstacle: the tangential force
     at a contact is at most mu times its pressure. The plain number 0, the default, is stored as `None`: no term at all.
@@ -79,7 +79,7 @@ def _distances(obstacle: Obstacle, points: Float[Array, "... 3"]) -> Float[Array
 class Plane(Obstacle):
     """The half space on one side of a plane, such as a floor.
 
-    `point`: (3,) [m], of the plane; `normal`: (3,), any nonzero vector, away from what is solid.
+    `point`: (3,) [m], of the plane; `normal`: (3,), any nonzero vector, pointing out of the solid.
     """
 
     point: Float[Array, "3"]
@@ -216,11 +216,11 @@ class Union(Obstacle):
 
 
 class Distance(Obstacle):
-    """A distance of one's own.
+    """A user-defined distance.
 
-    `function`: from a point (3,) [m] to its signed distance () [m], in JAX; what depends on it is as exact, and as free
-    of NaN in its gradient, as this. Programs are compiled for the function itself: make it once, not for each call,
-    and put numbers that change into a subclass of `Obstacle` instead.
+    `function`: from a point (3,) [m] to its signed distance () [m], in JAX; results are only as exact as this function,
+    and its gradient must be finite everywhere. Programs are compiled for the function itself: make it once, not for
+    each call, and put numbers that change into a subclass of `Obstacle` instead.
     """
 
     function: Callable[[Float[Array, "3"]], Float[Array, ""]] = eqx.field(static=True)

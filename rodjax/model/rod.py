@@ -36,11 +36,11 @@ ARCLENGTH_TOLERANCE = 1e-6
 
 
 class Law(eqx.Module):
-    """A density of elastic energy of one's own: subclass it, with numbers for fields, and give it to `Rod`.
+    """A user-defined density of elastic energy: subclass it, with numbers as fields, and pass it to `Rod`.
 
-    `__call__(curvature, twist, axial_strain, s)` [J/m] for one cross section, a smooth function of what these exceed
-    those of the stress-free shape by: `curvature` (2,) along d1 and d2 [1/m], `twist` [rad/m], `axial_strain`;
-    `s` [m]. It needs no derivatives of its own.
+    `__call__(curvature, twist, axial_strain, s)` [J/m] for one cross section, a smooth function of the strains relative
+    to the stress-free shape: `curvature` (2,) along d1 and d2 [1/m], `twist` [rad/m], `axial_strain`; `s` [m]. It needs
+    no derivatives of its own.
     """
 
     def __call__(
@@ -75,7 +75,8 @@ class Rod(eqx.Module):
     - `rest_curvature`: a pair (k1, k2) [1/m], components of t x t' along d1 and d2 in the shape without stress; `None`
         for a straight one. Not a first guess.
     - `rest_twist` [rad/m] in the shape without stress; `None` for none.
-    - `law`: a density of energy of one's own, in place of the quadratic one. The stiffnesses above are then its scale.
+    - `law`: a user-defined energy density, in place of the quadratic one. The stiffnesses above then only set its
+        scale.
     - `GA`: shear stiffness [N], shear factor included; or a pair (GA1, GA2) for the components of phi' along d1 and d2,
         whose energy GA1/2 gamma1^2 + GA2/2 gamma2^2 is added to any law. The frames (d1, d2, d3) are then those of the
         sections, as is what clamps and tangents of supports hold: the centerline leaves d3 by the shear. `None`:

@@ -47,13 +47,12 @@ class Scene(eqx.Module):
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
         it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding, and without
-        friction in the middle of elements, where contact gives way by 1e-3 of an element's compliance. Of a mesh
-        that is chosen for a tolerance elements lie no deeper than 1e-4 of the radius between their nodes either, as far
-        as finer ones help. Bent over an edge, or on a mesh that is given, the rod may lie deeper there:
-        `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod that came through an obstacle since its
-        guess or the last step of its path, or whose centerline lies within one, is not converged. Where no obstacle
-        touches the rod they only cost time: to see how far it is from what it stays away from, `rodjax.clearance` needs
-        none in the scene. Double precision only.
+        friction in the middle of elements too. Of a mesh that is chosen for a tolerance elements lie no deeper than
+        1e-4 of the radius between their nodes either, as far as finer ones help. Bent over an edge, or on a mesh that
+        is given, the rod may lie deeper there: `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod
+        that came through an obstacle since its guess or the last step of its path, or whose centerline lies within one,
+        is not converged. Where no obstacle touches the rod they only cost time: to see how far it is from what it stays
+        away from, `rodjax.clearance` needs none in the scene. Double precision only.
     - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
     - `point_couples`: `PointCouple`s along the rod.
 
@@ -439,7 +438,7 @@ def has_potential(scene: Scene) -> bool:
 def nondimensional(scene: Scene) -> tuple[Scene, Units]:
     """The same scene with L = 1, EI = 1, weight per length = gravity and a held end at the origin, and the way back.
 
-    Tolerances then mean the same for a hair and a hawser, and a scene far from the origin loses no digits.
+    Tolerances then mean the same for thin and thick rods, and a scene far from the origin loses no digits.
     """
     rod = scene.rod
     units = Units(origin=held_position(scene), length=rod.length, energy=rod.bending_scale / rod.length)

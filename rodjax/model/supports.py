@@ -112,14 +112,14 @@ class Free(Support):
 
 
 class Clip(eqx.Module):
-    """What holds a place between the ends of a rod: its position; its direction too where `tangent` is given; direction
-    and twist where `frame` is.
+    """A support between the ends of a rod: it holds a position; with `tangent` the direction too; with `frame`
+    direction and twist.
 
     `at`: arclength s [m], between 0 and L; `position`: (3,) [m]; `tangent`: (3,), any nonzero vector along the rod,
     which is free to spin in the clip; `frame`: (3, 3), columns d1, d2, t, a rotation, as that of a `Clamp`: then
-    `tangent` is `None`. Without both the rod is free to turn there. `sliding`: the rod slides through without friction,
-    so that no axial force acts on it there; where it passes the clip is then unknown, and `at` where the search for
-    that begins.
+    `tangent` is `None`. Without either, the rod is free to turn there. `sliding`: the rod slides through without
+    friction, so that the clip exerts no axial force; the arclength at the clip is then unknown, and the search for it
+    begins at `at`.
 
     A rod in a clip that holds its twist is solved by frames along it, as one whose section is not round is: by elements
     of a `Newton`.
@@ -238,7 +238,7 @@ class Slider(Movable):
 
 
 class Spring(Movable):
-    """A support that gives way against springs.
+    """A support held by springs, against which the end may move.
 
     `support`: `Clamp`, `Pin`, `Hinge` or `Slider`; `translation` [N/m] and `rotation` [N m/rad]: scalars or symmetric
     (3, 3), global axes. The energy is d . translation d/2 + r . rotation r/2, with the displacement d from the position

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
-from tqdm import tqdm
 
 from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, has_friction, has_node_places, slides
+from rodjax.notes import bar
 from rodjax.paths.harness_path import harness_batch
 from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
@@ -76,7 +76,7 @@ def solve_batch(
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     threads: int | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Any:
     """The equilibria of independent scenes of one structure, or of independent paths; or of harnesses.
 
@@ -90,7 +90,7 @@ def solve_batch(
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `threads`: the most that share more than 256 scenes, without `mesh`; `None`: the environment variable
         `RODJAX_THREADS`, or one for each core. The result is the same to the last bit whatever their number.
-    - `progress`: show a progress bar.
+    - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
     - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
         scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
 
@@ -117,7 +117,6 @@ def solve_batch(
         strain_limit=strain_limit,
         mesh=mesh,
         threads=threads,
-        progress=progress,
     )
 
 
@@ -128,14 +127,12 @@ def solve_stack(
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     threads: int | None = None,
-    progress: bool = False,
     **settings: Any,
 ) -> Equilibrium:
     """The same of stacked scenes of which some may have supports that are too far apart, as in a search.
 
     `settings`: the other arguments of `solve_batch`.
     """
-    instance(progress, "progress", bool)
     threads = checked_threads(threads)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -153,7 +150,7 @@ def solve_stack(
     def solve(options: Options, last: Equilibrium | None) -> Equilibrium:
         # A path has one guess, for its first scene; a step with friction is one from the guess.
         begin = guess if last is None or last.s.ndim > 2 or has_friction(given) else last
-        return _in_chunks(given, begin, strain_limit, options, mesh, threads, progress)
+        return _in_chunks(given, begin, strain_limit, options, mesh, threads)
 
     result = with_ranges(given, refined_together(solve, options, rtol))
     if is_here(result):
@@ -186,7 +183,6 @@ def _in_chunks(
     options: Options,
     mesh: Mesh | None,
     threads: int,
-    progress: bool,
 ) -> Equilibrium:
     count = scenes.rod.length.shape[0]
     each = _is_stack(guess)
@@ -222,7 +218,11 @@ def _in_chunks(
     else:
         # Of several devices each call uses all.
         results = as_completed(solved, ((first,) for first in firsts), threads=threads if mesh is None else 1)
-        parts = dict(tqdm(results, total=len(firsts), disable=not progress, unit="chunk"))
+        parts = {}
+        with bar(count, "cases") as drawn:
+            for k, part in results:
+                parts[k] = part
+                drawn.update(min(chunk * devices, count - firsts[k]))
     if count == chunk * devices:
         return parts[0]
     found = [parts[k] for k in range(len(parts))]

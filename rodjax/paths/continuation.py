@@ -38,10 +38,10 @@ Kind = Literal["fold", "branch"]
 
 
 class CriticalPoint(eqx.Module):
-    """An equilibrium in which a motion has no stiffness left.
+    """An equilibrium at which the stiffness of a motion vanishes.
 
     - `parameter`: where in the sequence of scenes, from 0 to m - 1
-    - `kind`: `"fold"`, where the branch turns round in the parameter, so that a path beyond it jumps; or `"branch"`,
+    - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; or `"branch"`,
       where another branch of equilibria crosses, as where a straight strut buckles
     - `equilibrium`: there; its scene is that of the parameter
     - `mode`: the critical motion, whose stiffness [N] is what is left of zero. Where a rod may buckle in all directions
@@ -58,12 +58,12 @@ class CriticalPoint(eqx.Module):
 
 
 class Branch(eqx.Module):
-    """Equilibria in a row on one branch, k of them.
+    """A sequence of k equilibria on one branch.
 
     - `parameter` [k]: where in the sequence of scenes, from 0 to m - 1; `equilibria`: with a leading axis of k
     - `index` [k]: the number of motions along which the energy falls; 0 where stable
     - `critical_points`: those between the equilibria, in their order
-    - `ended`: why it goes no further
+    - `ended`: why it was followed no further
     """
 
     parameter: Float[Array, "k"]
@@ -87,10 +87,12 @@ def follow(
     step: float = DEFAULT_STEPS.first,
     max_step: float = DEFAULT_STEPS.longest,
     max_points: int = DEFAULT_STEPS.most,
+    progress: bool | None = None,
 ) -> Branch:
     """One branch of equilibria through a sequence of scenes, stable or not, and through folds: pseudo-arclength.
 
-    Scenes may come again, as the branch turns back at folds. It ends where it reaches the first or the last scene.
+    A scene may be passed several times, as the branch turns back at folds. It ends where it reaches the first or the
+    last scene.
 
     **Arguments:**
 
@@ -103,6 +105,8 @@ def follow(
         [rad], and of the change of the parameter as a part of m - 1. Two critical points within a step are found where
         they change the index, or the direction of the parameter.
     - `max_points`: the most equilibria.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+        notebook.
 
     Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential.
     Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).

@@ -58,7 +58,7 @@ def lowest_mode(equilibrium: Equilibrium) -> Mode:
 
 @one_answer
 def squared_frequencies(equilibrium: Equilibrium, count: int = 6) -> np.ndarray:
-    """Squares of the lowest angular frequencies of small vibrations [1/s^2], (count,) complex, by their size.
+    """Squares of the lowest angular frequencies of small vibrations [1/s^2], (count,) complex, by magnitude.
 
     All real and positive: the equilibrium is stable. A negative one: it is left without vibration (divergence); a
     complex pair: by vibrations that grow (flutter). Under follower loads and couples, which have no potential, this is

@@ -19,6 +19,7 @@ from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional, slides
+from rodjax.notes import note
 from rodjax.paths.harness_path import harness_path
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
@@ -71,7 +72,7 @@ def solve_path(
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     at_critical: AtCritical = "jump",
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Any:
     """The equilibria of a sequence of scenes, each solved from the last; turns are carried along.
 
@@ -82,14 +83,16 @@ def solve_path(
     - `at_critical`: `"jump"`: where the branch of equilibria loses its stability the path goes on with the minimum
         found beyond, as a cable does. `"stop"`: it ends with the last scene before the first critical point of the
         branch, see `rodjax.follow`; eager only.
-    - `progress`: show a progress bar.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+      notebook; `True`: by a bar, which asks for a program of its own.
 
-    A step starts from the last equilibrium, or from where the last two point as far as the scenes go on as they did. A
-    step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves it took.
+    A step starts from the last equilibrium, or from the extrapolation of the last two as far as the scenes change as
+    they did before. A step that does not converge is halved, and halved again; `Equilibrium.substeps` counts the solves
+    it took.
 
-    Friction of obstacles acts from step to step: the slip of a node is what it goes along an obstacle from one
-    equilibrium to the next, and the tangential force there is at most mu times the pressure, as much where the node
-    slips, and against the slip. The first scene is solved from rest, without friction, unless the guess is an
+    Friction of obstacles acts from step to step: the slip of a node is its displacement along an obstacle from one
+    equilibrium to the next. The tangential force is at most mu times the pressure; where the node slips it equals that
+    bound and opposes the slip. The first scene is solved from rest, without friction, unless the guess is an
     `Equilibrium`. A step that is split has more equilibria on its way, and slips are counted from each. Obstacles with
     friction stay where they are. Derivatives are those of each step, with the places of the last equilibrium held.
 
@@ -109,7 +112,6 @@ def solve_path(
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
     stacked = stack_scenes(scenes)
-    instance(progress, "progress", bool)
     fixed_scenes, guess = not_differentiated(stacked, guess)
     if isinstance(scenes, Scene) or fixed_scenes is not stacked:
         check_ranges(fixed_scenes)
@@ -122,7 +124,7 @@ def solve_path(
         _check_stop(fixed_scenes)
 
     def solve(options: Options, _: Equilibrium | None) -> Equilibrium:
-        return path_from(fixed_scenes, guess, strain_limit, options, progress)
+        return path_from(fixed_scenes, guess, strain_limit, options, bool(progress))
 
     path = with_ranges(fixed_scenes, refined_together(solve, options, rtol))
     warn_of_outcome(path, strain_limit)
@@ -248,6 +250,8 @@ def path_from(
     """A path on one mesh; the guess is for its first scene."""
     # NumPy's, where the numbers are known: JAX takes as long for each of them as for a step.
     first = jax.tree.map(lambda leaf: namespace(leaf).asarray(leaf)[0], scenes)
+    count = scenes.rod.length.shape[0]
+    note("" if progress else f"solving {count} scenes one after another, on {options.segments} segments")
     return _solve_path(scenes, *first_state(first, guess, options), strain_limit, options, progress)
 
 

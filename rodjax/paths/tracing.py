@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.form import NEUTRAL
 from rodjax.model.scene import Scene
+from rodjax.notes import note
 from rodjax.paths.branch import BranchTangent, Station, no_motion, stepped
 from rodjax.solving.result import Equilibrium
 
@@ -118,6 +119,7 @@ def trace(
         return Trace(stations, crossings, BranchEnd.SCENES)
     distance = steps.first
     while len(stations) < steps.most:
+        note(f"following a branch, {len(stations)} equilibria so far")
         line = Line(scenes, segment, station)
         step = _step(line, distance)
         if step is None:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 import jax
 
 from rodjax.checks import shown
+from rodjax.notes import noted, told
 from rodjax.programs import kept
 from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
 from rodjax.programs.numpy_operations import TookTooLongError
@@ -29,8 +30,9 @@ LEAST_SECONDS = 1.0  # for the smallest program, on a busy machine
 PATIENCE = 0.5
 # The environment variable: "off" for no NumPy code.
 VARIABLE = "RODJAX_NUMPY_FIRST"
-# Around what may take seconds; the command line says so there.
-waiting: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+# What takes seconds, as a call says that lasts.
+PREPARING = "preparing, once for this kind of scene and mesh"
+COMPILING = "compiling, once for this kind of scene and mesh"
 # So many programs keep what JAX traced, and so many their NumPy code, of some 4 MB.
 MOST_TRACED, MOST_CODES = 16, 64
 _slots = threading.BoundedSemaphore(os.cpu_count() or 1)
@@ -70,7 +72,7 @@ class Program:
         executable = self.executable
         if executable is None:
             ANSWERS.compile_others(self)
-            with waiting():
+            with noted(COMPILING):
                 executable = self.compile(lambda: self.trace(args, options))
         return executable(*given, **named)
 
@@ -82,7 +84,7 @@ class Program:
         if not ANSWERS.by_numpy or _here.is_compiled_only or not is_early or self.seconds_left <= 0:
             return None
         if self.code is None:
-            with waiting():
+            with noted(PREPARING):
                 self._find_or_write_code(args, options)
         return self.code
 
@@ -230,11 +232,13 @@ def compiled_only() -> Iterator[None]:
 
 
 def one_answer(function: F) -> F:
-    """A function that calls the same programs many times for one answer, such as a fit."""
+    """A function that calls the same programs many times for one answer, such as a fit. What it does is told where it
+    takes long: by its argument `progress`, where it has one.
+    """
 
     @functools.wraps(function)
     def answer(*args, **options):
-        with ANSWERS.one():
+        with ANSWERS.one(), told(options.get("progress")):
             return function(*args, **options)
 
     return cast(F, answer)

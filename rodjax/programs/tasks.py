@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Int
 
 from rodjax.checks import line, shown, whole_number
+from rodjax.notes import bar
 from rodjax.programs import kept
 from rodjax.programs.answers import compiled_only
 from rodjax.version import __version__
@@ -103,13 +104,18 @@ def in_order(
     *,
     executor: Executor | None = None,
     threads: int | None = None,
+    unit: str = "parts",
 ) -> list[Any]:
-    """What `function` gives for each of the parts, in their order: see `as_completed`. A single part is done here as if
-    it were no part, by NumPy code too, unless there is an executor.
+    """What `function` gives for each of the parts, in their order: see `as_completed`; a bar counts them by `unit`. A
+    single part is done here as if it were no part, by NumPy code too, unless there is an executor.
     """
     if executor is None and len(parts) == 1:
         return [function(*parts[0])]
-    found = dict(as_completed(function, parts, executor=executor, threads=threads))
+    found = {}
+    with bar(len(parts), unit) as drawn:
+        for number, one in as_completed(function, parts, executor=executor, threads=threads):
+            found[number] = one
+            drawn.update()
     return [found[number] for number in range(len(found))]
 
 

@@ -33,6 +33,7 @@ class Gradients(NamedTuple):
     - `margins`: names, as of `rodjax.Margins`
     - `derivatives` (m, v): of each relative margin by each variable, by its unit
     - `remark`: told beside them; of a route whether it is an optimum, and what holds it
+    - `ranges` (v, 2): between which a route sought the values, and `active`: at which end of it each is held, or ""
     """
 
     variables: tuple[str, ...]
@@ -41,6 +42,8 @@ class Gradients(NamedTuple):
     margins: tuple[str, ...]
     derivatives: Float[np.ndarray, "m v"]
     remark: str = ""
+    ranges: Float[np.ndarray, "v 2"] | None = None
+    active: tuple[str, ...] = ()
 
     @staticmethod
     def of(route: Route) -> "Gradients":
@@ -48,7 +51,21 @@ class Gradients(NamedTuple):
         margins = tuple(name for name in route.gradients if name != "objective")
         rows = [np.asarray(route.gradients[name]) for name in margins]
         derivatives = np.reshape(rows, (len(rows), len(route.names)))
-        return Gradients(route.names, route.units, np.asarray(route.numbers), margins, derivatives, route.optimality)
+        ranges = np.stack([np.asarray(route.lower), np.asarray(route.upper)], axis=-1)
+        ends = [
+            [end for end in ("lower", "upper") if f"{name} at its {end} bound" in route.multipliers]
+            for name in route.names
+        ]
+        return Gradients(
+            route.names,
+            route.units,
+            np.asarray(route.numbers),
+            margins,
+            derivatives,
+            route.optimality,
+            ranges,
+            tuple(" and ".join(end) for end in ends),
+        )
 
 
 class Fact(NamedTuple):
@@ -174,7 +191,7 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
     facts += [
         Fact("largest twist rate", *_finite(measured["twist"][0], "rad/m", measured["twist"][1])),
         Fact("total twist", float(equilibrium.total_twist), "rad"),
-        Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="either way"),
+        Fact("largest strain", *_finite(measured["strain"][0], "", measured["strain"][1]), note="of either sign"),
         _axial(float(tension[most]), float(s[most]), "largest tension", "least compression"),
         _axial(float(tension[least]), float(s[least]), "least tension", "largest compression"),
         Fact("elastic energy", float(equilibrium.elastic_energy), "J"),
@@ -195,7 +212,7 @@ def _somewhere(equilibrium: Equilibrium) -> str:
     first, last = np.asarray(most_curved(equilibrium))
     if not (bool(equilibrium.converged) and np.isfinite(first)):
         return ""
-    return f", by its error anywhere from s = {1e3 * first:.4g} to {1e3 * last:.4g} mm"
+    return f", within its error between s = {1e3 * first:.4g} and {1e3 * last:.4g} mm"
 
 
 def _finite(value: float, unit: str, s: float) -> tuple[float | None, str, float | None]:

@@ -36,11 +36,14 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """What one panel shows of one cable; `limits`: values along s that must not be crossed."""
+    """What one panel shows of one cable; `limits`: values along s that must not be crossed, each in the color of what
+    it limits.
+    """
 
     label: str
     curves: list[Curve]
     limits: list[Float[np.ndarray, "k"]]
+    limit_colors: tuple[str, ...] = ()
 
 
 def plot_along(cables: Sequence[Cable], obstacles: Sequence[Obstacle], names: Sequence[str]) -> Figure:
@@ -62,17 +65,19 @@ def plot_along(cables: Sequence[Cable], obstacles: Sequence[Obstacle], names: Se
             grid[0, column].annotate(
                 clip.name,
                 (PER_METRE * clip.s, 1.0),
-                (2, -2),
+                (0, 2),
                 xycoords=("data", "axes fraction"),
                 textcoords="offset points",
-                va="top",
+                ha="center",
+                va="bottom",
                 fontsize=7,
                 color="0.35",
             )
         _mark_bend_radii(grid[0, column])
         grid[len(panels) - 1, column].set_xlabel("arclength s [mm]")
         if len(cables) > 1:
-            grid[0, column].set_title(cable.name, fontsize=10)
+            grid[0, column].set_title(cable.name, fontsize=10, pad=14 if len(clips) else None)
+        figure.align_ylabels(grid[: len(panels), column])
     return figure
 
 
@@ -107,9 +112,13 @@ def _panels(
             Curve(name, PER_METRE * row, PALETTE[k % len(PALETTE)])
             for k, (name, row) in enumerate(zip(names, away, strict=True))
         ]
-        asked = None if limits is None or limits.clearance is None else np.unique(np.asarray(limits.clearance))
-        lines = [] if asked is None else [PER_METRE * float(x) * ones for x in asked]
-        panels.append(Panel("clearance [mm]", curves, lines))
+        lines, colors = [], ()
+        if limits is not None and limits.clearance is not None:
+            asked = np.broadcast_to(np.asarray(limits.clearance), (len(obstacles),))
+            is_one = len(np.unique(asked)) == 1
+            lines = [PER_METRE * float(x) * ones for x in (asked[:1] if is_one else asked)]
+            colors = () if is_one else tuple(curve.color for curve in curves)
+        panels.append(Panel("clearance [mm]", curves, lines, colors))
     return PER_METRE * s, panels
 
 
@@ -138,10 +147,13 @@ def _draw(axes: Axes, s: Float[np.ndarray, "k"], panel: Panel) -> None:
         axes.plot(s, curve.values, curve.style, color=curve.color, linewidth=1.3, label=curve.label or None)
     low, high = axes.get_ylim()
     reach = FAR * max(float(np.max(np.abs(curve.values))) for curve in panel.curves)
-    near = [values for values in panel.limits if np.min(np.abs(values)) < reach]
-    for k, values in enumerate(near):
-        axes.plot(s, values, ":", color=LIMIT_COLOR, linewidth=1.3, label=None if k else "limit")
+    colors = panel.limit_colors or (LIMIT_COLOR,) * len(panel.limits)
+    shown = [pair for pair in zip(panel.limits, colors, strict=True) if np.min(np.abs(pair[0])) < reach]
+    for values, color in shown:
+        axes.plot(s, values, ":", color=color, linewidth=1.5)
+    near = [values for values, _ in shown]
     if near:
+        axes.plot([], [], ":", color="0.4" if panel.limit_colors else LIMIT_COLOR, label="limit")
         margin = 0.04 * (max(high, np.max(near)) - min(low, np.min(near)))
         axes.set_ylim(min(low, np.min(near) - margin), max(high, np.max(near) + margin))
     axes.set_xlim(s[0], s[-1])

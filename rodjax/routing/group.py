@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from tqdm import tqdm
 
+from rodjax.notes import bar
 from rodjax.paths.batch import solve_first
 from rodjax.routing.problem import (
     Evaluation,
@@ -60,10 +60,9 @@ def searched(
     reserves: Float[np.ndarray, "k m"],
     count: int,
     targets: Targets,
-    progress: bool,
 ) -> Found:
     """What the searches from the first `count` of the starts find, each with its reserve of the slacks."""
-    return Group(problem, starts, guesses, reserves, targets, progress).found(count)
+    return Group(problem, starts, guesses, reserves, targets).found(count)
 
 
 class Group:
@@ -76,9 +75,8 @@ class Group:
         guesses: Equilibrium,
         reserves: Float[np.ndarray, "k m"],
         targets: Targets,
-        progress: bool,
     ):
-        self.problem, self._reserves, self._targets, self._progress = problem, reserves, targets, progress
+        self.problem, self._reserves, self._targets = problem, reserves, targets
         self._options = checked_options(problem.scene, problem.segments, None, "hermite", problem.solver, None, False)[
             0
         ]
@@ -98,11 +96,10 @@ class Group:
             )
             return lambda ask: Search(self._starts[k], first[k], settings, ask, self._spare).run()
 
-        with tqdm(disable=not self._progress, unit="round") as bar:
+        with bar(None, "rounds") as drawn:
 
             def evaluate(asked: dict[int, Asked]) -> dict[int, Numbers]:
-                bar.update()
-                bar.set_postfix(running=len(asked))
+                drawn.update()
                 return self.evaluate(asked)
 
             outcomes = Rounds([search(k) for k in range(count)], evaluate).run()

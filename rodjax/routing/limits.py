@@ -9,7 +9,7 @@ from rodjax.checks import leaf, not_negative, number_list, positive, shown
 
 
 class Limits(eqx.Module):
-    """What the shape and the forces of a route shall keep to; what is not given is not asked.
+    """Limits on the shape and the forces of a route; a limit that is not given is not checked.
 
     **Arguments:**
 
@@ -19,8 +19,8 @@ class Limits(eqx.Module):
         one for each.
     - `clip_force` [N], `clip_moment` [N m]: largest of each clip.
     - `end_force` [N], `end_moment` [N m]: largest at each end.
-    - `twist` [rad/m]: largest, either way.
-    - `strain`: largest axial strain, either way.
+    - `twist` [rad/m]: largest magnitude.
+    - `strain`: largest magnitude of the axial strain.
     - `stability` [N]: least stiffness of the softest motion, as by `rodjax.lowest_mode`.
     - `length` [m], `mass` [kg], `energy` [J]: largest; of the energy, the elastic one.
 

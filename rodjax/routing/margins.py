@@ -25,7 +25,7 @@ NEARER = 6
 
 
 class Margins(eqx.Module):
-    """By how much limits are kept, one entry for each of the m things they limit; of several rods along `...`.
+    """The margins to limits, one entry for each of the m quantities they limit; of several rods along `...`.
 
     - `names`: such as "bend radius", "clearance to obstacle 0", "force of clip 0", "moment of start"
     - `units` of value and limit; `kinds`: "least" or "most"
@@ -80,7 +80,7 @@ class Measured(eqx.Module):
 
 
 def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names: Any = None) -> Margins:
-    """By how much an equilibrium keeps to limits.
+    """The margins of an equilibrium to limits.
 
     **Arguments:**
 
@@ -98,8 +98,8 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     Derivatives are those of the worst place, held at its fraction of the mesh, by numbers of the scene, the
     limits and the obstacles; of a straight rod, that of the bend radius is 0.
 
-    Raises `ValueError` or `TypeError` for a limit that asks for what the scene has not: a radius, clips, obstacles, for
-    obstacles without a limit of clearance, and for a stability that `rodjax.lowest_mode` refuses.
+    Raises `ValueError` or `TypeError` for a limit on what the scene lacks: a radius, clips, obstacles, for obstacles
+    without a limit of clearance, and for a stability that `rodjax.lowest_mode` refuses.
     """
     instance(equilibrium, "equilibrium", Equilibrium)
     obstacles, names = checked(equilibrium, limits, obstacles, names)

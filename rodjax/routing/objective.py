@@ -15,13 +15,13 @@ CLIP_SHARE = 0.05
 
 
 class Objective(eqx.Module):
-    """A weighted sum of what a route costs; of one of them with others as constraints, see `Limits`.
+    """The cost of a route, a weighted sum of the terms below; `Limits` are its constraints.
 
     **Arguments:** weights, each per unit of its own.
 
     - `length`: of the cable [m]; `mass` [kg].
     - `energy`: elastic energy, of bending nearly all of it [J].
-    - `end_force`: sum of the sizes of the forces at both ends [N].
+    - `end_force`: sum of the magnitudes of the forces at both ends [N].
     - `clips`: how many clips carry a force, counted smoothly: the sum of f^2/(f^2 + f0^2) over clips with the force f.
     - `clip_scale`: f0 [N]; `None`: a twentieth of the cable's weight.
 

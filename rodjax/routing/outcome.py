@@ -43,8 +43,10 @@ def as_dict(route: Route) -> dict[str, Any]:
         "gain_within_a_thousandth": plain(route.gain),
         "multipliers": {name: plain(value) for name, value in route.multipliers.items()},
         "numbers": {
-            name: {"value": plain(value), "unit": unit}
-            for name, unit, value in zip(route.names, route.units, np.asarray(route.numbers), strict=True)
+            name: {"value": plain(value), "unit": unit, "lower": plain(lower), "upper": plain(upper)}
+            for name, unit, value, lower, upper in zip(
+                route.names, route.units, route.numbers, route.lower, route.upper, strict=True
+            )
         },
         "values": {key: plain(value) for key, value in route.values.items()},
         "margins": dict(zip(route.margins.names, plain(np.asarray(route.margins.margin)), strict=True)),

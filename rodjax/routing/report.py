@@ -141,23 +141,33 @@ def report(
     gradients: Any = None,
     title: str | None = None,
     source: str | None = None,
+    progress: bool | None = None,
 ) -> Report:
-    """What there is to say of a cable at rest, or of several in one scene.
+    """A report of one cable in equilibrium, or of several in one scene.
 
     **Arguments:**
 
     - `equilibrium`: one `Equilibrium`, a list of them, or a dictionary of them by the names of the cables; or that of a
-      harness, whose rods are the cables: whether they are stable is told of the whole.
+      harness, whose rods are the cables: whether they are stable is told of the whole; or a `Route`, whose limits,
+      obstacles, their names and gradients are taken where none are given, and the bounds of its variables.
     - `limits`: `Limits` of all cables, or a list of `Limits` or `None`, one for each cable; `None`: none.
     - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
     - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
     - `title`: `None`: "Route".
     - `source`: what the cables were read from, told beside the date and the version.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+        notebook.
 
     Raises `ValueError` or `TypeError` for other arguments, for a stack of equilibria or one without a finite shape, and
     as `rodjax.margins` does.
     """
+    if isinstance(equilibrium, Route):
+        route = equilibrium
+        equilibrium, gradients = route.verified, route if gradients is None else gradients
+        limits = route.limits if limits is None else limits
+        if isinstance(obstacles, tuple) and not obstacles:
+            obstacles, names = route.obstacles, route.obstacle_names if names is None else names
     cables = _cables(equilibrium)
     each_limits = _each(limits, "limits", (Limits,), len(cables))
     each_gradients = _each(gradients, "gradients", (Gradients, Route), len(cables))

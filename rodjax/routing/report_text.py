@@ -25,6 +25,7 @@ MOST_NAMED = 3
 COLUMNS = 4
 # Components of loads below this part of their size, or of EI/L^2 and EI/L, are told as 0.
 ROUNDING = 1e-9
+CHANGES = "Change of each margin by the design variables:"
 SIGNS = {"least": ">=", "most": "<="}
 
 
@@ -202,13 +203,31 @@ def gradients(cable: Cable) -> str:
     if cable.gradients is None:
         return ""
     found = cable.gradients
-    told = "Change of each margin by the design variables:"
-    count = len(found.variables)
-    parts = [_columns(found, range(k, min(k + COLUMNS, count))) for k in range(0, count, COLUMNS)]
-    return "\n".join([*([found.remark] if found.remark else []), told, *parts])
+    bounds = [table(rows, "<>>><") + "\n"] if (rows := ranges(found)) else []
+    parts = [table(rows, "<" + ">" * (len(rows[0]) - 1)) for rows in derivatives(found)]
+    return "\n".join([*([found.remark] if found.remark else []), *bounds, CHANGES, *parts])
 
 
-def _columns(gradients: Gradients, which: Sequence[int]) -> str:
+def ranges(gradients: Gradients) -> list[tuple[str, ...]]:
+    """What a route found, between which bounds, and which of them hold it; nothing of what is not of a route."""
+    if gradients.ranges is None:
+        return []
+    rows: list[tuple[str, ...]] = [("design variable", "found", "lower bound", "upper bound", "")]
+    each = zip(gradients.variables, gradients.units, gradients.values, gradients.ranges, gradients.active, strict=True)
+    for name, unit, value, bounds, active in each:
+        # Numbers without a unit are told as they are, not in percent as strains.
+        cells = [amount(float(x), unit) if unit else f"{float(x):.4g}" for x in (value, *bounds)]
+        rows.append((name, *cells, f"at its {active} bound" if active else ""))
+    return rows
+
+
+def derivatives(gradients: Gradients) -> list[list[tuple[str, ...]]]:
+    """Rows of tables, each of a few design variables: what they are, and by how much they change each margin."""
+    count = len(gradients.variables)
+    return [_columns(gradients, range(k, min(k + COLUMNS, count))) for k in range(0, count, COLUMNS)]
+
+
+def _columns(gradients: Gradients, which: Sequence[int]) -> list[tuple[str, ...]]:
     # Numbers without a unit are told as they are, not in percent as strains.
     units = [TOLD.get(gradients.units[k] or "1", (gradients.units[k] or "1", 1.0)) for k in which]
     values = [
@@ -219,7 +238,7 @@ def _columns(gradients: Gradients, which: Sequence[int]) -> str:
     for name, row in zip(gradients.margins, np.asarray(gradients.derivatives), strict=True):
         cells = [f"{100 * row[k] / factor + 0.0:+.3g} %/{unit}" for k, (unit, factor) in zip(which, units, strict=True)]
         rows.append((name, *cells))
-    return table(rows, "<" + ">" * len(which))
+    return rows
 
 
 def table(rows: Sequence[Sequence[str]], sides: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, positive, whole_number
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, check_without_friction, slides
 from rodjax.paths.batch import solve_stack
 from rodjax.programs.answers import one_answer
@@ -88,14 +89,16 @@ class Starts(eqx.Module):
 class Route(eqx.Module):
     """The best of the routes found; `feasible`: it keeps to all limits, on the finer mesh too.
 
+    - `limits`, `obstacles`, `obstacle_names`: what was asked for
     - `scene`; `equilibrium`: on the mesh of the search; `verified`: on one twice as fine, and `margins` of that
     - `objective`: what was least; `optimal`: whether conditions of optimality to first order hold there: `gain`, by
         how much it falls at most, to first order, within a thousandth of the range of each variable and the limits, is
         below the tolerance
-    - `multipliers`: by the names of what holds the objective up, by how much it falls for a whole limit more: of the
-        limits, the spans of the rod kept from being pulled taut, and per range the ends of the ranges
-    - `names`, `units` (n): of the numbers that varied; `numbers` (n,): what they are in SI units; `values`: by the key
-      of each variable, what the scene has
+    - `multipliers`: of the active constraints by name, the decrease of the objective if the constraint is relaxed by
+        the whole limit, or a bound of a variable by its whole range; spans of the rod that are kept from being pulled
+        taut count too
+    - `names`, `units` (n): of the numbers that varied; `numbers` (n,): what they are in SI units, between `lower` and
+      `upper`; `values`: by the key of each variable, what the scene has
     - `gradients`: by the names of the margins, and "objective": the derivatives by `numbers`, (n,); of the margins at
       the worst place, on the mesh of the search
     - `starts`: how each start ended
@@ -104,6 +107,9 @@ class Route(eqx.Module):
     """
 
     feasible: bool = eqx.field(static=True)
+    limits: Limits | None
+    obstacles: tuple[Obstacle, ...]
+    obstacle_names: tuple[str, ...] = eqx.field(static=True)
     scene: Scene
     equilibrium: Equilibrium
     verified: Equilibrium
@@ -115,6 +121,8 @@ class Route(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     numbers: Float[np.ndarray, "n"]
+    lower: Float[np.ndarray, "n"]
+    upper: Float[np.ndarray, "n"]
     values: dict[str, np.ndarray]
     gradients: dict[str, Float[np.ndarray, "n"]]
     starts: Starts
@@ -147,7 +155,7 @@ class Route(eqx.Module):
     @property
     def optimality(self) -> str:
         """Whether the objective is an optimum, and what holds it, in words."""
-        gain = f"within a thousandth of the ranges the objective decreases by at most {self.gain:.1g}"
+        gain = f"within a thousandth of the ranges the objective decreases by at most {max(self.gain, 0.0) + 0.0:.1g}"
         if not self.optimal:
             return f"It is NOT known to be an optimum, the search stalled: {gain}."
         held = sorted(self.multipliers.items(), key=lambda item: -item[1])
@@ -173,9 +181,9 @@ def route(
     reserve: Any = None,
     executor: Executor | None = None,
     threads: int | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Route:
-    """The design of least cost that keeps to limits: where clips sit, how long the cable is, how its ends point.
+    """The design of least cost within limits: positions of clips, length of the cable, directions of its ends.
 
     Each start is a search by sequential quadratic programming with exact derivatives; eight starts at a time are
     computed together. The first begins at the nominal scene, the others at random designs.
@@ -198,7 +206,8 @@ def route(
         `concurrent.futures.Executor`, such as `client.get_executor()` of Dask; `None`: threads of this process.
     - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
         result.
-    - `progress`: show a progress bar of rounds of solves, where up to eight starts are searched here.
+    - `progress`: whether a bar on stderr tells of it, by rounds of solves, of more than eight starts by groups of
+        eight; `None`: in a terminal or notebook, after 2 s.
 
     Limits all along the rod are kept at every place that `rodjax.margins` looks at, each place a constraint: so all
     constraints are smooth, and no softened maximum is taken. The result is called optimal where the conditions of
@@ -211,7 +220,7 @@ def route(
 
     The same arguments give the same route to the last bit. Where no start keeps to the limits, the result is that of
     the least violation, `feasible` is False, and `str` says what is missing. Raises `ValueError` or `TypeError` for
-    arguments that make no sense, and `ValueError` where no start has an equilibrium.
+    invalid arguments, and `ValueError` where no start has an equilibrium.
     """
     workers = Workers(checked_executor(executor), checked_threads(threads))
     problem, names = _problem(scene, variables, limits, objective, obstacles, names, segments, solver)
@@ -220,9 +229,8 @@ def route(
     given = None if reserve is None else float(positive(reserve, "reserve"))
     tolerance = float(positive(tolerance, "tolerance"))
     iterations = whole_number(iterations, "iterations", 1, 1_000_000)
-    instance(progress, "progress", bool)
 
-    fleet = _Fleet(problem, count, rng, workers, progress)
+    fleet = _Fleet(problem, count, rng, workers)
     fleet.search(tolerance, iterations, RESERVE if given is None else given)
     return _best(fleet, names, is_finished=given is None)
 
@@ -252,8 +260,8 @@ def _problem(
 class _Fleet:
     """All searches, in groups: where they start, and the best of each."""
 
-    def __init__(self, problem: Problem, count: int, rng: np.random.Generator, workers: Workers, progress: bool):
-        self.problem, self._workers, self._progress = problem, workers, progress
+    def __init__(self, problem: Problem, count: int, rng: np.random.Generator, workers: Workers):
+        self.problem, self._workers = problem, workers
         self.solves = np.zeros(count, int)
         self.failed = self.redrawn = 0
         starts, guesses = self._begin(count, rng)
@@ -330,15 +338,16 @@ class _Fleet:
         size, count = min(GROUP, len(self._starts)), len(which)
         targets = Targets(self.scale, self.tolerance, self._iterations, region)
         firsts = range(0, count, size)
-        is_one = len(firsts) == 1 and self._workers.executor is None
 
         def part(first: int) -> tuple[Any, ...]:
             rows = which[rows_of(first, size, count)]
             starts, guesses, reserves = _rows((self._starts, self._guesses, self.reserves), rows)
-            return self.problem, starts, guesses, reserves, min(size, count - first), targets, self._progress and is_one
+            return self.problem, starts, guesses, reserves, min(size, count - first), targets
 
         parts = [part(first) for first in firsts]
-        for first, found in zip(firsts, in_order(searched, parts, **self._workers._asdict()), strict=True):
+        for first, found in zip(
+            firsts, in_order(searched, parts, **self._workers._asdict(), unit="groups of starts"), strict=True
+        ):
             self._put(which[first : first + size], found)
 
     def _put(self, which: Int[np.ndarray, "w"], found: Found) -> None:
@@ -409,6 +418,9 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
     conditions = fleet.optimality(best)
     return Route(
         feasible=bool(kept[best]),
+        limits=problem.limits,
+        obstacles=problem.obstacles,
+        obstacle_names=names,
         scene=at.result.scene,
         equilibrium=at.result,
         verified=verified,
@@ -420,6 +432,8 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
         names=labels,
         units=tuple(unit for variable in variables for unit in variable.units()),
         numbers=offsets + scales * np.asarray(at.design),
+        lower=np.minimum(offsets, offsets + scales),
+        upper=np.maximum(offsets, offsets + scales),
         values={variable.key: np.asarray(number_of(at.result.scene, variable)) for variable in variables},
         gradients=rows,
         starts=_starts(fleet, feasible, offsets, scales, found.names),
@@ -486,7 +500,7 @@ def _multipliers(
             multiplier *= float(rates[1 + worst] @ row) / max(float(row @ row), np.finfo(float).tiny)
         found[names[g - spans] if g >= spans else f"length of the rod in span {g}"] = multiplier
     for values, end in ((conditions.lower, "lower"), (conditions.upper, "upper")):
-        found |= {f"{label} at its {end} end": float(value) for label, value in zip(labels, values, strict=True)}
+        found |= {f"{label} at its {end} bound": float(value) for label, value in zip(labels, values, strict=True)}
     # What the program leaves of others is nothing.
     least = NOTHING * abs(float(at.objective))
     return {name: value for name, value in found.items() if value > least}

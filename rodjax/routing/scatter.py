@@ -16,6 +16,7 @@ from rodjax.identification.unknowns import nominal, with_values
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, has_potential, slides
 from rodjax.model.supports import Free
+from rodjax.notes import bar
 from rodjax.paths.batch import LANES, chunk_size, solve_stack
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
@@ -112,8 +113,10 @@ class Scattering(eqx.Module):
             results: Iterable[tuple[int, Any]] = enumerate(_solved_part(*part) for part in parts)
         else:
             results = as_completed(_solved_part, parts, **workers._asdict())
-        for number, part in results:
-            yield number, *jax.tree.map(lambda x, k=number: x[: total - k * size], part)
+        with bar(total, "cases") as drawn:
+            for number, part in results:
+                drawn.update(min(size, total - number * size))
+                yield number, *jax.tree.map(lambda x, k=number: x[: total - k * size], part)
 
 
 def _solved_part(

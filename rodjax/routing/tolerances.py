@@ -190,8 +190,9 @@ def tolerances(
     seed: int = 0,
     executor: Executor | None = None,
     threads: int | None = None,
+    progress: bool | None = None,
 ) -> Envelope:
-    """How an equilibrium scatters where numbers of its scene do, normally and independently of one another.
+    """The scatter of an equilibrium whose scene has numbers with tolerances, normally distributed and independent.
 
     **Arguments:**
 
@@ -206,13 +207,14 @@ def tolerances(
         `client.get_executor()` of Dask; `None`: threads of this process.
     - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core. Neither changes the
         result.
+    - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
 
     Flagged are quantities whose standard deviation by the solves differs by more than 5 % from that of the first order,
     or whose mean is off by more than a tenth of it, both beyond what so few samples may be off by (two standard
     errors); solves that do not converge; and the rod where the stiffness of its softest motion vanishes within three
     standard deviations. Where the equilibrium is critical the first order is not a number, and a flag says so.
 
-    Raises `ValueError` or `TypeError` for names that the scene has not, and for arguments that make no sense.
+    Raises `ValueError` or `TypeError` for names that the scene does not have, and for invalid arguments.
     """
     workers = Workers(checked_executor(executor), checked_threads(threads))
     instance(equilibrium, "equilibrium", Equilibrium)

@@ -181,7 +181,7 @@ class OnPatch(Variable):
 
 
 class OnSurface(Variable):
-    """A position on a surface of one's own; `key`: such as `"clips.0.position"`.
+    """A position on a user-defined surface; `key`: such as `"clips.0.position"`.
 
     `function`: of u and v, both in 0 to 1, the point (3,) [m], in JAX. Programs are compiled for the function itself:
     make it once, not for each call.

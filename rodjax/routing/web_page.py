@@ -16,7 +16,7 @@ from matplotlib.colors import Colormap, to_hex
 from rodjax.model.surfaces import Faces
 from rodjax.plot import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
 from rodjax.routing import report_text
-from rodjax.routing.cable_report import Cable
+from rodjax.routing.cable_report import Cable, Gradients
 from rodjax.routing.records import plain
 from rodjax.routing.view_data import (
     Coloring,
@@ -168,11 +168,10 @@ def _panel(report: Any) -> str:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
         parts += [_limits(cable, k), _facts(cable, k), _supports(cable)]
         if cable.gradients is not None:
-            parts.append(f"<h2>derivatives</h2><pre>{escape(report_text.gradients(cable))}</pre>")
+            parts.append(_gradients(cable.gradients))
         parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
         rows = [_row([name, text], k, None) for name, text in report_text.inputs(report, cable)]
         parts.append("<h2>inputs</h2>" + _table(("", ">SI units"), rows, ' class="inputs"'))
-    parts.append(f'<div id="along"><h2>along the cable</h2>{_diagrams(report)}</div>')
     if report.obstacles:
         boxes = "".join(
             f'<li><label><input type="checkbox" checked data-obstacle="{k}">'
@@ -180,6 +179,7 @@ def _panel(report: Any) -> str:
             for k, name in enumerate(report.names)
         )
         parts.append(f"<h2>obstacles</h2><ul>{boxes}</ul>")
+    parts.append(f'<div id="along"><h2>along the cable</h2>{_diagrams(report)}</div>')
     return "\n".join(part for part in parts if part)
 
 
@@ -239,6 +239,20 @@ def _supports(cable: Cable) -> str:
                 rows.append(_row(cells, 0, None))
     heads = ("what supports apply", ">axes", ">1", ">2", ">3", ">magnitude")
     return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')
+
+
+def _gradients(gradients: Gradients) -> str:
+    """What a route found, and by how much each design variable changes each margin."""
+    parts = ["<h2>design</h2>", f'<p class="soft">{escape(gradients.remark)}</p>' if gradients.remark else ""]
+    bounds = report_text.ranges(gradients)
+    parts += [_design(bounds)] if bounds else []
+    parts += [f"<p>{escape(report_text.CHANGES)}</p>", *map(_design, report_text.derivatives(gradients))]
+    return "".join(parts)
+
+
+def _design(rows: Sequence[Sequence[str]]) -> str:
+    heads = [escape(rows[0][0]), *(f">{escape(name)}" for name in rows[0][1:])]
+    return _table(heads, [_row(row, 0, None) for row in rows[1:]], ' class="vectors design"')
 
 
 def _diagrams(report: Any) -> str:

@@ -19,7 +19,7 @@ ASIDE = 0.05
 
 
 class Guess(eqx.Module):
-    """A first shape, in no need of fitting supports, length or mesh.
+    """An initial shape; it need not match the supports, the length or the mesh.
 
     `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
     frames allow on this shape, the solution has the one nearest to this.

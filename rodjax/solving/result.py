@@ -83,7 +83,7 @@ class OverstretchedWarning(UserWarning):
 
 
 class MeshWarning(UserWarning):
-    """A mesh on which nobody looked at the errors: one far too coarse, or of a size that nobody chose."""
+    """A mesh whose errors were not estimated: one that is far too coarse, or of the default size inside `jit`."""
 
 
 class PrecisionWarning(UserWarning):

@@ -26,6 +26,7 @@ def solve(
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    progress: bool | None = None,
 ) -> Equilibrium: ...
 
 
@@ -41,6 +42,7 @@ def solve(
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    progress: bool | None = None,
 ) -> HarnessEquilibrium: ...
 
 
@@ -56,6 +58,7 @@ def solve(
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
+    progress: bool | None = None,
 ) -> Equilibrium | HarnessEquilibrium:
     """The equilibrium of a scene, or of a harness.
 
@@ -82,12 +85,14 @@ def solve(
         supports and gravity. Of a harness an earlier equilibrium or `None`.
     - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
         motions out of the plane too.
-    - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that would
-        rather leave its plane, is left along it, always to the same side. `"equilibrium"`: what the steps of Newton's
-        method lead to is kept, whatever its stability; `Equilibrium.index` counts the ways down from there. Where
-        poses are unknown these steps are not shortened but by `max_rotation`.
-    - `strain_limit`: largest |axial strain| that is not remarked on, at either sign; `None`: no limit. An equilibrium
-        beyond it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
+    - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that is
+        unstable out of its plane, is left along that motion, always to the same side. `"equilibrium"`: what the steps
+        of Newton's method lead to is kept, whatever its stability; `Equilibrium.index` counts the motions that lower
+        the energy. Where poses are unknown only `max_rotation` shortens these steps.
+    - `strain_limit`: largest |axial strain|, of either sign, without a warning; `None`: no limit. An equilibrium beyond
+        it has the status `OVERSTRETCHED`, and outside `jit` an `OverstretchedWarning` says where.
+    - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
+        notebook.
 
     A scene with an end that is a `Hinge`, `Slider` or `Spring` is solved as a harness of one rod, whose result is that
     of the rod: an `Equilibrium` with clamps at the poses that were found.
@@ -98,7 +103,7 @@ def solve(
     pressures that bound friction held.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.
-    Raises `ValueError` or `TypeError` for arguments that make no sense.
+    Raises `ValueError` or `TypeError` for invalid arguments.
     """
     instance(scene, "scene", (Scene, Harness))
     options: dict[str, Any] = {

@@ -25,8 +25,12 @@ need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the 
 Further quantities are written where they are asked for (`also=["bend_radius", "clip_forces"]`, `--also
 bend_radius,clip_forces`): `bend_radius` the smallest one of the centerline, `clearance` to each obstacle, `clip_forces`
 and `clip_moments` of each clip, `obstacle_forces` of each obstacle, `largest_tension`, `least_tension`,
-`largest_strain`. `rodjax sweep --csv` writes all but the nodes as a table too, `rodjax.sweeps.result.write_csv` that of
-a sweep that is there.
+`largest_strain`.
+
+**Tables**: `rodjax sweep --csv OUT.csv` and `--parquet OUT.parquet` (pyarrow: `pip install 'rodjax[parquet]'`) write
+all but the nodes as a table too, one row a case, one column a number, named with its unit: `end.position.2 [m]`,
+`bend_radius [m]`. `write_csv` and `write_parquet` of `rodjax.sweeps.result` make them of a finished sweep, and its
+`columns` gives what `pandas.DataFrame` takes.
 
 **On the way** there is a folder beside the result, named like it with `.parts`: `manifest.json`, which says what is
 solved, and `chunk-<number>.h5` for each finished chunk, with the datasets of the result; and a file with `.lock`, by

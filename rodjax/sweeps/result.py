@@ -20,6 +20,8 @@ from rodjax.sweeps.cases import SweepError
 from rodjax.sweeps.chunk import DESCRIPTIONS, ERRORS, INTEGERS, RESULTS, Arrays, error_by_rtol
 from rodjax.sweeps.manifest import Manifest, differences, manifest_of, opened
 
+PARQUET_SUFFIX = ".parquet"
+
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
@@ -152,30 +154,63 @@ def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.
     return dataset
 
 
-def write_csv(sweep: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Writes all of a sweep but its `nodes` as comma-separated values, one row a case; components of vectors go by
-    their numbers, as in the keys of scene files. The names of the columns end with their units.
+def columns(sweep: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """All of a sweep but its `nodes`, by columns of one number a case, the number of the case first. Components of
+    vectors go by their numbers, as in the keys of scene files. The names of the columns end with their units.
 
-    Raises `SweepError` for what is no sweep, `OSError` where the file cannot be written.
+    `pandas.DataFrame(columns("sweep.h5"))` makes a data frame of it. Raises `SweepError` for what is no sweep.
     """
-    columns: dict[str, np.ndarray] = {}
+    found: dict[str, np.ndarray] = {}
 
     def add(name: str, entry: Any) -> None:
         if isinstance(entry, h5py.Dataset) and name != "nodes":
             unit, values = entry.attrs["units"], entry[()]
             for index in np.ndindex(values.shape[1:]):
                 place = "".join(f".{k}" for k in index)
-                columns[f"{name.removeprefix('parameters/')}{place} [{unit}]"] = values[(slice(None), *index)]
+                found[f"{name.removeprefix('parameters/')}{place} [{unit}]"] = values[(slice(None), *index)]
 
     with opened(file_path(sweep, "sweep")) as file:
         Manifest.of(file.attrs, Path(sweep))
         file.visititems(add)
-    first = ["case [1]", *(name for name in columns if name != "case [1]")]
+    return {"case [1]": found.pop("case [1]")} | found
+
+
+def write_csv(sweep: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Writes the `columns` of a sweep as comma-separated values, one row a case.
+
+    Raises `SweepError` for what is no sweep, `OSError` where the file cannot be written.
+    """
+    found = columns(sweep)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(first)
-    writer.writerows(zip(*(columns[name].tolist() for name in first), strict=True))
+    writer.writerow(found)
+    writer.writerows(zip(*(values.tolist() for values in found.values()), strict=True))
     replace_file(file_path(path, "path", ".csv"), text.getvalue().encode())
+
+
+def write_parquet(sweep: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Writes the `columns` of a sweep as an Apache Parquet file, for pandas, polars and DuckDB; numbers keep their
+    types.
+
+    Raises `ImportError` without pyarrow (`pip install 'rodjax[parquet]'`), `SweepError` for what is no sweep, `OSError`
+    where the file cannot be written.
+    """
+    path = file_path(path, "path", PARQUET_SUFFIX)
+    check_parquet()
+    import pyarrow
+    from pyarrow import parquet
+
+    image = pyarrow.BufferOutputStream()
+    parquet.write_table(pyarrow.table(columns(sweep)), image)
+    replace_file(path, image.getvalue().to_pybytes())
+
+
+def check_parquet() -> None:
+    """Raises `ImportError` where Parquet files cannot be written, before a long sweep."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise ImportError("Parquet files need pyarrow: pip install 'rodjax[parquet]'") from None
 
 
 def summary(path: Path) -> Summary:

@@ -14,13 +14,13 @@ import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from rodjax.atomic_write import replace_file, seal
 from rodjax.checks import file_path, whole_number
 from rodjax.file_lock import LockedError, locked
 from rodjax.io.scene_file import SceneFile
 from rodjax.model.scene import check_without_friction
+from rodjax.notes import bar, told
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
 from rodjax.solving.equilibrium import DEFAULT_RTOL
 from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
@@ -86,7 +86,7 @@ def sweep(
     also: Sequence[str] = (),
     executor: Executor | None = None,
     threads: int | None = None,
-    progress: bool = False,
+    progress: bool | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Summary:
     """Solves a scene file for all cases of a grid or table and writes the results to one HDF5 file.
@@ -107,13 +107,13 @@ def sweep(
     - `executor`: what solves the chunks, anything with the interface of `concurrent.futures.Executor`, such as
         `client.get_executor()` of Dask; files are read and written here alone. `None`: threads of this process.
     - `threads`: how many, `None`: the environment variable `RODJAX_THREADS`, or one for each core.
-    - `progress`: draw a bar on stderr.
+    - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
     - `say`: gets a line on the mesh and on what was resumed.
 
-    Raises `SweepError` for what the user can mend: before anything is solved, but for a case that makes no sense though
-    the extreme ones do; where another process writes the same file; and where an executor fails, whose finished chunks
-    are kept. `OSError` where a file cannot be written. Whoever solves the chunks, on processors of one type the result
-    is the same to the last bit.
+    Raises `SweepError` for invalid input, before anything is solved, unless the extreme cases are valid and another is
+    not; where another process writes the same file; and where an executor fails, whose finished chunks are kept.
+    `OSError` where a file cannot be written. Whoever solves the chunks, on processors of one type the result is the
+    same to the last bit.
     """
     output = file_path(output, "output")
     try:
@@ -139,8 +139,8 @@ def sweep(
             f"shard {manifest.shard} would be empty: {_chunks(manifest)}; take fewer shards or a smaller chunk"
         )
     try:
-        with locked(output):
-            return _swept(reader, manifest, output, parts, resume, executor, threads, progress, say)
+        with locked(output), told(progress):
+            return _swept(reader, manifest, output, parts, resume, executor, threads, say)
     except LockedError as error:
         raise SweepError(str(error)) from None
 
@@ -153,7 +153,6 @@ def _swept(
     resume: bool,
     executor: Executor | None,
     threads: int,
-    progress: bool,
     say: Callable[[str], None],
 ) -> Summary:
     _check_place(output, parts, resume)
@@ -166,11 +165,11 @@ def _swept(
     missing = [chunk for chunk in manifest.chunks if not _is_there(_part(parts, chunk))]
     tasks = ((_chunk(reader, manifest, chunk),) for chunk in missing)
     done = manifest.rows - sum(len(manifest.cases_of(chunk)) for chunk in missing)
-    with tqdm(total=manifest.rows, initial=done, unit=" cases", disable=not progress, file=sys.stderr) as bar:
+    with bar(manifest.rows, "cases", done) as drawn:
         try:
             for k, solved in as_completed(solved_chunk, tasks, executor=executor, threads=threads):
                 _write(_part(parts, missing[k]), solved)
-                bar.update(len(solved["case"]))
+                drawn.update(len(solved["case"]))
         except TaskError as error:
             raise SweepError(f"{error}; the finished chunks are in {parts}: go on with --resume") from error
     files = (arrays(_part(parts, chunk), manifest, chunk) for chunk in manifest.chunks)

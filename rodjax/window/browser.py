@@ -15,7 +15,8 @@ import numpy as np
 
 from rodjax.checks import whole_number
 from rodjax.routing.limits import Limits
-from rodjax.window.controls import Pose
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.window.controls import Pose, rods_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import least_bend_radius, rows
@@ -50,7 +51,7 @@ class Window:
         self.session, self.limits = session, limits
         self.quantity, self.with_loads = "curvature", True
         self.scales: dict[str, Scale] = {}
-        self.report = Report(session.reading, "", True, False, int(session.result.iterations), 0.0)
+        self.report = Report(session.readings, "", True, False, int(session.result.iterations), 0.0)
         self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
         self.on_drawn: Callable[[Report], None] = lambda report: None
         self._numbers_at = self._stability_at = self._slid_at = 0.0
@@ -62,6 +63,8 @@ class Window:
             self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         # A tunnel through a server of viser's would let anybody in.
         self.server.request_share_url = _no_tunnel
+        least = [least_bend_radius(scene, limits) for scene in rods_of(session.scene).values()]
+        self._least_radii = None if None in least else [float(radius or 0) for radius in least]
         self.stage = Stage(self.server, session, self.drag)
         self.panel = self._panel()
         self.panel.show_frames(len(session.recorded), len(session.recorded) - 1)
@@ -99,9 +102,9 @@ class Window:
 
     def _panel(self) -> Panel:
         colors = dict(QUANTITIES)
-        if not self.session.scene.obstacles:
+        if "pressure" not in self.session.reading.values:
             colors.pop("pressure")
-        if least_bend_radius(self.session, self.limits) is not None:
+        if self._least_radii is not None:
             colors[MARGIN] = MARGIN
         later = self._mailbox.command
         buttons = Buttons(
@@ -216,21 +219,23 @@ class Window:
         self.panel.say(text or self._hint, is_bad=bool(text))
 
     def _draw(self) -> None:
-        reading = self.report.reading
-        least = least_bend_radius(self.session, self.limits)
-        if least is not None:
-            reading.values[MARGIN] = least * reading.values["curvature"]
-        values = reading.values[self.quantity]
+        readings = self.report.readings
+        if self._least_radii is not None:
+            for reading, least in zip(readings, self._least_radii, strict=True):
+                reading.values[MARGIN] = least * reading.values["curvature"]
+        values = np.concatenate([reading.values[self.quantity] for reading in readings])
         scale = self.scales.get(self.quantity)
         if scale is None or not covers(scale, values):
             low, high = float(np.min(values)), float(np.max(values))
             if scale is not None:  # it only grows, so that a colour keeps its meaning
                 low, high = min(low, float(scale.edges[0])), max(high, float(scale.edges[-1]))
             scale = self.scales[self.quantity] = scale_over(low, high)
+            self.panel.show_legend(scale)
         with self.server.atomic():
-            self.stage.draw(reading, self.quantity, scale)
-            self.stage.draw_loads(reading, self.with_loads)
-        self.panel.show_legend(scale)
+            self.stage.draw(readings, self.quantity, scale)
+            self.stage.draw_loads(readings, self.with_loads)
+            if isinstance(self.session.result, HarnessEquilibrium):
+                self.stage.draw_joints(np.asarray(self.session.result.positions))
 
     def _show_all(self) -> None:
         """After a jump to another moment: handles and sliders go along."""
@@ -260,6 +265,8 @@ class Window:
 
     def color_by(self, name: str) -> None:
         self.quantity = name
+        if name in self.scales:
+            self.panel.show_legend(self.scales[name])
         self._draw()
 
     def fit_colors(self) -> None:

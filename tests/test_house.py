@@ -20,6 +20,7 @@ ORDER = (
     ("analysis",),
     ("io",),
     ("plot", "problems"),
+    ("filming",),
     ("identification",),
     ("routing",),
     ("sweeps",),

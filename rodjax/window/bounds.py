@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.checks import namespace
+from rodjax.checks import Numbers, namespace
 from rodjax.geometry.vectors import root
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
@@ -50,8 +50,8 @@ class Asked(NamedTuple):
     negative within.
     """
 
-    reaches: Float[np.ndarray, "spans"]
-    depths: tuple[Float[np.ndarray, "k m"], ...]
+    reaches: Float[Numbers, "spans"]
+    depths: tuple[Float[Numbers, "k m"], ...]
 
 
 @compiled
@@ -89,9 +89,7 @@ def why_not(scene: Scene | Harness, asked: Asked, limits: Asked) -> str | None:
     )
 
 
-def _out_of_reach(
-    spans: list[Any], found: Float[np.ndarray, "spans"], limits: Float[np.ndarray, "spans"]
-) -> str | None:
+def _out_of_reach(spans: list[Any], found: Float[Numbers, "spans"], limits: Float[Numbers, "spans"]) -> str | None:
     """What is further apart than these multiples of the length of the rod between."""
     for (prefix, name, other, length, _), reach, limit in zip(spans, found, limits, strict=True):
         if not reach <= limit:
@@ -103,7 +101,7 @@ def _out_of_reach(
     return None
 
 
-def _within_obstacle(scene: Scene, before: Float[np.ndarray, "k m"], now: Float[np.ndarray, "k m"]) -> str | None:
+def _within_obstacle(scene: Scene, before: Float[Numbers, "k m"], now: Float[Numbers, "k m"]) -> str | None:
     """Which held place has come into which obstacle."""
     entered = np.argwhere(~(now >= 0) & (before >= 0))
     if not entered.size:

@@ -375,7 +375,8 @@ def _can_move(obstacle: Obstacle) -> bool:
 def center_of(obstacle: Obstacle) -> Float[np.ndarray, "3"]:
     """The middle of the points that say where an obstacle of the library is [m]."""
     if isinstance(obstacle, Union):
-        return sum(center_of(part) for part in obstacle.obstacles) / len(obstacle.obstacles)
+        xp, centers = namespace(obstacle), [center_of(part) for part in obstacle.obstacles]
+        return xp.mean(xp.stack(centers), axis=0)
     xp = namespace(obstacle)
     points = [xp.asarray(getattr(obstacle, name)).reshape(-1, 3) for name in _POINTS[type(obstacle)]]
     points = xp.concatenate(points)

@@ -7,12 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.checks import Numbers
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.programs.compilation import compiled
 from rodjax.solving.newton import Newton
+from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
 from rodjax.window.bounds import Asked, asked_of, makes_sense
 from rodjax.window.controls import Controls, scene_of
@@ -25,11 +27,11 @@ class Outcome(NamedTuple):
     """
 
     asked: Asked
-    makes_sense: Bool[np.ndarray, ""]
-    converged: Bool[np.ndarray, ""]
-    status: np.ndarray
-    iterations: np.ndarray
-    way: Float[np.ndarray, ""]
+    makes_sense: Bool[Numbers, ""]
+    converged: Bool[Numbers, ""]
+    status: Int[Numbers, ""]
+    iterations: Int[Numbers, ""]
+    way: Float[Numbers, ""]
 
 
 class Followed(NamedTuple):
@@ -41,7 +43,7 @@ class Followed(NamedTuple):
 
 
 def followed(
-    scene: Scene | Harness, controls: Controls, guess: Shown, limits: Asked, strain_limit: float, segments: int
+    scene: Scene | Harness, controls: Controls, guess: Any, limits: Asked, strain_limit: float, segments: int
 ) -> Followed:
     """The rods of a scene at controls, from where they were."""
     result, groups, outcome = _followed(scene, controls, guess, limits, strain_limit, segments=segments)
@@ -50,7 +52,7 @@ def followed(
 
 @functools.partial(compiled, static_argnames=("segments",))
 def _followed(
-    scene: Scene | Harness, controls: Controls, guess: Shown, limits: Asked, strain_limit: Any, segments: int
+    scene: Any, controls: Controls, guess: Any, limits: Asked, strain_limit: Any, segments: int
 ) -> tuple[Shown, Groups, Outcome]:
     scene = scene_of(scene, controls)
     asked = asked_of(scene)
@@ -65,7 +67,7 @@ def _followed(
 
 
 def _nodes(shown: Shown) -> list[Float[Array, "... n+1 3"]]:
-    return [group.nodes for group in getattr(shown, "groups", (shown,))]
+    return [group.nodes for group in ((shown,) if isinstance(shown, Equilibrium) else shown.groups)]
 
 
 def _ways(nodes: Float[Array, "... n+1 3"], before: Float[Array, "... n+1 3"]) -> Float[Array, "... n+1"]:

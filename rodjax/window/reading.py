@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from rodjax.analysis.clearance import places, radius_at
 from rodjax.analysis.curvature import curvature_along, curvature_within
 from rodjax.analysis.samples import framed_at
+from rodjax.checks import Numbers
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.rotations import from_frame
 from rodjax.programs.compilation import compiled
@@ -34,9 +35,9 @@ class Pieces(NamedTuple):
     is along the rod and the first along d1, scales along them: radius, 1 m without one, and length.
     """
 
-    positions: Float[np.ndarray, "k 3"]
-    wxyzs: Float[np.ndarray, "k 4"]
-    scales: Float[np.ndarray, "k 3"]
+    positions: Float[Numbers, "k 3"]
+    wxyzs: Float[Numbers, "k 4"]
+    scales: Float[Numbers, "k 3"]
 
 
 class Reading(NamedTuple):
@@ -46,14 +47,14 @@ class Reading(NamedTuple):
     `moments`: (m, 3), what each of the m places that hold the rod exerts on it, moments at its two ends.
     """
 
-    s: Float[np.ndarray, "k"]
-    centerline: Float[np.ndarray, "k 3"]
-    d1: Float[np.ndarray, "k 3"]
-    d2: Float[np.ndarray, "k 3"]
-    values: dict[str, Float[np.ndarray, "k"]]
-    feet: Float[np.ndarray, "m 3"]
-    forces: Float[np.ndarray, "m 3"]
-    moments: Float[np.ndarray, "2 3"]
+    s: Float[Numbers, "k"]
+    centerline: Float[Numbers, "k 3"]
+    d1: Float[Numbers, "k 3"]
+    d2: Float[Numbers, "k 3"]
+    values: dict[str, Any]
+    feet: Float[Numbers, "m 3"]
+    forces: Float[Numbers, "m 3"]
+    moments: Float[Numbers, "2 3"]
     pieces: Pieces
 
 
@@ -62,9 +63,9 @@ class Figures(NamedTuple):
     straight; `clearances` from the obstacles [m], and the forces [N] with which these push.
     """
 
-    bend_radius: Float[np.ndarray, ""]
-    clearances: Float[np.ndarray, "obstacles"]
-    obstacle_forces: Float[np.ndarray, "obstacles 3"]
+    bend_radius: Float[Numbers, ""]
+    clearances: Float[Numbers, "obstacles"]
+    obstacle_forces: Float[Numbers, "obstacles 3"]
 
 
 def _reading(equilibrium: Equilibrium) -> Reading:
@@ -108,7 +109,7 @@ def _pieces(centerline: Float[Array, "k 3"], d1: Float[Array, "k 3"], radius: Fl
     frames = jnp.stack([across, jnp.cross(along, across), along], axis=-1)
     radii = (radius[:-1] + radius[1:]) / 2
     turns = jnp.pad(jnp.linalg.norm(jnp.diff(along, axis=0), axis=1), 1)
-    longer = lengths + radii * jnp.maximum(turns[:-1], turns[1:]) / 2
+    longer = lengths + radii * jnp.maximum(turns[:-1], turns[1:])  # by half of it at both ends
     pieces = (centerline[:-1] + centerline[1:]) / 2, jax.vmap(from_frame)(frames), jnp.stack([radii, radii, longer], 1)
     return Pieces(*(numbers.astype(jnp.float32) for numbers in pieces))
 

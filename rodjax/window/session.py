@@ -52,9 +52,9 @@ MOST_RECORDED, MOST_UNDONE = 5000, 500
 class Moment(NamedTuple):
     """The rods at one moment: the scene that the controls are of, where these are, and the equilibrium."""
 
-    scene: Scene | Harness
+    scene: Any
     controls: Controls
-    result: Shown
+    result: Any  # Shown
 
 
 class Report(NamedTuple):
@@ -115,7 +115,7 @@ class Session:
         self.is_recording = False
         self._undone: list[Moment] = []
 
-    def _begin_with(self, scene: Scene | Harness) -> None:
+    def _begin_with(self, scene: Any) -> None:
         self.scene, self.handles, self.sliders = scene, handles_of(scene), sliders_of(scene)
         asked = asked_of(scene)
         self.limits = Asked(
@@ -127,7 +127,8 @@ class Session:
         self._is_steady = all(isinstance(rod.start, Directed) or isinstance(rod.end, Directed) for rod in rods)
 
     @property
-    def result(self) -> Shown:
+    def result(self) -> Any:
+        """An `Equilibrium`, or that of a harness."""
         return self.now.result
 
     @property
@@ -140,7 +141,7 @@ class Session:
         """Of each rod, when they are asked for."""
         return figures_of(self.result)
 
-    def _reached(self, moment: Moment, readings: tuple[Reading, ...], depths: tuple[np.ndarray, ...]) -> None:
+    def _reached(self, moment: Moment, readings: tuple[Reading, ...], depths: tuple[Any, ...]) -> None:
         self.now, self.readings, self.softest = moment, readings, None
         self.limits = self.limits._replace(depths=depths)
         self.__dict__.pop("figures", None)

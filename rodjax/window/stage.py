@@ -96,7 +96,7 @@ class Stage:
         colors = tube.as_light(np.concatenate(colors))
         both = Pieces(
             np.concatenate([pieces.positions] * 2),
-            np.concatenate([pieces.wxyzs, tube.half_turned(pieces.wxyzs)]),
+            np.concatenate([pieces.wxyzs, tube.half_turned(np.asarray(pieces.wxyzs))]),
             np.concatenate([pieces.scales] * 2),
         )
         if not self.meshes:
@@ -175,7 +175,9 @@ class Stage:
 
     def _draw_obstacles(self) -> None:
         obstacles = getattr(self.session.scene, "obstacles", ())
-        for k, faces in enumerate(surfaces(obstacles, self.session.reading.centerline) if obstacles else []):
+        for k, faces in enumerate(
+            surfaces(obstacles, np.asarray(self.session.reading.centerline)) if obstacles else []
+        ):
             name = f"obstacles[{k}]"
             pivot = center_of(obstacles[k]) if name in self.session.handles else np.zeros(3)
             vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)

@@ -38,6 +38,7 @@ from rodjax.solving.result import (
     OverstretchedWarning,
     PrecisionWarning,
     describe,
+    pictures,
 )
 from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from rodjax.analysis.curvature import most_curved
     from rodjax.analysis.discrete_energy import energy, residual
     from rodjax.analysis.sensitivity import end_stiffness, sensitivities
+    from rodjax.filming import film
     from rodjax.identification.each import Fits, fit_each
     from rodjax.identification.fit import fit
     from rodjax.identification.measurements import (
@@ -164,6 +166,7 @@ __all__ = [
     "enable_compilation_cache",
     "end_stiffness",
     "energy",
+    "film",
     "fit",
     "fit_each",
     "follow",
@@ -252,9 +255,18 @@ _LATER = {
     "Route": "routing.route",
     "route": "routing.route",
     "sweep": "sweeps.sweep",
+    "film": "filming",
     "view": "window.opening",
     **dict.fromkeys(("Between", "OnLine", "OnPatch", "OnSurface", "Turned"), "routing.variables"),
 }
+
+
+def _drawn(equilibrium: Equilibrium) -> str:
+    """A picture for a notebook, by what takes a second to import."""
+    return importlib.import_module("rodjax.plot").picture_html(equilibrium)
+
+
+pictures.append(_drawn)
 
 
 def __dir__() -> list[str]:

@@ -122,8 +122,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_view(commands: Any) -> None:
-    view = commands.add_parser("view", help="move the rod of a scene by the mouse, in a window of the browser")
-    view.add_argument("scene", metavar="SCENE.toml", type=Path, help="its format: pydoc rodjax.io.scene_file")
+    view = commands.add_parser("view", help="move the rods of a scene by the mouse, in a window of the browser")
+    view.add_argument(
+        "scene",
+        metavar="SCENE.toml",
+        type=Path,
+        help=f"of a rod or a harness; or a result{SUFFIX}, such as a recording",
+    )
     view.add_argument(
         "--port", metavar="N", type=_port, default=8080, help="of the window; 0 for any that is free; 8080"
     )
@@ -342,16 +347,30 @@ def _cables(result: rodjax.HarnessEquilibrium) -> list[str]:
     return [rodjax.describe(result), f"energy       {float(result.energy):.6g} J", *rows]
 
 
+def _file_to_view(path: Path) -> SceneFile | HarnessFile | rodjax.Equilibrium | rodjax.HarnessEquilibrium:
+    if path.suffix != SUFFIX:
+        return read_harness_file(path) if is_harness_file(path) else read_scene_file(path)
+    try:
+        return rodjax.load(path)
+    except ValueError as error:
+        raise CommandError(f"{path}: {' '.join(str(error).split())}") from None
+
+
 def _view(arguments: argparse.Namespace) -> int:
-    file = read_scene_file(arguments.scene)
+    file = _file_to_view(arguments.scene)
     from rodjax.window.opening import session_of, show  # takes a second, which the other commands need not wait for
 
     with warnings.catch_warnings():
         for category in (NotConvergedWarning, OverstretchedWarning, MeshWarning):
             warnings.simplefilter("ignore", category)  # said by the window
         try:
-            shown = rodjax.solve_path(file.scenes, **file.settings) if file.is_path else file.scenes[0]
-            session = session_of(shown, file.segments, file.strain_limit)
+            if isinstance(file, HarnessFile):
+                session = session_of(file.harness, file.segments, file.strain_limit)
+            elif not isinstance(file, SceneFile):
+                session = session_of(file, None)
+            else:
+                shown = rodjax.solve_path(file.scenes, **file.settings) if file.is_path else file.scenes[0]
+                session = session_of(shown, file.segments, file.strain_limit)
         except ValueError as error:
             print(f"rodjax: {arguments.scene}: {' '.join(str(error).split())}", file=sys.stderr)
             return 3

@@ -1,5 +1,7 @@
 """Pictures of equilibria, as matplotlib figures without pyplot: save them with `figure.savefig("rod.png")`."""
 
+import base64
+import io
 from collections.abc import Callable, Sequence
 from typing import Literal, cast
 
@@ -89,6 +91,16 @@ def plot_rod(
     figure = cast(Figure, axes.get_figure(root=True))
     figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)
     return figure
+
+
+def picture_html(equilibrium: Equilibrium) -> str:
+    """A picture of one equilibrium with its loads, as HTML; nothing where it has no numbers."""
+    if not np.all(np.isfinite(np.asarray(equilibrium.nodes))):
+        return ""
+    content = io.BytesIO()
+    plot_rod(equilibrium, loads=True).savefig(content, format="png", dpi=80)
+    encoded = base64.b64encode(content.getvalue()).decode()
+    return f'<img alt="the rod, coloured by curvature" src="data:image/png;base64,{encoded}">'
 
 
 def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", radius: float | None = None) -> Figure:

@@ -21,6 +21,7 @@ ORDER = (
     ("analysis",),
     ("io",),
     ("plot", "problems"),
+    ("filming",),
     ("identification",),
     ("routing",),
     ("sweeps",),

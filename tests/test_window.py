@@ -15,8 +15,8 @@ import rodjax as rj
 from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
 from rodjax.window import tube
-from rodjax.window.bounds import out_of_reach, reaches
-from rodjax.window.controls import Pose, SceneMaker, controls_of, handles_of, moved, sliders_of
+from rodjax.window.bounds import Asked, asked_of, why_not
+from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, sliders_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import rows
@@ -73,7 +73,7 @@ def test_a_scene_of_its_own_controls_is_the_same():
         "distributed": [rj.DistributedForce((0.0, 0.0, 0.1), part=(0.2, 0.6))],
     }
     scene = hanging(clips=[clip], obstacles=[box], **loads)
-    same = SceneMaker(scene)(controls_of(scene))
+    same = scene_of(scene, controls_of(scene))
     assert jax_leaves(same) == pytest.approx(jax_leaves(scene), abs=1e-15)  # the tangent of a clip by way of a frame
 
 
@@ -93,9 +93,8 @@ def test_handles_and_sliders_are_those_of_what_the_scene_has():
 
 def test_numbers_of_sliders_are_those_of_the_scene():
     scene = hanging(clips=[rj.Clip(0.5, (0.4, 0.0, -0.1))])
-    made = SceneMaker(scene)
     numbers = {"rod.length": 1.2, "rod.EI": 2.0, "rod.GJ": 0.5, "gravity": 0.25, "clips[0].at": 0.45}
-    changed = made(controls_of(scene).changed(numbers))
+    changed = scene_of(scene, controls_of(scene).changed(numbers))
     assert float(changed.rod.length) == 1.2
     assert float(changed.rod.EI) == 2.0 * float(scene.rod.EI)
     assert float(changed.rod.GJ) == 0.5 * float(scene.rod.GJ)
@@ -201,9 +200,10 @@ def test_a_move_beyond_the_reach_is_followed_as_far_as_it_goes(session):
 
 def test_reach_is_that_of_the_rod_between_two_places():
     scene = hanging(clips=[rj.Clip(0.3, (0.2, 0.0, 0.0)), rj.Clip(0.6, (0.5, 0.0, 0.0), sliding=True)])
-    np.testing.assert_allclose(reaches(scene), [0.2 / 0.3, 0.3, 0.3])
-    assert out_of_reach(scene, [1.0, 1.0, 1.0]) is None
-    told = out_of_reach(scene, [0.5, 1.0, 1.0])
+    asked = Asked(np.asarray(asked_of(scene).reaches), ())
+    np.testing.assert_allclose(asked.reaches, [0.2 / 0.3, 0.3, 0.3])
+    assert why_not(scene, asked, Asked(np.array([1.0, 1.0, 1.0]), ())) is None
+    told = why_not(scene, asked, Asked(np.array([0.5, 1.0, 1.0]), ()))
     assert told == "clip 0 is 0.2 m from the start, but the 0.3 m of rod between them reach at most 0.15 m"
 
 
@@ -248,18 +248,18 @@ def test_a_support_may_not_enter_an_obstacle_nor_the_other_way_round():
 def test_an_obstacle_pushes_the_rod_and_lets_it_go():
     session = Session(hanging(obstacles=[rj.Capsule((0.4, -1.0, -0.5), (0.4, 1.0, -0.5), 0.05)]), segments=SEGMENTS)
     free = np.asarray(session.result.nodes)
-    assert session.reading.clearances[0] == pytest.approx(-0.055 - (-0.5 - free[:, 2].min()), abs=2e-3)
+    assert session.figures[0].clearances[0] == pytest.approx(-0.055 - (-0.5 - free[:, 2].min()), abs=2e-3)
     report = session.move({"obstacles[0]": ((0.4, 0.0, -0.3), None)})
     assert report.moved
     weight = float(session.scene.rod.mass_per_length) * 9.81
-    assert 0.1 * weight < report.reading.obstacle_forces[0][2] < 2 * weight
+    assert 0.1 * weight < session.figures[0].obstacle_forces[0][2] < 2 * weight
     # All forces on the rod are in balance with its weight.
-    total = report.reading.forces.sum(0) + report.reading.obstacle_forces.sum(0)
+    total = report.reading.forces.sum(0) + session.figures[0].obstacle_forces.sum(0)
     np.testing.assert_allclose(total, (0, 0, weight), atol=1e-6)
     assert np.max(report.reading.values["pressure"]) > 0
     session.move({"obstacles[0]": ((0.4, 0.0, -0.5), None)})
     np.testing.assert_allclose(session.result.nodes, free, atol=1e-7)
-    assert np.all(session.reading.obstacle_forces == 0)
+    assert np.all(session.figures[0].obstacle_forces == 0)
 
 
 KINDS = {
@@ -304,10 +304,50 @@ def test_every_kind_of_scene_can_be_taken_in_the_hand(kind):
     np.testing.assert_allclose(session.result.nodes, again.nodes, atol=1e-7)  # residuals below 1e-8 EI/L^2
     np.testing.assert_allclose(session.result.nodes[0], place, atol=1e-15)
     assert all(np.all(np.isfinite(values)) for values in report.reading.values.values())
-    assert np.isfinite(report.reading.bend_radius)
+    assert np.isfinite(session.figures[0].bend_radius)
     assert (session.settle() is None) == ("potential" in kind or "slides" in kind)
     labels = [row.label for row in rows(session, report)]
     assert len(set(labels)) == len(labels)
+
+
+@pytest.mark.slow
+def test_a_harness_is_taken_in_the_hand(tmp_path):
+    """An end and the support of a joint are dragged; both rods follow to where a solve of the harness finds them."""
+    cable = rj.problems.cable()
+    joints = {"y": rj.Body(support=rj.Spring(rj.Pin((0.8, 0.0, -0.1)), translation=50.0), mass=0.05)}
+    rods = {
+        "left": rj.Scene(cable, rj.Clamp((0, 0, 0), LEVEL), rj.Joint("y", LEVEL), (0, 0, -9.81)),
+        "right": rj.Scene(cable, rj.Joint("y", LEVEL), rj.Clamp((1.6, 0, 0), LEVEL), (0, 0, -9.81)),
+    }
+    session = Session(rj.Harness(rods, joints), segments=6)
+    assert list(session.handles) == ["left/start", "right/end", "joints/y"]
+    assert list(session.sliders) == ["left/rod.length", "rod.EI", "rod.GJ", "gravity", "right/rod.length"]
+    session.record(True)
+    report = session.move(
+        {"right/end": ((1.55, 0.05, 0.0), None), "joints/y": ((0.8, 0.05, -0.1), None), "gravity": 0.9}
+    )
+    assert report.moved, report.message
+    result = session.result
+    assert isinstance(result, rj.HarnessEquilibrium)
+    again = rj.solve(result.harness, segments=6, guess=result)
+    np.testing.assert_allclose(result["right"].nodes[-1], (1.55, 0.05, 0), atol=1e-12)
+    for name, reading in zip(result, report.readings, strict=True):
+        np.testing.assert_allclose(result[name].nodes, again[name].nodes, atol=1e-7)  # residuals below 1e-8 EI/L^2
+        np.testing.assert_allclose(reading.centerline[0], result[name].nodes[0], atol=1e-12)
+    gravity = result.harness["left"].gravity
+    assert gravity is not None
+    assert gravity[2] == pytest.approx(-0.9 * 9.81)
+    refused = session.move({"right/end": ((math.nan, 0.0, 0.0), None)})
+    assert "right/end.position must be finite" in refused.message
+    labels = [row.label for row in rows(session, refused)]
+    assert "left: bend radius" in labels
+    assert len(set(labels)) == len(labels)
+    content, _ = path_file(session)
+    (tmp_path / "path.vtkhdf").write_bytes(content)
+    replayed = session_of(rj.load(tmp_path / "path.vtkhdf"), None)
+    assert len(replayed.recorded) == len(session.recorded)
+    with pytest.raises(ValueError, match="a harness cannot be written as a scene file yet"):
+        scene_file(session)
 
 
 # --- undo, record, save ----------------------------------------------------------------------------------------------
@@ -338,6 +378,7 @@ def test_a_recording_is_a_path(session, tmp_path):
     content, _ = path_file(session)
     (tmp_path / "path.vtkhdf").write_bytes(content)
     path = rj.load(tmp_path / "path.vtkhdf")
+    assert isinstance(path, rj.Equilibrium)
     np.testing.assert_allclose(path.nodes[:, -1, 0], (0.8, 0.78, 0.76, 0.74), atol=1e-12)
     again = session_of(path, None)
     assert again.segments == SEGMENTS
@@ -376,35 +417,58 @@ def test_the_file_of_a_shape_that_no_cold_solve_finds_says_so():
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
-def test_the_tube_is_closed_and_has_the_volume_of_the_rod(session):
-    """Strips, bands and caps together: by Gauss' theorem, and from its outside."""
-    reading = session.reading
-    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
-    scale = tube.scale_over(0.0, float(np.max(reading.values["curvature"])))
-    parts = [*surface.strips, *surface.bands(reading.values["curvature"], scale), surface.caps]
-    corners = np.concatenate([part.vertices.astype(float)[part.faces] for part in parts])
-    volume = np.sum(np.linalg.det(corners)) / 6
-    length = np.sum(np.linalg.norm(np.diff(reading.centerline, axis=0), axis=1))
+def area_and_volume(faces: tube.Faces) -> tuple[np.ndarray, float]:
+    """The sum of the directed areas, and the volume within by Gauss' theorem."""
+    corners = faces.vertices.astype(float)[faces.faces]
+    directed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
+    return directed, float(np.sum(np.linalg.det(corners)) / 6)
+
+
+def test_meshes_are_closed_and_face_outwards():
+    directed, volume = area_and_volume(tube.cylinder())
     around = tube.AROUND
-    area = around / 2 * math.sin(2 * math.pi / around) * 5e-3**2
-    # Pappus, but that each piece between two rings is bent by up to 0.12 rad from its middle: 1 - cos(0.12) = 7e-3 at
-    # the most, a fifth of that on average.
-    assert volume == pytest.approx(area * length, rel=3e-3)
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
-    np.testing.assert_allclose(facing, 0, atol=1e-8)
+    np.testing.assert_allclose(directed, 0, atol=1e-6)  # single precision
+    assert volume == pytest.approx(around / 2 * math.sin(2 * math.pi / around), rel=1e-6)
+    directed, volume = area_and_volume(tube.ball())
+    np.testing.assert_allclose(directed, 0, atol=1e-6)
+    assert 0.97 * 4 * math.pi / 3 < volume < 4 * math.pi / 3  # of 512 faces
+    directed, _ = area_and_volume(tube.strip())
+    assert directed[0] > 0
+    np.testing.assert_allclose(directed[1:], 0, atol=1e-6)
 
 
-def test_bands_show_the_values_between_their_edges(session):
-    reading = session.reading
-    values = reading.values["curvature"]
-    surface = tube.Surface(reading.centerline, reading.d1, reading.d2, 5e-3)
+def test_pieces_of_a_rod_join_and_carry_its_directors(session):
+    """Their ends are the places of the reading, but for what they are longer so that nothing gapes: by the largest
+    turn and the radius. Single precision keeps 1e-7.
+    """
+    reading, radius = session.reading, float(session.scene.rod.radius)
+    pieces = reading.pieces
+    x, y, z, w = np.moveaxis(pieces.wxyzs[:, [1, 2, 3, 0]].astype(float), 1, 0)
+    frames = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
+    lengths = np.linalg.norm(np.diff(reading.centerline, axis=0), axis=1)
+    low = pieces.positions - frames[:, :, 2] * lengths[:, None] / 2
+    np.testing.assert_allclose(low, reading.centerline[:-1], atol=1e-6)
+    assert np.all(pieces.scales[:, 2] >= lengths - 1e-7)
+    turns = np.linalg.norm(np.diff(frames[:, :, 2], axis=0), axis=1)
+    assert np.all(pieces.scales[:, 2] - lengths <= radius * turns.max() + 1e-6)
+    np.testing.assert_allclose(pieces.scales[:, :2], radius, rtol=1e-6)
+    middle = reading.d1[:-1] + reading.d1[1:]
+    cosines = np.sum(frames[:, :, 0] * middle, axis=1) / np.linalg.norm(middle, axis=1)
+    assert np.min(cosines) > 1 - 1e-4  # at right angles to the chord, not to the tangent
+    opposite = Rotation.from_quat(np.roll(tube.half_turned(pieces.wxyzs), -1, axis=1)).as_matrix()
+    np.testing.assert_allclose(opposite[:, :, 0], -frames[:, :, 0], atol=1e-6)
+    np.testing.assert_allclose(opposite[:, :, 2], frames[:, :, 2], atol=1e-6)
+
+
+def test_colors_are_those_of_the_bands_of_values(session):
+    values = session.reading.values["curvature"]
     scale = tube.scale_over(float(values.min()), float(values.max()))
     assert tube.covers(scale, values)
     assert 4 <= len(scale.colors) <= tube.MOST_BANDS
-    middles = (values[1:] + values[:-1]) / 2
-    for k, part in enumerate(surface.bands(values, scale)):
-        inside = np.sum((scale.edges[k] <= middles) & (middles < scale.edges[k + 1]))
-        assert len(part.faces) == max(1, 2 * inside * (tube.AROUND - 2 * tube.STRIP))
+    middles, colors = (values[1:] + values[:-1]) / 2, tube.colors_of(values, scale)
+    for k, color in enumerate(scale.colors):
+        inside = (scale.edges[k] <= middles) & (middles < scale.edges[k + 1])
+        assert np.all(colors[inside] == color)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 0.0), (3.0, 3.0), (-1e-12, 1e-12), (-5.0, 2e6)])
@@ -419,7 +483,7 @@ def test_numbers_stand_against_their_limits(session):
     report = session.move({"end": ((0.6, 0.0, 0.0), None)})
     session.settle()
     found = {row.label: row for row in rows(session, report, limits)}
-    radius = report.reading.bend_radius
+    radius = float(session.figures[0].bend_radius)
     assert radius == pytest.approx(1 / np.max(report.reading.values["curvature"]), rel=1e-2)  # at clamps, on one side
     assert found["smallest bend radius"].text == f"{1e3 * radius:.4g} mm of at least 205 mm"
     assert found["smallest bend radius"].is_bad  # less than 20 diameters inside: 41 radii of 5 mm
@@ -457,7 +521,7 @@ def test_of_moves_that_nobody_took_the_newest_counts():
 
 
 def test_arguments_that_make_no_sense_are_refused():
-    with pytest.raises(TypeError, match="shown must be a Scene or Equilibrium, got 3"):
+    with pytest.raises(TypeError, match="shown must be a Scene or Harness or Equilibrium or HarnessEquilibrium, got 3"):
         view(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="segments must be a whole number from 2"):
         Session(hanging(), segments=1)
@@ -497,6 +561,15 @@ def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):
         assert main(["view", scene_toml, "--no-browser", "--port", str(port)]) == 2
     said = capsys.readouterr().err
     assert said == f"rodjax: port {port} of 127.0.0.1 cannot be opened: Address already in use\n"
+
+
+def test_a_file_that_is_no_result_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "path.vtkhdf").write_text("nothing")
+    assert main(["view", str(tmp_path / "path.vtkhdf")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("rodjax: ")
+    assert "path.vtkhdf" in said
+    assert said.count("\n") == 1
 
 
 def test_without_viser_the_command_says_what_to_install(scene_toml, capsys, monkeypatch):

@@ -74,6 +74,10 @@ LEAST_LACKING = 1e-3
 MOST_TURN = {"hermite": 3.0, "finite_difference": math.pi / 2}
 
 
+# What makes pictures for notebooks, as HTML, of those that are there; drawing is none of this module's imports.
+pictures: "list[Callable[[Equilibrium], str]]" = []
+
+
 class NotConvergedWarning(UserWarning):
     """A solve ended without an equilibrium; the message says why."""
 
@@ -230,12 +234,13 @@ class Equilibrium(eqx.Module):
         return "\n".join([f"Equilibrium of {_stack_told(self)}", *(f"  {name}: {told}" for name, told in _told(self))])
 
     def _repr_html_(self) -> str:
-        """The same as a table, which notebooks show."""
+        """The same as a table, and of a single one a picture, which notebooks show."""
         rows = "".join(
             f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(told)}</td></tr>"
             for name, told in _told(self)
         )
-        return f"<table><caption>Equilibrium of {escape(_stack_told(self))}</caption>{rows}</table>"
+        table = f"<table><caption>Equilibrium of {escape(_stack_told(self))}</caption>{rows}</table>"
+        return table if self.s.ndim > 1 or not is_known(self) else table + "".join(drawn(self) for drawn in pictures)
 
     @property
     def clip_forces(self) -> Float[Array, "... clips 3"]:

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from rodjax.checks import whole_number
+from rodjax.filming import best_suffix, film_content
 from rodjax.routing.limits import Limits
-from rodjax.window.controls import Pose
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.window.controls import Pose, rods_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import least_bend_radius, rows
 from rodjax.window.panel import Buttons, Panel
-from rodjax.window.reading import QUANTITIES
+from rodjax.window.reading import QUANTITIES, readings_of
 from rodjax.window.session import Report, Session
 from rodjax.window.stage import Stage
 from rodjax.window.tube import Scale, covers, scale_over
@@ -28,6 +30,8 @@ from rodjax.window.tube import Scale, covers, scale_over
 # Seconds: without a move after which a rod is at rest, between numbers and between looks at stability while it moves,
 # between frames of a recording, and without a number after which a slider is taken anew.
 REST, NUMBERS, STABILITY, FRAME, STRETCH = 0.05, 0.1, 0.25, 1 / 30, 0.5
+# Shapes that a fan shows at most, and pixels of a film, which the browser shall have drawn in so many seconds each.
+MOST_IN_FAN, FILM, FILM_SECONDS = 100, (960, 640), 20.0
 MARGIN = "share of the bend limit"
 _log = logging.getLogger("rodjax")
 
@@ -50,7 +54,7 @@ class Window:
         self.session, self.limits = session, limits
         self.quantity, self.with_loads = "curvature", True
         self.scales: dict[str, Scale] = {}
-        self.report = Report(session.reading, "", True, False, int(session.result.iterations), 0.0)
+        self.report = Report(session.readings, "", True, False, int(session.result.iterations), 0.0)
         self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
         self.on_drawn: Callable[[Report], None] = lambda report: None
         self._numbers_at = self._stability_at = self._slid_at = 0.0
@@ -62,6 +66,8 @@ class Window:
             self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         # A tunnel through a server of viser's would let anybody in.
         self.server.request_share_url = _no_tunnel
+        least = [least_bend_radius(scene, limits) for scene in rods_of(session.scene).values()]
+        self._least_radii = None if None in least else [float(radius or 0) for radius in least]
         self.stage = Stage(self.server, session, self.drag)
         self.panel = self._panel()
         self.panel.show_frames(len(session.recorded), len(session.recorded) - 1)
@@ -99,9 +105,9 @@ class Window:
 
     def _panel(self) -> Panel:
         colors = dict(QUANTITIES)
-        if not self.session.scene.obstacles:
+        if "pressure" not in self.session.reading.values:
             colors.pop("pressure")
-        if least_bend_radius(self.session, self.limits) is not None:
+        if self._least_radii is not None:
             colors[MARGIN] = MARGIN
         later = self._mailbox.command
         buttons = Buttons(
@@ -116,10 +122,14 @@ class Window:
             record=lambda on: later(lambda: self.record(on)),
             play=lambda: later(self.play),
             show_recorded=lambda k: self._mailbox.move("recorded", k),
+            show_fan=lambda on: later(lambda: self.show_fan(on)),
+            save_film=lambda client: later(lambda: self.save_film(client)),
             save_recording=lambda client: later(lambda: self._download(client, "path.vtkhdf", path_file)),
         )
         numbers = dict(self.session.now.controls.numbers)
-        return Panel(self.server.gui, list(self.session.sliders.values()), numbers, colors, buttons)
+        return Panel(
+            self.server.gui, list(self.session.sliders.values()), numbers, colors, buttons, bool(self.session.recorded)
+        )
 
     def drag(self, name: str, pose: Pose, phase: str = "update") -> None:
         """A handle has been dragged to a pose, as the browser tells it: at the "start", an "update" or the "end"."""
@@ -136,6 +146,10 @@ class Window:
             self._mailbox.command(self.session.mark)
         self._slid, self._slid_at = name, now
         self._mailbox.move(name, value)
+
+    def _repr_html_(self) -> str:
+        """The window itself, in a notebook on this machine."""
+        return f'<iframe src="{self.url}" width="100%" height="600" style="border:0"></iframe>'
 
     # --- the thread that does it ---
 
@@ -216,21 +230,23 @@ class Window:
         self.panel.say(text or self._hint, is_bad=bool(text))
 
     def _draw(self) -> None:
-        reading = self.report.reading
-        least = least_bend_radius(self.session, self.limits)
-        if least is not None:
-            reading.values[MARGIN] = least * reading.values["curvature"]
-        values = reading.values[self.quantity]
+        readings = self.report.readings
+        if self._least_radii is not None:
+            for reading, least in zip(readings, self._least_radii, strict=True):
+                reading.values[MARGIN] = least * reading.values["curvature"]
+        values = np.concatenate([reading.values[self.quantity] for reading in readings])
         scale = self.scales.get(self.quantity)
         if scale is None or not covers(scale, values):
             low, high = float(np.min(values)), float(np.max(values))
             if scale is not None:  # it only grows, so that a colour keeps its meaning
                 low, high = min(low, float(scale.edges[0])), max(high, float(scale.edges[-1]))
             scale = self.scales[self.quantity] = scale_over(low, high)
+            self.panel.show_legend(scale)
         with self.server.atomic():
-            self.stage.draw(reading, self.quantity, scale)
-            self.stage.draw_loads(reading, self.with_loads)
-        self.panel.show_legend(scale)
+            self.stage.draw(readings, self.quantity, scale)
+            self.stage.draw_loads(readings, self.with_loads)
+            if isinstance(self.session.result, HarnessEquilibrium):
+                self.stage.draw_joints(np.asarray(self.session.result.positions))
 
     def _show_all(self) -> None:
         """After a jump to another moment: handles and sliders go along."""
@@ -260,6 +276,8 @@ class Window:
 
     def color_by(self, name: str) -> None:
         self.quantity = name
+        if name in self.scales:
+            self.panel.show_legend(self.scales[name])
         self._draw()
 
     def fit_colors(self) -> None:
@@ -280,6 +298,29 @@ class Window:
         if self.session.recorded and not self.session.is_recording:
             moment = self.session.recorded[min(k, len(self.session.recorded) - 1)]
             self._jump(lambda: self.session.show(moment))
+
+    def show_fan(self, on: bool) -> None:
+        """All steps that are recorded at once, or every so many of them."""
+        steps = self.session.recorded
+        chosen = np.unique(np.linspace(0, len(steps) - 1, MOST_IN_FAN).round().astype(int)) if on and steps else []
+        self.stage.draw_fan([readings_of(steps[k].result) for k in chosen])
+
+    def save_film(self, client: Any) -> None:
+        """All steps as the browser that asks for it shows them."""
+        steps = self.session.recorded
+        if not steps:
+            self.panel.say("not saved: nothing is recorded yet", is_bad=True)
+            return
+        frames = []
+        for k in range(len(steps)):
+            if self._mailbox.is_closed:
+                return
+            self.panel.say(f"the film is made: step {k + 1} of {len(steps)}")
+            self.show_recorded(k)
+            frames.append(np.asarray(client.get_render(height=FILM[1], width=FILM[0], timeout=FILM_SECONDS))[..., :3])
+        name = f"film{best_suffix()}"
+        client.send_file_download(name, film_content(frames, name))
+        self.panel.say(f"{name} is ready to be downloaded")
 
     def play(self) -> None:
         for k in range(len(self.session.recorded)):

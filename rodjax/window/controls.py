@@ -1,12 +1,13 @@
 """What a hand can move in a scene: poses of ends, clips and obstacles, and a few numbers.
 
-`Controls` are all of it at one moment; `SceneMaker` makes the scene of them, and between two of them there are others,
-so that a large move can be made in pieces.
+`Controls` are all of it at one moment; `scene_of` makes the scene of them, and between two of them there are others, so
+that a large move can be made in pieces.
 """
 
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,12 +16,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from rodjax.checks import leaf, number_array, rotation, vector
+from rodjax.checks import leaf, namespace, number_array, rotation, vector
 from rodjax.model.along import Along
+from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Clip, Pin, Support, Swivel, frame
+from rodjax.model.supports import Clamp, Clip, Hinge, Pin, Spring, Support, Swivel, frame
+from rodjax.model.supports import Slider as Slide
 from rodjax.model.triangle_mesh import Mesh
 
 # How far sliders go, as multiples of the scene's own number.
@@ -52,6 +55,7 @@ class Slider(NamedTuple):
     high: float
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["poses", "numbers"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class Controls:
     """All poses and numbers of a scene at one moment. Those of an obstacle are relative to its place in the scene."""
@@ -120,8 +124,32 @@ def _pose_between(pose: Pose, other: Pose, fraction: float) -> Pose:
 # --- of a scene ------------------------------------------------------------------------------------------------------
 
 
-def handles_of(scene: Scene) -> dict[str, Handle]:
-    """What of a scene can be taken in the hand: ends that are held, clips, and obstacles of the library."""
+def rods_of(scene: Scene | Harness) -> dict[str, Scene]:
+    """The rods by what the names of their controls begin with: nothing where there is only one."""
+    return {"": scene} if isinstance(scene, Scene) else dict(zip(map("{}/".format, scene), scene.scenes, strict=True))
+
+
+def handles_of(scene: Scene | Harness) -> dict[str, Handle]:
+    """What can be taken in the hand: ends that are held, clips, obstacles of the library, and supports of joints."""
+    handles = {}
+    for prefix, rod in rods_of(scene).items():
+        for handle in _handles_of_rod(rod):
+            label = f"{prefix[:-1]}: {handle.label}" if prefix else handle.label
+            handles[prefix + handle.name] = Handle(prefix + handle.name, label, handle.turns)
+    for name, support in _supports(scene).items():
+        handles[name] = Handle(name, name.replace("joints/", "joint "), not isinstance(support, Pin))
+    return handles
+
+
+def _supports(scene: Scene | Harness) -> dict[str, Support]:
+    """Of the joints of a harness, those that there are."""
+    if isinstance(scene, Scene):
+        return {}
+    joints = zip(scene.joint_names, scene.bodies, strict=True)
+    return {f"joints/{name}": body.support for name, body in joints if body.support is not None}
+
+
+def _handles_of_rod(scene: Scene) -> list[Handle]:
     handles = []
     for name, end in (("start", scene.start), ("end", scene.end)):
         if isinstance(end, Clamp | Swivel | Pin):
@@ -132,11 +160,27 @@ def handles_of(scene: Scene) -> dict[str, Handle]:
         if _can_move(obstacle):
             label = f"obstacle {k} ({type(obstacle).__name__.lower()})"
             handles.append(Handle(f"obstacles[{k}]", label, not isinstance(obstacle, Sphere)))
-    return {handle.name: handle for handle in handles}
+    return handles
 
 
-def sliders_of(scene: Scene) -> dict[str, Slider]:
-    """The numbers of a scene that have a slider."""
+# Numbers that the rods of a harness have in common.
+SHARED = ("rod.EI", "rod.GJ", "gravity")
+
+
+def sliders_of(scene: Scene | Harness) -> dict[str, Slider]:
+    """The numbers that have a slider; stiffnesses and gravity those of all rods of a harness together."""
+    sliders = {}
+    for prefix, rod in rods_of(scene).items():
+        for slider in _sliders_of_rod(rod):
+            if not prefix or slider.name in SHARED:
+                sliders[slider.name] = slider
+            else:
+                name, label = prefix + slider.name, f"{prefix[:-1]}: {slider.label}"
+                sliders[name] = slider._replace(name=name, label=label)
+    return sliders
+
+
+def _sliders_of_rod(scene: Scene) -> list[Slider]:
     rod, length = scene.rod, float(scene.rod.length)
     sliders = []
     varies = any(isinstance(leaf, Along) for leaf in jax.tree.leaves(rod, is_leaf=lambda x: isinstance(x, Along)))
@@ -153,13 +197,29 @@ def sliders_of(scene: Scene) -> dict[str, Slider]:
             before, at, after = places[k : k + 3]
             # Half of the way to the neighbours, so that clips keep their order and a span its length.
             sliders.append(Slider(f"clips[{k}].at", f"clip {k} at", "m", (before + at) / 2, (at + after) / 2))
-    return {slider.name: slider for slider in sliders}
+    return sliders
 
 
-def controls_of(scene: Scene) -> Controls:
-    """Where the handles and sliders of a scene stand."""
+def controls_of(scene: Scene | Harness) -> Controls:
+    """Where the handles and sliders stand."""
+    poses, numbers = {}, {}
+    for prefix, rod in rods_of(scene).items():
+        found = _controls_of_rod(rod)
+        poses |= {prefix + name: pose for name, pose in found.poses.items()}
+        numbers |= {name if name in SHARED else prefix + name: number for name, number in found.numbers.items()}
+    for name, support in _supports(scene).items():
+        poses[name] = Pose(np.array(place_of(support), float), np.eye(3))
+    return Controls(poses, numbers)
+
+
+def place_of(support: Any) -> Any:
+    """The position of a support [m]."""
+    return place_of(support.support) if isinstance(support, Spring) else support.position
+
+
+def _controls_of_rod(scene: Scene) -> Controls:
     poses = {}
-    for name in handles_of(scene):
+    for name in (handle.name for handle in _handles_of_rod(scene)):
         if name in ("start", "end"):
             end = getattr(scene, name)
             poses[name] = Pose(np.array(end.position, float), _frame_of(end))
@@ -168,7 +228,7 @@ def controls_of(scene: Scene) -> Controls:
             poses[name] = Pose(np.array(clip.position, float), _frame_of(clip))
         else:
             poses[name] = Pose(center_of(scene.obstacles[_index(name)]), np.eye(3))
-    numbers = dict.fromkeys(sliders_of(scene), 1.0)
+    numbers = {slider.name: 1.0 for slider in _sliders_of_rod(scene)}
     for name in numbers:
         if name == "rod.length":
             numbers[name] = float(scene.rod.length)
@@ -193,48 +253,69 @@ def _frame_of(held: Any) -> Float[np.ndarray, "3 3"]:
     return np.array(frame(tangent, np.eye(3)[np.argmin(np.abs(tangent))]), float)
 
 
-class SceneMaker:
-    """Makes the scene of controls; parts that have not moved since the last one are taken from there."""
+def scene_of(scene: Scene | Harness, controls: Controls) -> Any:
+    """The scene, or harness, at controls, known or traced. Raises `ValueError` where that makes no sense, as far as it
+    is known.
+    """
+    rods = []
+    for prefix, rod in rods_of(scene).items():
+        shared = (["rod.EI", "rod.GJ"] if rod.rod.law is None else []) + ([] if rod.gravity is None else ["gravity"])
+        numbers = _of_rod(controls.numbers, prefix) | {name: controls.numbers[name] for name in shared}
+        rods.append(_rod_scene(rod, Controls(_of_rod(controls.poses, prefix), numbers)))
+    if isinstance(scene, Scene):
+        return rods[0]
+    supports = _supports(scene)
+    joints = {}
+    for name, body in zip(scene.joint_names, scene.bodies, strict=True):
+        key = f"joints/{name}"
+        if key in supports:
+            support = _support_moved(supports[key], controls.poses[key])
+            body = eqx.tree_at(lambda body: body.support, body, support)
+        joints[name] = body
+    return Harness(dict(zip(scene, rods, strict=True)), joints)
 
-    def __init__(self, scene: Scene):
-        self.scene = scene
-        self._parts: dict[str, tuple[tuple, Any]] = {}
 
-    def __call__(self, controls: Controls) -> Scene:
-        """Raises `ValueError` where the scene makes no sense."""
-        scene, poses, numbers = self.scene, controls.poses, controls.numbers
-        of_rod = [numbers.get(f"rod.{name}") for name in ("length", "EI", "GJ")]
-        clips, obstacles = [], []
-        for k, clip in enumerate(scene.clips):
-            pose, at = poses[f"clips[{k}]"], numbers.get(f"clips[{k}].at")
-            clips.append(self._part(f"clips[{k}]", (pose, at), lambda c=clip, p=pose, at=at: _clip_at(c, p, at)))
-        for k, obstacle in enumerate(scene.obstacles):
-            pose = poses.get(f"obstacles[{k}]")
-            obstacles.append(self._part(f"obstacles[{k}]", (pose,), lambda o=obstacle, p=pose: _obstacle_at(o, p)))
-        factor = numbers.get("gravity")
-        return Scene(
-            self._part("rod", tuple(of_rod), lambda: _rod_at(scene.rod, controls)),
-            self._part("start", (poses.get("start"),), lambda: _support_at(scene.start, poses.get("start"))),
-            self._part("end", (poses.get("end"),), lambda: _support_at(scene.end, poses.get("end"))),
-            self._part("gravity", (factor,), lambda: None if factor is None else _times(scene.gravity, factor)),
-            scene.point_forces,
-            scene.turns,
-            scene.distributed,
-            clips,
-            obstacles,
-            scene.potentials,
-            scene.point_couples,
-        )
+def _of_rod(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Those whose names begin with its prefix, by the rest of them."""
+    return {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
 
-    def _part(self, name: str, key: tuple, make: Callable[[], Any]) -> Any:
-        last, part = self._parts.get(name, (None, None))
-        is_same = last is not None and all(
-            a is b or (isinstance(a, float) and a == b) for a, b in zip(key, last, strict=True)
-        )
-        if not is_same:
-            part = make()
-            self._parts[name] = key, part
-        return part
+
+def _support_moved(support: Any, pose: Pose) -> Any:
+    """To the position of a pose, and turned by its frame."""
+    if isinstance(support, Spring):
+        return eqx.tree_at(lambda spring: spring.support, support, _support_moved(support.support, pose))
+    xp = namespace(support, pose)
+    changes = {"position": pose.position}
+    if getattr(support, "frame", None) is not None:
+        changes["frame"] = pose.frame @ xp.asarray(support.frame)
+    if isinstance(support, Hinge):
+        changes["axis"] = pose.frame @ xp.asarray(support.axis)
+    if isinstance(support, Slide):
+        changes["directions"] = xp.asarray(support.directions) @ pose.frame.T
+    return eqx.tree_at(
+        lambda support: [getattr(support, name) for name in changes],
+        support,
+        [_like(getattr(support, name), value) for name, value in changes.items()],
+    )
+
+
+def _rod_scene(scene: Scene, controls: Controls) -> Scene:
+    poses, numbers = controls.poses, controls.numbers
+    clips = [_clip_at(clip, poses[f"clips[{k}]"], numbers.get(f"clips[{k}].at")) for k, clip in enumerate(scene.clips)]
+    obstacles = [_obstacle_at(one, poses.get(f"obstacles[{k}]")) for k, one in enumerate(scene.obstacles)]
+    return Scene(
+        _rod_at(scene.rod, controls),
+        _support_at(scene.start, poses.get("start")),
+        _support_at(scene.end, poses.get("end")),
+        _times(scene.gravity, numbers["gravity"]) if "gravity" in numbers else None,
+        scene.point_forces,
+        scene.turns,
+        scene.distributed,
+        clips,
+        obstacles,
+        scene.potentials,
+        scene.point_couples,
+    )
 
 
 def _clip_at(clip: Clip, pose: Pose, at: float | None) -> Clip:
@@ -260,23 +341,23 @@ def _rod_at(rod: Rod, controls: Controls) -> Rod:
     if "rod.length" in numbers:
         rod = eqx.tree_at(lambda rod: rod.length, rod, _like(rod.length, numbers["rod.length"]))
     for name in ("EI", "GJ"):
-        factor = numbers.get(f"rod.{name}", 1.0)
-        if factor != 1.0:
+        factor = numbers.get(f"rod.{name}")
+        if factor is not None:
             rod = eqx.tree_at(lambda rod, name=name: getattr(rod, name), rod, _times(getattr(rod, name), factor))
     return rod
 
 
-def _times(value: Any, factor: float) -> Any:
+def _times(value: Any, factor: Any) -> Any:
     """A stiffness, or a pair, that may vary along the rod."""
     if isinstance(value, tuple):
         return tuple(_times(one, factor) for one in value)
     if isinstance(value, Along):
         return eqx.tree_at(lambda along: along.values, value, _times(value.values, factor))
-    return _like(value, np.asarray(value) * factor)
+    return _like(value, namespace(value, factor).asarray(value) * factor)
 
 
 def _like(old: Any, new: Any) -> Any:
-    return leaf(np.asarray(new, old.dtype))
+    return leaf(namespace(new).asarray(new, old.dtype))
 
 
 # --- obstacles -------------------------------------------------------------------------------------------------------
@@ -294,9 +375,11 @@ def _can_move(obstacle: Obstacle) -> bool:
 def center_of(obstacle: Obstacle) -> Float[np.ndarray, "3"]:
     """The middle of the points that say where an obstacle of the library is [m]."""
     if isinstance(obstacle, Union):
-        return np.mean([center_of(part) for part in obstacle.obstacles], axis=0)
-    points = [np.array(getattr(obstacle, name), float).reshape(-1, 3) for name in _POINTS[type(obstacle)]]
-    points = np.concatenate(points)
+        xp, centers = namespace(obstacle), [center_of(part) for part in obstacle.obstacles]
+        return xp.mean(xp.stack(centers), axis=0)
+    xp = namespace(obstacle)
+    points = [xp.asarray(getattr(obstacle, name)).reshape(-1, 3) for name in _POINTS[type(obstacle)]]
+    points = xp.concatenate(points)
     return (points.min(axis=0) + points.max(axis=0)) / 2
 
 
@@ -311,22 +394,25 @@ def with_frames(obstacle: Obstacle) -> Obstacle:
 
 def moved(obstacle: Obstacle, pivot: Float[np.ndarray, "3"], pose: Pose) -> Obstacle:
     """An obstacle of the library turned by the frame of a pose about a pivot, which goes to its position."""
-    if np.array_equal(pose.position, pivot) and np.array_equal(pose.frame, np.eye(3)):
-        return obstacle
     if isinstance(obstacle, Union):
         return Union(*(moved(part, pivot, pose) for part in obstacle.obstacles))
     names = list(_POINTS[type(obstacle)])
-    values = [pose.position + (np.asarray(getattr(obstacle, name)) - pivot) @ pose.frame.T for name in names]
+    xp = namespace(obstacle, pose)
+
+    def moved_point(points: Any) -> Any:
+        return xp.add(pose.position, (xp.asarray(points) - pivot) @ pose.frame.T)
+
+    values = [moved_point(getattr(obstacle, name)) for name in names]
     if isinstance(obstacle, Plane):
         names.append("normal")
-        values.append(pose.frame @ np.asarray(obstacle.normal))
+        values.append(pose.frame @ xp.asarray(obstacle.normal))
     if isinstance(obstacle, Box):
         names.append("frame")
-        values.append(pose.frame if obstacle.frame is None else pose.frame @ np.asarray(obstacle.frame))
+        values.append(pose.frame if obstacle.frame is None else pose.frame @ xp.asarray(obstacle.frame))
     dtype = jax.tree.leaves(obstacle)[0].dtype
     return eqx.tree_at(
         lambda obstacle: [getattr(obstacle, name) for name in names],
         obstacle,
-        [leaf(np.asarray(value, dtype)) for value in values],
+        [leaf(xp.asarray(value, dtype)) for value in values],
         is_leaf=lambda x: x is None,
     )

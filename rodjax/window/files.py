@@ -18,6 +18,8 @@ SAME_SHAPE = 1e-3
 def scene_file(session: Session) -> tuple[bytes, str]:
     """The present scene as TOML, with the turns of its rod; a remark where a solve of it ends in another shape."""
     result = session.result
+    if not isinstance(result, Equilibrium):
+        raise ValueError("a harness cannot be written as a scene file yet; 'Save path' keeps where it was moved")
     scene = _with_turns(result.scene, 0.0) if _can_state_turns(session) else result.scene
     cold = session.solved(scene, None)
     if scene.turns is not None:

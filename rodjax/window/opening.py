@@ -3,15 +3,17 @@
 import jax
 
 from rodjax.checks import instance, is_known
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.routing.limits import Limits
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.window.browser import Window
-from rodjax.window.session import SEGMENTS, Session
+from rodjax.window.session import SEGMENTS, Session, scene_in
 
 
 def view(
-    shown: Scene | Equilibrium,
+    shown: Scene | Harness | Equilibrium | HarnessEquilibrium,
     port: int = 8080,
     *,
     host: str = "127.0.0.1",
@@ -27,8 +29,8 @@ def view(
 
     **Arguments:**
 
-    - `shown`: a `Scene`; or an `Equilibrium`, whose shape and turns the rod begins with. Of a path or a batch, with one
-      leading axis, the last one; the others are steps of the recording.
+    - `shown`: a `Scene` or `Harness`; or an equilibrium of one, with whose shape and turns the rods begin. Of a path or
+      a batch, with one leading axis, the last one; all of them are steps of the recording, which can be shown together.
     - `port`: of the server; 0 for any that is free.
     - `host`: the address at which it can be reached, by default by programs of this machine only; whoever reaches it
       can move the rod.
@@ -40,7 +42,7 @@ def view(
     Returns the window: its `url`, `session` and `close()`. Raises `ImportError` without viser, `OSError` where the port
     cannot be opened, `ValueError` or `TypeError` for arguments that make no sense or a scene without an equilibrium.
     """
-    instance(shown, "shown", (Scene, Equilibrium))
+    instance(shown, "shown", (Scene, Harness, Equilibrium, HarnessEquilibrium))
     if limits is not None:
         instance(limits, "limits", Limits)
     if not is_known(shown):
@@ -61,18 +63,24 @@ def show(
     return window
 
 
-def session_of(shown: Scene | Equilibrium, segments: int | None, strain_limit: float = DEFAULT_STRAIN_LIMIT) -> Session:
+def session_of(
+    shown: Scene | Harness | Equilibrium | HarnessEquilibrium,
+    segments: int | None,
+    strain_limit: float = DEFAULT_STRAIN_LIMIT,
+) -> Session:
     """A session that begins with what is shown."""
-    if isinstance(shown, Scene):
+    if isinstance(shown, Scene | Harness):
         return Session(shown, segments=SEGMENTS if segments is None else segments, strain_limit=strain_limit)
-    if shown.s.ndim > 2:
-        raise ValueError(f"shown must have one leading axis at most, got {shown.s.shape[:-1]}")
-    if shown.discretization == "continuum":
+    axes = shown.status.ndim
+    if axes > 1:
+        raise ValueError(f"shown must have one leading axis at most, got {shown.status.shape}")
+    if isinstance(shown, Equilibrium) and shown.discretization == "continuum":
         raise ValueError("shown must be of elements or finite differences, got one of the continuum")
-    is_many = shown.s.ndim == 2
-    last = jax.tree.map(lambda leaf: leaf[-1], shown) if is_many else shown
-    count = last.s.shape[-1] - 1 if segments is None else segments
-    session = Session(last.scene, segments=count, guess=last, strain_limit=strain_limit)
-    if is_many:
+    last = jax.tree.map(lambda leaf: leaf[-1], shown) if axes else shown
+    if segments is None:
+        meshes = [last.s.shape[-1] - 1] if isinstance(last, Equilibrium) else last.segments
+        segments = max(meshes)
+    session = Session(scene_in(last), segments=segments, guess=last, strain_limit=strain_limit)
+    if axes:
         session.add_recorded(shown)
     return session

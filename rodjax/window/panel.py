@@ -26,14 +26,22 @@ class Buttons(NamedTuple):
     record: Callable[[bool], None]
     play: Callable[[], None]
     show_recorded: Callable[[int], None]
+    show_fan: Callable[[bool], None]
     save_recording: Callable[[Any], None]
+    save_film: Callable[[Any], None]
 
 
 class Panel:
     """Built once; `say`, `show_rows` and the others change what it shows."""
 
     def __init__(
-        self, gui: Any, sliders: Sequence[Slider], values: dict[str, float], colors: dict[str, str], do: Buttons
+        self,
+        gui: Any,
+        sliders: Sequence[Slider],
+        values: dict[str, float],
+        colors: dict[str, str],
+        do: Buttons,
+        has_steps: bool = False,
     ):
         self.gui = gui
         self.message = gui.add_html("")
@@ -50,12 +58,17 @@ class Panel:
         self._button("Undo", lambda client: do.undo())
         self._button("Start over", lambda client: do.start_over())
         self._button("Save scene", do.save_scene, "Downloads scene.toml, which `rodjax solve` and `rodjax view` read")
-        with gui.add_folder("Record", expand_by_default=False):
+        with gui.add_folder("Record", expand_by_default=has_steps):
             self.recording = gui.add_checkbox("Record moves", False)
             self._when(self.recording, do.record)
             self.frame = gui.add_slider("Step", 0, 1, 1, 0, disabled=True)
             self._when(self.frame, do.show_recorded)
+            self.fan = gui.add_checkbox("All steps, pale", False, disabled=True)
+            self._when(self.fan, do.show_fan)
             self._button("Play", lambda client: do.play())
+            self._button(
+                "Save film", do.save_film, "Downloads film.mp4, or film.gif, of all steps as they are seen here"
+            )
             self._button("Save path", do.save_recording, "Downloads path.vtkhdf, which ParaView and rodjax.load read")
 
     def _slider(self, slider: Slider, value: float, number: Callable[[str, float], None]) -> Any:
@@ -117,7 +130,7 @@ class Panel:
 
     def show_frames(self, count: int, at: int) -> None:
         """How many moments are recorded, and which of them is shown."""
-        self.frame.disabled = count < 2
+        self.frame.disabled = self.fan.disabled = count < 2
         self.frame.max = max(count - 1, 1)
         self.frame.value = max(at, 0)
 

@@ -1,6 +1,7 @@
-"""What the window shows of an equilibrium: the shape between the nodes, quantities along it, loads, and its numbers."""
+"""What the window shows of rods at rest: shapes between the nodes, quantities along them, loads, and their numbers."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,11 @@ from jaxtyping import Array, Float
 from rodjax.analysis.clearance import places, radius_at
 from rodjax.analysis.curvature import curvature_along, curvature_within
 from rodjax.analysis.samples import framed_at
+from rodjax.checks import Numbers
 from rodjax.discretization.hermite import Curve
+from rodjax.geometry.rotations import from_frame
 from rodjax.programs.compilation import compiled
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 # Places between two nodes, with the first of the two: smooth to the eye on 32 elements.
@@ -26,91 +30,143 @@ QUANTITIES = {
 }
 
 
-class Along(NamedTuple):
-    """A rod at k arclengths: what one program finds of it."""
+class Pieces(NamedTuple):
+    """A rod as cylinders from each of k + 1 places to the next: middles, turns (w, x, y, z) of axes of which the third
+    is along the rod and the first along d1, scales along them: radius, 1 m without one, and length.
+    """
 
-    s: Float[np.ndarray, "k"]
-    centerline: Float[np.ndarray, "k 3"]
-    tangents: Float[np.ndarray, "k 3"]
-    d1: Float[np.ndarray, "k 3"]
-    curvature: Float[np.ndarray, "k"]
-    largest_curvature: Float[np.ndarray, ""]  # on both sides of nodes, too: it jumps at clips
-    clearances: Float[np.ndarray, "obstacles"]
-    clip_forces: Float[np.ndarray, "clips 3"]
-    obstacle_forces: Float[np.ndarray, "obstacles 3"]
-    contact: Float[np.ndarray, "n+1"]  # size of the contact force of each node [N]
+    positions: Float[Numbers, "k 3"]
+    wxyzs: Float[Numbers, "k 4"]
+    scales: Float[Numbers, "k 3"]
 
 
 class Reading(NamedTuple):
-    """A rod at rest as it is shown, in SI units and NumPy's arrays.
+    """A rod at rest as it is shown, in SI units.
 
     `centerline`, `d1`, `d2`: (k, 3), at arclengths `s` (k,); `values`: (k,) of each quantity; `feet`, `forces`,
-    `moments`: (m, 3), what each of the m places that hold the rod exerts on it; `clearances`: (obstacles,).
-    `bend_radius`: the smallest one of the centerline, infinite where it is straight.
+    `moments`: (m, 3), what each of the m places that hold the rod exerts on it, moments at its two ends.
     """
 
-    s: Float[np.ndarray, "k"]
-    centerline: Float[np.ndarray, "k 3"]
-    d1: Float[np.ndarray, "k 3"]
-    d2: Float[np.ndarray, "k 3"]
-    values: dict[str, Float[np.ndarray, "k"]]
-    feet: Float[np.ndarray, "m 3"]
-    forces: Float[np.ndarray, "m 3"]
-    moments: Float[np.ndarray, "2 3"]
-    clearances: Float[np.ndarray, "obstacles"]
-    obstacle_forces: Float[np.ndarray, "obstacles 3"]
-    bend_radius: float
+    s: Float[Numbers, "k"]
+    centerline: Float[Numbers, "k 3"]
+    d1: Float[Numbers, "k 3"]
+    d2: Float[Numbers, "k 3"]
+    values: dict[str, Any]
+    feet: Float[Numbers, "m 3"]
+    forces: Float[Numbers, "m 3"]
+    moments: Float[Numbers, "2 3"]
+    pieces: Pieces
+
+
+class Figures(NamedTuple):
+    """What takes a look at all of the rod: `bend_radius`, the smallest one of the centerline [m], infinite where it is
+    straight; `clearances` from the obstacles [m], and the forces [N] with which these push.
+    """
+
+    bend_radius: Float[Numbers, ""]
+    clearances: Float[Numbers, "obstacles"]
+    obstacle_forces: Float[Numbers, "obstacles 3"]
+
+
+def _reading(equilibrium: Equilibrium) -> Reading:
+    s = places(equilibrium, np.arange(PLACES) / PLACES)
+    centerline, tangents, d1 = framed_at(equilibrium, s)
+    nodes, scene = equilibrium.s, equilibrium.scene
+    values = {name: jnp.interp(s, nodes, getattr(equilibrium, name)) for name in ("curvature", "twist", "tension")}
+    if isinstance(equilibrium.state.shape, Curve):
+        values["curvature"] = curvature_within(equilibrium, s)
+    if scene.obstacles:
+        steps = jnp.diff(nodes)
+        # Of the half elements on both sides of a node.
+        shares = (jnp.append(steps, 0.0) + jnp.append(jnp.zeros(1, s.dtype), steps)) / 2
+        contact = jnp.sqrt(jnp.sum(equilibrium.contact_forces**2, axis=-1))
+        values["pressure"] = jnp.interp(s, nodes, contact / shares)
+    ends = equilibrium.nodes[jnp.array([0, -1])]
+    clips = [clip.position[None] for clip in scene.clips]
+    # At s = 0 what the support applies is the reverse of the section force.
+    forces = [-equilibrium.start_force[None], equilibrium.end_force[None], equilibrium.clip_forces]
+    return Reading(
+        s=s,
+        centerline=centerline,
+        d1=d1,
+        d2=jnp.cross(tangents, d1),
+        values=values,
+        feet=jnp.concatenate([ends, *clips]),
+        forces=jnp.concatenate(forces),
+        moments=jnp.stack([-equilibrium.start_moment, equilibrium.end_moment]),
+        pieces=_pieces(centerline, d1, jnp.ones_like(s) if scene.rod.radius is None else radius_at(scene.rod, s)),
+    )
+
+
+def _pieces(centerline: Float[Array, "k 3"], d1: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Pieces:
+    """A little longer where the rod bends, so that nothing gapes on the outside."""
+    chords = jnp.diff(centerline, axis=0)
+    lengths = jnp.sqrt(jnp.sum(chords**2, axis=1))
+    along = chords / lengths[:, None]
+    across = d1[:-1] + d1[1:]
+    across = across - jnp.sum(across * along, axis=1, keepdims=True) * along
+    across = across / jnp.linalg.norm(across, axis=1, keepdims=True)
+    frames = jnp.stack([across, jnp.cross(along, across), along], axis=-1)
+    radii = (radius[:-1] + radius[1:]) / 2
+    turns = jnp.pad(jnp.linalg.norm(jnp.diff(along, axis=0), axis=1), 1)
+    longer = lengths + radii * jnp.maximum(turns[:-1], turns[1:])  # by half of it at both ends
+    pieces = (centerline[:-1] + centerline[1:]) / 2, jax.vmap(from_frame)(frames), jnp.stack([radii, radii, longer], 1)
+    return Pieces(*(numbers.astype(jnp.float32) for numbers in pieces))
+
+
+Shown = Equilibrium | HarnessEquilibrium
+# What is shown of rods that are stacked.
+Groups = tuple[Any, ...]
+
+
+def over_groups(function: Callable[[Equilibrium], Any], shown: Shown) -> Groups:
+    """A function of an equilibrium, of that of each rod; those of one structure and mesh are stacked."""
+    if isinstance(shown, Equilibrium):
+        return (jax.tree.map(lambda leaf: leaf[None], function(shown)),)
+    return tuple(jax.vmap(function)(group) for group in shown.groups)
+
+
+def of_rods(groups: Groups, shown: Shown) -> tuple[Any, ...]:
+    """What was found of stacked rods, of each rod in turn, in NumPy's arrays."""
+    groups = jax.tree.map(np.asarray, groups)
+    members = ((0,),) if isinstance(shown, Equilibrium) else shown.members
+    found = {
+        number: jax.tree.map(lambda leaf, place=place: leaf[place], group)
+        for numbers, group in zip(members, groups, strict=True)
+        for place, number in enumerate(numbers)
+    }
+    return tuple(found[number] for number in range(len(found)))
+
+
+def readings_in_program(shown: Shown) -> Groups:
+    """As a part of a program: stacked, of JAX's arrays."""
+    return over_groups(_reading, shown)
+
+
+def readings_of(shown: Shown) -> tuple[Reading, ...]:
+    """Of each rod, in NumPy's arrays."""
+    return of_rods(_readings(shown), shown)
+
+
+_readings = compiled(readings_in_program)
 
 
 @compiled
-def _along(equilibrium: Equilibrium) -> tuple[Array, ...]:
-    s = places(equilibrium, np.arange(PLACES) / PLACES)
-    centerline, tangents, d1 = framed_at(equilibrium, s)
-    if isinstance(equilibrium.state.shape, Curve):
-        curvature = curvature_within(equilibrium, s)
-    else:
-        curvature = jnp.interp(s, equilibrium.s, equilibrium.curvature)
+def _figures(shown: Shown) -> Groups:
+    return over_groups(_figures_of_rod, shown)
+
+
+def _figures_of_rod(equilibrium: Equilibrium) -> Figures:
+    # On both sides of nodes, too: at clips curvature jumps.
     largest = jnp.max(curvature_along(equilibrium)[1])
-    scene = equilibrium.scene
-    clearances = jnp.zeros(0, s.dtype)
+    scene, clearances = equilibrium.scene, jnp.zeros(0, equilibrium.s.dtype)
     if scene.obstacles:
-        radius = radius_at(scene.rod, s)
+        s = places(equilibrium, np.arange(PLACES) / PLACES)
+        centerline, radius = equilibrium.position_at(s), radius_at(scene.rod, s)
         clearances = jnp.stack([jnp.min(jax.vmap(one.at)(centerline) - radius) for one in scene.obstacles])
-    forces = equilibrium.obstacle_forces
-    contact = jnp.sqrt(jnp.sum(jnp.sum(forces, axis=0) ** 2, axis=-1))
-    totals = jnp.sum(forces, axis=1)
-    return s, centerline, tangents, d1, curvature, largest, clearances, equilibrium.clip_forces, totals, contact
+    return Figures(1 / largest, clearances, jnp.sum(equilibrium.obstacle_forces, axis=1))
 
 
-def reading_of(equilibrium: Equilibrium) -> Reading:
-    """Of one equilibrium. `moments` are those at the two ends."""
-    along = Along(*(np.asarray(array) for array in _along(equilibrium)))
-    nodes = np.asarray(equilibrium.s)
-
-    def between(values: Array | np.ndarray) -> Float[np.ndarray, "k"]:
-        return np.interp(along.s, nodes, np.asarray(values))
-
-    values = {name: between(getattr(equilibrium, name)) for name in ("twist", "tension")}
-    values["curvature"] = along.curvature
-    if equilibrium.scene.obstacles:
-        # Of the half elements on both sides of a node.
-        shares = (np.append(np.diff(nodes), 0.0) + np.append(0.0, np.diff(nodes))) / 2
-        values["pressure"] = between(along.contact / shares)
-    largest = float(along.largest_curvature)
-    ends = np.asarray(equilibrium.nodes)[[0, -1]]
-    clips = [np.asarray(clip.position) for clip in equilibrium.scene.clips]
-    # At s = 0 what the support applies is the reverse of the section force.
-    forces = [-np.asarray(equilibrium.start_force), np.asarray(equilibrium.end_force)]
-    return Reading(
-        s=along.s,
-        centerline=along.centerline,
-        d1=along.d1,
-        d2=np.cross(along.tangents, along.d1),
-        values=values,
-        feet=np.stack([*ends, *clips]),
-        forces=np.stack([*forces, *along.clip_forces]),
-        moments=np.stack([-np.asarray(equilibrium.start_moment), np.asarray(equilibrium.end_moment)]),
-        clearances=along.clearances,
-        obstacle_forces=along.obstacle_forces,
-        bend_radius=1 / largest if largest > 0 else np.inf,
-    )
+def figures_of(shown: Shown) -> tuple[Figures, ...]:
+    """Of each rod."""
+    return of_rods(_figures(shown), shown)

@@ -1,5 +1,6 @@
-"""A rod in the hand, without a browser: a scene, moves that change it, and what is shown of it."""
+"""Rods in the hand, without a browser: a scene, moves that change it, and what is shown of it."""
 
+import functools
 import math
 import time
 import warnings
@@ -11,9 +12,11 @@ import jax
 import numpy as np
 
 from rodjax.checks import instance, whole_number
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.supports import Directed
 from rodjax.paths.modes import lowest_mode
-from rodjax.programs.answers import numpy_first
+from rodjax.programs.answers import compiled_only
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
@@ -25,9 +28,10 @@ from rodjax.solving.result import (
 )
 from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
-from rodjax.window.bounds import depths, out_of_reach, reaches, within_obstacle
-from rodjax.window.controls import Controls, SceneMaker, controls_of, handles_of, sliders_of, with_frames
-from rodjax.window.reading import Reading, reading_of
+from rodjax.window.bounds import Asked, asked_of, why_not
+from rodjax.window.controls import Controls, controls_of, handles_of, rods_of, scene_of, sliders_of, with_frames
+from rodjax.window.following import Followed, followed
+from rodjax.window.reading import Figures, Reading, Shown, figures_of, readings_of
 
 SEGMENTS = 32
 # A move further than this (by the length, or in radians, or of the way of a slider) is made in pieces: frames that turn
@@ -46,35 +50,42 @@ MOST_RECORDED, MOST_UNDONE = 5000, 500
 
 
 class Moment(NamedTuple):
-    """The rod at one moment: the scene that its controls are of, where these are, and its equilibrium."""
+    """The rods at one moment: the scene that the controls are of, where these are, and the equilibrium."""
 
-    scene: Scene
+    scene: Any
     controls: Controls
-    result: Equilibrium
+    result: Any  # Shown
 
 
 class Report(NamedTuple):
-    """What a move led to. `reading`: what is shown; `message`: in words what the user must know, or nothing; `moved`:
-    whether the rod followed all of the way; `snapped`; `iterations` of all solves; `milliseconds` for all of it.
+    """What a move led to. `readings`: what is shown of each rod; `message`: in words what the user must know, or
+    nothing; `moved`: whether the rods followed all of the way; `snapped`; `iterations` of all solves; `milliseconds`
+    for all of it.
     """
 
-    reading: Reading
+    readings: tuple[Reading, ...]
     message: str
     moved: bool
     snapped: bool
     iterations: int
     milliseconds: float
 
+    @property
+    def reading(self) -> Reading:
+        """Of the only rod, or the first one."""
+        return self.readings[0]
+
 
 class Session:
-    """One scene whose handles and sliders are moved; its rod follows, each time from where it was.
+    """A scene or harness whose handles and sliders are moved; its rods follow, each time from where they were.
 
     **Arguments:**
 
-    - `scene`: `Scene`, with numbers.
-    - `segments`: of the mesh, which stays. Errors are those of that mesh: `rodjax.describe(session.result)` tells.
-    - `guess`: an earlier `Equilibrium`, whose turns are carried, or `None`.
-    - `strain_limit`: a move that would strain the rod by more than this is refused, as far as places that are held
+    - `scene`: `Scene` or `Harness`, with numbers.
+    - `segments`: of the mesh of each rod, which stays. Errors are those of that mesh: `rodjax.describe(session.result)`
+      tells.
+    - `guess`: an earlier equilibrium, whose turns are carried, or `None`.
+    - `strain_limit`: a move that would strain a rod by more than this is refused, as far as places that are held
       show; what is above at the start may stay so.
 
     Raises `ValueError` where the scene has no equilibrium to begin with.
@@ -82,55 +93,71 @@ class Session:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Harness,
         *,
         segments: int = SEGMENTS,
-        guess: Equilibrium | None = None,
+        guess: Shown | None = None,
         strain_limit: float = DEFAULT_STRAIN_LIMIT,
     ):
-        instance(scene, "scene", Scene)
+        instance(scene, "scene", (Scene, Harness))
         self.segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
         self.strain_limit = strain_limit
         # The turns that a scene states are made once, and carried from then on.
-        first = self.solved(_movable(scene), guess)
+        first = self.solved(movable(scene), guess)
         if not bool(first.converged):
             told = " ".join(describe(first).split())
             raise ValueError(f"scene must have an equilibrium to begin with, got none: {told}")
-        self._begin_with(_without_turns(_movable(scene)))
+        self._begin_with(without_turns(movable(scene)))
         self.now = self.first = Moment(self.scene, controls_of(self.scene), first)
-        self.reading = reading_of(first)
-        self.depths = depths(self.scene)
+        self.readings = readings_of(first)
         self.softest: float | None = None
         self.recorded: list[Moment] = []
         self.is_recording = False
         self._undone: list[Moment] = []
 
-    def _begin_with(self, scene: Scene) -> None:
-        self.scene, self.scene_at = scene, SceneMaker(scene)
-        self.handles, self.sliders = handles_of(scene), sliders_of(scene)
-        self.reach_limits = [max(1 + self.strain_limit, reach) for reach in reaches(scene)]
+    def _begin_with(self, scene: Any) -> None:
+        self.scene, self.handles, self.sliders = scene, handles_of(scene), sliders_of(scene)
+        asked = asked_of(scene)
+        self.limits = Asked(
+            np.maximum(1 + self.strain_limit, np.asarray(asked.reaches)), tuple(map(np.asarray, asked.depths))
+        )
+        rods = rods_of(scene).values()
+        self.length = max(float(rod.rod.length) for rod in rods)
+        # What of a scene depends on how its ends are turned is known where something holds their directions.
+        self._is_steady = all(isinstance(rod.start, Directed) or isinstance(rod.end, Directed) for rod in rods)
 
     @property
-    def result(self) -> Equilibrium:
+    def result(self) -> Any:
+        """An `Equilibrium`, or that of a harness."""
         return self.now.result
+
+    @property
+    def reading(self) -> Reading:
+        """Of the only rod, or the first one."""
+        return self.readings[0]
+
+    @functools.cached_property
+    def figures(self) -> tuple[Figures, ...]:
+        """Of each rod, when they are asked for."""
+        return figures_of(self.result)
+
+    def _reached(self, moment: Moment, readings: tuple[Reading, ...], depths: tuple[Any, ...]) -> None:
+        self.now, self.readings, self.softest = moment, readings, None
+        self.limits = self.limits._replace(depths=depths)
+        self.__dict__.pop("figures", None)
 
     def warm_up(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
         """Compiles what moves need, so that none of them waits for it, as long as it is wanted."""
-        # Two answers of each kind come from NumPy code; for the third all are compiled side by side.
-        for _ in range(3):
-            if not is_wanted():
-                return
-            scene = self.scene_at(self.now.controls)
-            reading_of(self.solved(scene, self.result))
-            self._check(scene)
-        with numpy_first(False):  # later, it would be compiled in the middle of a move
-            self.settle()
+        with compiled_only():
+            for prepare in (lambda: self._followed(self.now.controls), lambda: self.figures, self.settle):
+                if is_wanted():
+                    prepare()
 
     # --- moves ---
 
     def move(self, changes: Mapping[str, Any]) -> Report:
         """Moves handles, (position (3,) [m], frame (3, 3) or `None` where it is not turned) by name, and sliders to
-        numbers; the rod follows as far as it can. What makes no sense is told in the report, and nothing moves.
+        numbers; the rods follow as far as they can. What makes no sense is told in the report, and nothing moves.
         """
         begin = time.perf_counter()
         try:
@@ -139,95 +166,88 @@ class Session:
             return self._report(begin, f"not moved: {error}", moved=False)
         return self._moved_to(target, begin)
 
+    def _followed(self, controls: Controls) -> Followed:
+        return followed(self.scene, controls, self.result, self.limits, self.strain_limit, self.segments)
+
     def _moved_to(self, target: Controls, begin: float) -> Report:
         start = self.now.controls
-        length = float(self.scene.rod.length)
-        distance = start.distance(target, self.sliders, length)
+        distance = start.distance(target, self.sliders, self.length)
         share = 1 / max(1, math.ceil(distance / PIECE))
         least = share / 2**HALVINGS
-        reached, message, snapped, iterations = 0.0, "", False, 0
+        reached, message, snapped, iterations, status = 0.0, "", False, 0, Status.CONVERGED
         for _ in range(MOST_PIECES):
             aim = min(reached + share, 1.0)
             controls = start.between(target, aim)
-            try:
-                scene = self.scene_at(controls)
-                found_depths = self._check(scene)
-            except ValueError as error:
-                message = self._why_not(target) or str(error)
+            if not self._is_steady or target.numbers != start.numbers:
+                # Numbers of which a scene makes no sense; a program would not say so.
+                message = self._refusal(controls)
+                if message:
+                    message = self._refusal(target) or message
+                    break
+            found = self._followed(controls)
+            outcome = found.outcome
+            if not outcome.makes_sense:
+                message = self._refusal(target) or self._refusal(controls)
                 break
-            result = self.solved(scene, self.result)
-            iterations += int(result.iterations)
-            if not bool(result.converged):
-                message = " ".join(describe(result).split())
+            iterations += int(outcome.iterations)
+            if not outcome.converged:
+                message = " ".join(describe(found.result).split())
                 share /= 2
                 if share < least:
                     break
                 continue
-            message = ""
-            snapped |= self._has_snapped(result, distance * (aim - reached))
-            self.now, self.depths, reached = Moment(self.scene, controls, result), found_depths, aim
+            message, status = "", int(outcome.status)
+            snapped |= self._has_snapped(float(outcome.way), distance * (aim - reached))
+            self._reached(Moment(self.scene, controls, found.result), found.readings, outcome.asked.depths)
+            reached = aim
             if reached >= 1.0:
                 break
         if self.is_recording and reached > 0.0:
             self.recorded.append(self.now)
             self.is_recording = len(self.recorded) < MOST_RECORDED
-        if reached > 0.0:
-            self.softest = None
-            self.reading = reading_of(self.result)
         is_there = reached >= 1.0
         if not is_there:
             how = "not moved" if reached == 0.0 else f"moved by {100 * reached:.0f} % of the way only"
             message = f"{how}: {message or 'the way is too long'}"
         elif snapped:
             message = "the rod snapped into another shape"
-        elif int(self.result.status) == Status.OVERSTRETCHED:
+        elif status == Status.OVERSTRETCHED:
             message = f"the rod is strained by more than {100 * self.strain_limit:g} %"
         return self._report(begin, message, is_there, snapped, iterations)
 
-    def _why_not(self, target: Controls) -> str | None:
-        """What makes no sense about where the hand went: it says more than what does on the way there."""
+    def _refusal(self, controls: Controls) -> str:
+        """What makes no sense about a scene, in words, or nothing."""
         try:
-            self._check(self.scene_at(target))
+            scene = scene_of(self.scene, controls)
         except ValueError as error:
             return str(error)
-        return None
+        return why_not(scene, jax.tree.map(np.asarray, asked_of(scene)), self.limits) or ""
 
-    def _check(self, scene: Scene) -> np.ndarray:
-        """Raises `ValueError` where a scene asks of its rod what no rod can do; returns the depths of its supports."""
-        found = out_of_reach(scene, self.reach_limits)
-        now = depths(scene)
-        found = found or within_obstacle(scene, self.depths, now)
-        if found:
-            raise ValueError(found)
-        return now
-
-    def solved(self, scene: Scene, guess: Equilibrium | None) -> Equilibrium:
-        """As every move of this session is solved."""
+    def solved(self, scene: Scene | Harness, guess: Any) -> Any:
+        """On the mesh of this session; the window tells what warnings would."""
         with warnings.catch_warnings():
-            # The window tells these.
             for category in (NotConvergedWarning, OverstretchedWarning, MeshWarning):
                 warnings.simplefilter("ignore", category)
             return solve(scene, segments=self.segments, guess=guess, strain_limit=self.strain_limit)
 
-    def _has_snapped(self, result: Equilibrium, distance: float) -> bool:
-        way = np.asarray(result.nodes) - np.asarray(self.result.nodes)
-        way = float(np.max(np.linalg.norm(way, axis=-1))) / float(self.scene.rod.length)
-        return way > max(SNAP_WAY, SNAP_RATIO * distance)
+    def _has_snapped(self, way: float, distance: float) -> bool:
+        return way / self.length > max(SNAP_WAY, SNAP_RATIO * distance)
 
     def _report(self, begin: float, message: str, moved: bool, snapped: bool = False, iterations: int = 0) -> Report:
         milliseconds = 1e3 * (time.perf_counter() - begin)
-        return Report(self.reading, message, moved, snapped, iterations, milliseconds)
+        return Report(self.readings, message, moved, snapped, iterations, milliseconds)
 
     # --- stability ---
 
     @property
     def can_settle(self) -> bool:
         """Whether the stiffness of the softest motion can be told."""
-        return has_potential(self.scene) and not slides(self.scene)
+        return isinstance(self.scene, Scene) and has_potential(self.scene) and not slides(self.scene)
 
     def settle(self) -> float | None:
         """The stiffness of the softest motion [N], as by `rodjax.lowest_mode`; `None` where it cannot be told."""
         if self.can_settle:
+            assert isinstance(self.result, Equilibrium)
             self.softest = float(lowest_mode(self.result).stiffness)
         return self.softest
 
@@ -236,6 +256,7 @@ class Session:
         """Whether the rod is about to snap: its softest motion, where that is known, has next to no stiffness left."""
         if self.softest is None:
             return False
+        assert isinstance(self.result, Equilibrium)
         rod = self.result.scene.rod
         return self.softest * float(rod.length) ** 2 < SOFT * float(rod.bending_scale)
 
@@ -256,14 +277,13 @@ class Session:
         self.show(self._undone.pop())
         return self._report(begin, "", moved=True)
 
-    def show(self, moment: Moment) -> Reading:
+    def show(self, moment: Moment) -> tuple[Reading, ...]:
         """Makes an earlier moment the present one."""
         if moment.scene is not self.scene:
             self._begin_with(moment.scene)
-        self.now, self.softest = moment, None
-        self.depths = depths(self.scene_at(moment.controls))
-        self.reading = reading_of(moment.result)
-        return self.reading
+        depths = tuple(map(np.asarray, asked_of(scene_of(self.scene, moment.controls)).depths))
+        self._reached(moment, readings_of(moment.result), depths)
+        return self.readings
 
     def record(self, on: bool) -> None:
         """Begins a new recording, with the present moment first, or ends it."""
@@ -271,25 +291,34 @@ class Session:
             self.recorded = [self.now]
         self.is_recording = on
 
-    def add_recorded(self, path: Equilibrium) -> None:
+    def add_recorded(self, path: Any) -> None:
         """Takes a path, or a batch, of equilibria of the structure of this scene for what was recorded."""
         self.recorded = []
-        for k in range(min(path.s.shape[0], MOST_RECORDED)):
+        for k in range(min(path.status.shape[0], MOST_RECORDED)):
             one = jax.tree.map(lambda leaf, k=k: leaf[k], path)
-            scene = _without_turns(_movable(one.scene))
+            scene = without_turns(movable(scene_in(one)))
             self.recorded.append(Moment(scene, controls_of(scene), one))
 
-    def recording(self) -> Equilibrium:
+    def recording(self) -> Any:
         """All recorded equilibria along a leading axis. Raises `ValueError` where there are none."""
         if not self.recorded:
             raise ValueError("nothing is recorded yet")
         return jax.tree.map(lambda *leaves: np.stack(leaves), *(moment.result for moment in self.recorded))
 
 
-def _movable(scene: Scene) -> Scene:
-    obstacles = tuple(map(with_frames, scene.obstacles))
-    return eqx.tree_at(lambda scene: scene.obstacles, scene, obstacles) if obstacles else scene
+def scene_in(shown: Shown) -> Scene | Harness:
+    """Of which an equilibrium is."""
+    return shown.scene if isinstance(shown, Equilibrium) else shown.harness
 
 
-def _without_turns(scene: Scene) -> Scene:
+def movable(scene: Any) -> Any:
+    """With a frame for each box, which may be turned."""
+    if isinstance(scene, Harness) or not scene.obstacles:
+        return scene
+    return eqx.tree_at(lambda scene: scene.obstacles, scene, tuple(map(with_frames, scene.obstacles)))
+
+
+def without_turns(scene: Any) -> Any:
+    if isinstance(scene, Harness):
+        return eqx.tree_at(lambda harness: harness.scenes, scene, tuple(map(without_turns, scene.scenes)))
     return eqx.tree_at(lambda scene: scene.turns, scene, None, is_leaf=lambda x: x is None)

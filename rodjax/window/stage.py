@@ -1,29 +1,32 @@
-"""The three-dimensional part of the window: the rod, its loads, obstacles and handles, as nodes of a viser scene."""
+"""The three-dimensional part of the window: rods, their loads, obstacles and handles, as nodes of a viser scene."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from rodjax.checks import leaf
-from rodjax.model.along import Along
 from rodjax.model.surfaces import surfaces
-from rodjax.plot import largest_radius, radius_along
+from rodjax.plot import largest_radius
 from rodjax.window import tube
-from rodjax.window.controls import Pose, center_of
-from rodjax.window.reading import Reading
+from rodjax.window.controls import Pose, center_of, rods_of
+from rodjax.window.reading import Pieces, Reading
 from rodjax.window.session import Session
 
 # By the length of the rod: the least radius that can be seen, that of a rod without one, the longest arrow, and the
 # size of handles. By the extent of what is seen: how far away the camera is, and how far the panel moves the middle.
 LEAST_RADIUS, DEFAULT_RADIUS, ARROW, HANDLE = 0.002, 0.004, 0.15, 0.1
-CAMERA, PANEL = 0.95, 0.18
+CAMERA, PANEL = 0.8, 0.16
+# By the largest radius, that of a joint; and how pale other shapes are.
+JOINT, FAN_OPACITY = 1.6, 0.18
+# Scales that differ by less look the same.
+SAME_SCALE = 0.01
 # Below these parts of EI/L^2 and EI/L forces and moments are rounding.
 LEAST_LOAD = 1e-6
 # Of Okabe and Ito, told apart by all eyes: forces, moments.
-FORCE_COLOR, MOMENT_COLOR, OBSTACLE_COLOR, CAP_COLOR = (213, 94, 0), (0, 114, 178), (150, 155, 160), (120, 120, 120)
+FORCE_COLOR, MOMENT_COLOR, OBSTACLE_COLOR, JOINT_COLOR = (213, 94, 0), (0, 114, 178), (150, 155, 160), (120, 120, 120)
+FAN_COLOR = (110, 120, 130)
 
 Moved = Callable[[str, Pose, str], None]
 
@@ -35,88 +38,116 @@ class Stage:
 
     def __init__(self, server: Any, session: Session, moved: Moved):
         self.server, self.session = server, session
-        self.length = float(session.scene.rod.length)
-        self.parts: dict[str, Any] = {}
+        self.rods = [scene.rod for scene in rods_of(session.scene).values()]
+        self.length = session.length
+        # As many times as thick as they are.
+        self.thickness = np.array(
+            [
+                self._radius(rod.radius) / (1.0 if rod.radius is None else largest_radius(rod.radius))
+                for rod in self.rods
+            ],
+            np.float32,
+        )
+        self.force = max(float(rod.bending_scale) for rod in self.rods) / self.length**2  # EI/L^2
+        self.meshes: dict[str, Any] = {}
+        self.joints: Any = None
         self.obstacles: dict[str, Any] = {}
         self.placed = dict(session.now.controls.poses)  # where obstacles are drawn
         self.handles = {name: self._handle(name, moved) for name in session.handles}
         self.arrows: dict[str, Any] = {}
         self._draw_obstacles()
-        points = session.reading.centerline
+        points = np.concatenate([reading.centerline for reading in session.readings])
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(float(np.linalg.norm(high - low)), 0.2 * self.length)
         # The panel hides the right of the picture.
         middle = (low + high) / 2 + PANEL * extent * np.array([1.0, 0.0, 0.0])
         server.initial_camera.look_at = tuple(middle)
         server.initial_camera.position = tuple(middle + CAMERA * extent * np.array([0.0, -0.92, 0.4]))
-        server.initial_camera.near = 1e-3 * self.length
-        server.initial_camera.far = 1e3 * self.length
+        server.initial_camera.near = 1e-2 * self.length
+        server.initial_camera.far = 1e2 * self.length
 
-    # --- the rod ---
+    # --- the rods ---
 
     @property
     def note(self) -> str:
-        """Where the rod is not drawn as thick as it is."""
-        radius = self.session.scene.rod.radius
+        """Where rods are not drawn as thick as they are."""
+        if any(rod.radius is None for rod in self.rods):
+            return "A rod without a radius is drawn with one."
+        times = np.max(self.thickness)
+        return "" if times == 1 else f"The thinnest rod is drawn {times:.2g} times as thick as it is."
+
+    def _radius(self, radius: Any) -> float:
+        """With which a rod is drawn that has this one."""
         if radius is None:
-            return "The rod has no radius; it is drawn with one."
-        times = self._radius() / largest_radius(radius)
-        return "" if times == 1 else f"The rod is drawn {times:.2g} times as thick as it is."
+            return DEFAULT_RADIUS * self.length
+        return max(largest_radius(radius), LEAST_RADIUS * self.length)
 
-    def _radius(self) -> float:
-        radius = self.session.scene.rod.radius
-        return (
-            DEFAULT_RADIUS * self.length if radius is None else max(largest_radius(radius), LEAST_RADIUS * self.length)
+    def _pieces(self, readings: Sequence[Reading]) -> Pieces:
+        """Of all rods."""
+        positions, wxyzs, scales = map(np.concatenate, zip(*(reading.pieces for reading in readings), strict=True))
+        counts = [len(reading.pieces.positions) for reading in readings]
+        scales[:, :2] *= np.repeat(self.thickness, counts)[:, None]
+        return Pieces(positions, wxyzs, scales)
+
+    def draw(self, readings: Sequence[Reading], quantity: str, scale: tube.Scale) -> None:
+        """The rods, coloured by a quantity."""
+        pieces = self._pieces(readings)
+        colors = [tube.colors_of(reading.values[quantity], scale) for reading in readings]
+        colors = tube.as_light(np.concatenate(colors))
+        both = Pieces(
+            np.concatenate([pieces.positions] * 2),
+            np.concatenate([pieces.wxyzs, tube.half_turned(np.asarray(pieces.wxyzs))]),
+            np.concatenate([pieces.scales] * 2),
         )
-
-    def _radii(self, reading: Reading) -> float | Float[np.ndarray, "k"]:
-        radius, thickest = self.session.scene.rod.radius, self._radius()
-        if not isinstance(radius, Along):
-            return thickest
-        return thickest / largest_radius(radius) * radius_along(radius, leaf(reading.s))
-
-    def draw(self, reading: Reading, quantity: str, scale: tube.Scale) -> None:
-        """The rod, coloured by a quantity."""
-        surface = tube.Surface(reading.centerline, reading.d1, reading.d2, self._radii(reading))
-        shown = {f"/rod/strip {k}": part for k, part in enumerate(surface.strips)}
-        shown["/rod/caps"] = surface.caps
-        for k, part in enumerate(surface.bands(reading.values[quantity], scale)):
-            shown[f"/rod/band {k}"] = part
-        for name in set(self.parts) - set(shown):
-            self.parts.pop(name).remove()
-        for name, part in shown.items():
-            self._show_part(name, part, self._color(name, scale))
-
-    @staticmethod
-    def _color(name: str, scale: tube.Scale) -> tuple[int, int, int]:
-        if name == "/rod/caps":
-            return CAP_COLOR
-        k = int(name.split()[-1])
-        red, green, blue = tube.STRIP_COLORS[k] if "strip" in name else scale.colors[k]
-        return int(red), int(green), int(blue)
-
-    def _show_part(self, name: str, part: tube.Part, color: tuple[int, int, int]) -> None:
-        if name not in self.parts:
-            self.parts[name] = self.server.scene.add_mesh_simple(
-                name, part.vertices, part.faces, color=color, cast_shadow=False, receive_shadow=False
-            )
+        if not self.meshes:
+            strips = np.repeat(tube.as_light(np.array(tube.STRIP_COLORS)), len(colors), axis=0)
+            self.meshes = {
+                "tube": self._batched("/rods/tube", tube.cylinder(), pieces, colors),
+                "strips": self._batched("/rods/strips", tube.strip(), both, strips),
+            }
             return
-        drawn = self.parts[name]
-        drawn.vertices = part.vertices
-        if drawn.color != color:
-            drawn.color = color
-        if drawn.faces.shape != part.faces.shape or not np.array_equal(drawn.faces, part.faces):
-            drawn.faces = part.faces
+        _move_to(self.meshes["tube"], pieces)
+        _move_to(self.meshes["strips"], both)
+        if not np.array_equal(self.meshes["tube"].batched_colors, colors):
+            self.meshes["tube"].batched_colors = colors
+
+    def _batched(self, name: str, mesh: tube.Faces, pieces: Pieces, colors: Any, **more: Any) -> Any:
+        return self.server.scene.add_batched_meshes_simple(
+            name, mesh.vertices, mesh.faces, pieces.wxyzs, pieces.positions, batched_scales=pieces.scales,
+            batched_colors=colors, lod="off", cast_shadow=False, receive_shadow=False, **more,
+        )  # fmt: skip
+
+    def draw_fan(self, many: Sequence[Sequence[Reading]]) -> None:
+        """Other shapes of the rods, pale; none where there are none."""
+        fan = self.meshes.pop("fan", None)
+        if fan is not None:
+            fan.remove()
+        if many:
+            pieces = Pieces(*map(np.concatenate, zip(*map(self._pieces, many), strict=True)))
+            self.meshes["fan"] = self._batched(
+                "/fan", tube.cylinder(), pieces, tube.as_light(np.array(FAN_COLOR)), opacity=FAN_OPACITY
+            )
+
+    def draw_joints(self, positions: Float[np.ndarray, "j 3"]) -> None:
+        """The bodies in which rods of a harness meet."""
+        size = JOINT * max(self._radius(rod.radius) for rod in self.rods)
+        count = len(positions)
+        turns = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (count, 1))
+        pieces = Pieces(positions.astype(np.float32), turns, np.full((count, 3), size, np.float32))
+        if self.joints is None:
+            self.joints = self._batched("/joints", tube.ball(), pieces, tube.as_light(np.array(JOINT_COLOR)))
+        else:
+            self.joints.batched_positions = pieces.positions
 
     # --- loads ---
 
-    def draw_loads(self, reading: Reading, visible: bool) -> None:
-        """Arrows for the forces on the rod, and two-headed ones for the moments at its ends."""
-        units = self.session.result.state.units
-        self._arrows("forces", reading.feet, reading.forces, float(units.force), FORCE_COLOR, (1.0,), visible)
-        self._arrows(
-            "moments", reading.feet[:2], reading.moments, float(units.energy), MOMENT_COLOR, (1.0, 0.8), visible
-        )
+    def draw_loads(self, readings: Sequence[Reading], visible: bool) -> None:
+        """Arrows for the forces on the rods, and two-headed ones for the moments at their ends."""
+        feet, forces = (np.concatenate([getattr(one, name) for one in readings]) for name in ("feet", "forces"))
+        ends, moments = np.concatenate([one.feet[:2] for one in readings]), [one.moments for one in readings]
+        self._arrows("forces", feet, forces, self.force, FORCE_COLOR, (1.0,), visible)
+        moment = self.force * self.length
+        self._arrows("moments", ends, np.concatenate(moments), moment, MOMENT_COLOR, (1.0, 0.8), visible)
 
     def _arrows(self, name: str, feet, loads, unit: float, color, heads: tuple[float, ...], visible: bool) -> None:
         sizes = np.linalg.norm(loads, axis=1)
@@ -128,7 +159,9 @@ class Stage:
         points = np.concatenate(lines).astype(np.float32)
         drawn = self.arrows.get(name)
         if drawn is not None and len(drawn.points) == len(points):
-            drawn.points, drawn.visible = points, visible
+            drawn.points = points
+            if drawn.visible != visible:
+                drawn.visible = visible
             return
         if drawn is not None:
             drawn.remove()
@@ -141,8 +174,10 @@ class Stage:
     # --- obstacles and handles ---
 
     def _draw_obstacles(self) -> None:
-        obstacles = self.session.scene.obstacles
-        for k, faces in enumerate(surfaces(obstacles, self.session.reading.centerline) if obstacles else []):
+        obstacles = getattr(self.session.scene, "obstacles", ())
+        for k, faces in enumerate(
+            surfaces(obstacles, np.asarray(self.session.reading.centerline)) if obstacles else []
+        ):
             name = f"obstacles[{k}]"
             pivot = center_of(obstacles[k]) if name in self.session.handles else np.zeros(3)
             vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)
@@ -179,6 +214,12 @@ class Stage:
     def show_handles(self, visible: bool) -> None:
         for drawn in self.handles.values():
             drawn.visible = visible
+
+
+def _move_to(mesh: Any, pieces: Pieces) -> None:
+    mesh.batched_positions, mesh.batched_wxyzs = pieces.positions, pieces.wxyzs
+    if np.max(np.abs(pieces.scales - mesh.batched_scales) - SAME_SCALE * pieces.scales) > 0:
+        mesh.batched_scales = pieces.scales
 
 
 def _place(drawn: Any, pose: Pose) -> None:

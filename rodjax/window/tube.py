@@ -1,4 +1,6 @@
-"""The surface of a rod as triangles, in bands of one colour each, with strips along its directors."""
+"""Rods as short cylinders, each of one colour, and strips along their directors: all that changes in a move are places,
+turns and colours of the same meshes.
+"""
 
 from typing import NamedTuple
 
@@ -9,27 +11,71 @@ from matplotlib.ticker import MaxNLocator
 
 from rodjax.plot import COLOR_MAP
 
-# Faces around the rod, and of them those of each strip: along d1, and on the other side.
-AROUND, STRIP = 16, 2
+# Faces around a rod, and of them those of a strip.
+AROUND, STRIP = 24, 3
 STRIP_COLORS = ((30, 30, 30), (245, 245, 245))
+# By the radius, how far strips stand out.
+OUT = 1.06
 # So many bands of colour at most: more cannot be told from one another, nor read off a legend.
 MOST_BANDS = 12
 # Ranges narrower than this part of their values, or than this, are rounding.
 LEAST_RANGE, LEAST_VALUE = 1e-3, 1e-9
 
 
-_ANGLES = 2 * np.pi / AROUND * (np.arange(AROUND) - STRIP / 2)
-_COSINE, _SINE = np.cos(_ANGLES)[:, None], np.sin(_ANGLES)[:, None]
-# The points of a ring that are those of each strip, and of both sides between them.
-_STRIPS = [np.arange(first, first + STRIP + 1) for first in (0, AROUND // 2)]
-_BETWEEN = np.concatenate([np.arange(first + STRIP, first + AROUND // 2 + 1) % AROUND for first in (0, AROUND // 2)])
-
-
-class Part(NamedTuple):
-    """Triangles: vertices (v, 3) [m], and three of their numbers for each."""
+class Faces(NamedTuple):
+    """Triangles: vertices (v, 3), and three of their numbers for each."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
+
+
+def cylinder() -> Faces:
+    """Of radius 1 and length 1 about the z axis, with both ends."""
+    angles = 2 * np.pi / AROUND * np.arange(AROUND)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    around = np.arange(AROUND)
+    onward = (around + 1) % AROUND
+    low, high = around, AROUND + around
+    sides = [np.stack([low, onward, AROUND + onward], axis=1), np.stack([low, AROUND + onward, high], axis=1)]
+    # Points of their own, so that edges are sharp.
+    base, top = 2 * AROUND, 3 * AROUND
+    caps = [
+        np.stack([np.full(AROUND, 4 * AROUND), base + onward, base + around], axis=1),
+        np.stack([np.full(AROUND, 4 * AROUND + 1), top + around, top + onward], axis=1),
+    ]
+    levels = [np.column_stack([ring, np.full(AROUND, z)]) for z in (-0.5, 0.5)]
+    vertices = np.concatenate([*levels, *levels, [[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]]])
+    return Faces(vertices.astype(np.float32), np.concatenate([*sides, *caps]).astype(np.uint32))
+
+
+def strip() -> Faces:
+    """Of a slightly larger cylinder, about the x axis."""
+    angles = 2 * np.pi / AROUND * (np.arange(STRIP + 1) - STRIP / 2)
+    ring = OUT * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    vertices = np.concatenate([np.column_stack([ring, np.full(STRIP + 1, z)]) for z in (-0.5, 0.5)])
+    low = np.arange(STRIP)
+    high = STRIP + 1 + low
+    faces = [np.stack([low, low + 1, high + 1], axis=1), np.stack([low, high + 1, high], axis=1)]
+    return Faces(vertices.astype(np.float32), np.concatenate(faces).astype(np.uint32))
+
+
+def ball() -> Faces:
+    """Of radius 1: an octahedron of which each face has been parted three times."""
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    triangles = corners[[[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]]
+    for _ in range(3):
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        triangles = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    vertices, faces = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return Faces(vertices.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
+
+
+def half_turned(wxyzs: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
+    """Quaternions (w, x, y, z) turned by half a turn about their own z axes."""
+    w, x, y, z = wxyzs.T
+    return np.stack([-z, y, -x, w], axis=1)
 
 
 class Scale(NamedTuple):
@@ -53,56 +99,15 @@ def covers(scale: Scale, values: Float[np.ndarray, "k"]) -> bool:
     return bool(scale.edges[0] <= np.min(values) and np.max(values) <= scale.edges[-1])
 
 
-class Surface:
-    """The surface of one rod: strips along its directors, caps, and bands of colour between the strips."""
-
-    def __init__(
-        self,
-        centerline: Float[np.ndarray, "k 3"],
-        d1: Float[np.ndarray, "k 3"],
-        d2: Float[np.ndarray, "k 3"],
-        radius: float | Float[np.ndarray, "k"],
-    ):
-        self.centerline = centerline.astype(np.float32)
-        radii = np.broadcast_to(radius, len(centerline))[:, None, None]
-        around = _COSINE * d1[:, None] + _SINE * d2[:, None]
-        self.rings = (centerline[:, None] + radii * around).astype(np.float32)
-
-    @property
-    def strips(self) -> list[Part]:
-        """Along d1 and along -d1."""
-        rows = np.arange(len(self.rings) - 1)
-        return [_part(self.rings[:, columns], rows) for columns in _STRIPS]
-
-    def bands(self, values: Float[np.ndarray, "k"], scale: Scale) -> list[Part]:
-        """By the band of the mean value of each pair of rings, on both sides of the strips. A band may be empty."""
-        means = (values[1:] + values[:-1]) / 2
-        band = np.clip(np.searchsorted(scale.edges, means, side="right") - 1, 0, len(scale.colors) - 1)
-        between = self.rings[:, _BETWEEN]
-        return [_part(between, np.flatnonzero(band == k), sides=2) for k in range(len(scale.colors))]
-
-    @property
-    def caps(self) -> Part:
-        """The two ends."""
-        vertices = np.concatenate([self.rings[0], self.rings[-1], self.centerline[[0, -1]]])
-        around = np.arange(AROUND)
-        onward, middle = (around + 1) % AROUND, 2 * AROUND
-        first = np.stack([np.full_like(around, middle), onward, around], axis=1)
-        last = np.stack([np.full_like(around, middle + 1), AROUND + around, AROUND + onward], axis=1)
-        return Part(vertices, np.concatenate([first, last]).astype(np.uint32))
+def as_light(colors: Int[np.ndarray, "k 3"]) -> Int[np.ndarray, "k 3"]:
+    """Colours of a screen, 0 to 255, as amounts of light: so viser's batched meshes take them."""
+    shares = np.asarray(colors) / 255
+    light = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * light).astype(np.uint8)
 
 
-def _part(rings: Float[np.ndarray, "k m 3"], rows: Int[np.ndarray, "r"], sides: int = 1) -> Part:
-    """The faces from these rows of rings to the next; neighbours share their vertices. Each ring is of so many sides,
-    between which there are no faces.
-    """
-    if not len(rows):
-        # One triangle without an area: a mesh that is empty has no middle.
-        return Part(np.repeat(rings[0, :1], 3, axis=0), np.array([[0, 1, 2]], np.uint32))
-    count = rings.shape[1]
-    is_used = np.zeros(len(rings), bool)
-    is_used[rows] = is_used[rows + 1] = True
-    at = (np.cumsum(is_used) - 1)[rows, None] * count
-    left = np.arange(count).reshape(sides, -1)[:, :-1].reshape(-1)
-    corners = np.stack([left, left + 1, left + count + 1, left, left + count + 1, left + count], axis=-1).reshape(-1)
-    return Part(rings[is_used].reshape(-1, 3), (at + corners).reshape(-1, 3).astype(np.uint32))
+def colors_of(values: Float[np.ndarray, "k+1"], scale: Scale) -> Int[np.ndarray, "k 3"]:
+    """By the bands of the mean values of neighbours."""
+    means = (values[1:] + values[:-1]) / 2
+    band = np.clip(np.searchsorted(scale.edges, means, side="right") - 1, 0, len(scale.colors) - 1)
+    return scale.colors[band].astype(np.uint8)

@@ -169,6 +169,8 @@ HARNESS_FIELDS = {
     "harness/stable": ("1", "whether no motion of rods and joints lowers the energy"),
     "harness/index": ("1", "independent motions of rods and joints that lower the energy"),
     "harness/residual": ("1", "largest component of the gradient, in EI/L^2 of each rod"),
+    "harness/contact_forces": ("N", "forces of obstacles on the joints, where rods end in them"),
+    "harness/end_pressures": ("N", "of contacts of the joints, of each stack of rods by rod, obstacle and end"),
     **{f"harness/{name}": FIELDS[name] for name in ("converged", "status", "iterations", "evaluations")},
     "end/frame": ("1", "frame of the end of the rod in the axes of the joint, columns d1, d2, t"),
     "end/offset": ("m", "from the position of the joint to the end of the rod, in the axes of the joint"),

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
 from rodjax.geometry.rotations import from_frame
-from rodjax.model.scene import Scene, between, has_potential, slides, support_between
+from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -126,9 +126,8 @@ def _check_scene(scene: Scene, name: str) -> None:
 
 def check_movable(scene: Scene, name: str) -> None:
     """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
-    for part, why in (("obstacles", "obstacles"), ("potentials", "fields")):
-        if getattr(scene, part):
-            raise ValueError(f"{name}.{part} must be () where ends have unknown poses: {why} are not computed there")
+    if has_friction(scene):
+        raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
     if slides(scene):
         raise ValueError(f"{name}.clips must not slide where ends of the rod have unknown poses")
     if not has_potential(scene):

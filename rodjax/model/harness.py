@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
 from rodjax.geometry.rotations import from_frame
+from rodjax.model.along import largest_beside
 from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
@@ -364,6 +365,13 @@ def joint_ends(scene: Scene, joint_names: tuple[str, ...]) -> tuple[tuple[int, i
     frames = [end.frame if isinstance(end, Joint) else np.eye(3) for end in ends]
     offsets = [end.offset if isinstance(end, Joint) else np.zeros(3) for end in ends]
     return (numbers[0], numbers[1]), frames, offsets
+
+
+def end_radii(scene: Scene) -> Float[Array, "2"]:
+    """Of the rod at its ends [m]."""
+    length, radius = scene.rod.length, scene.rod.radius
+    assert radius is not None
+    return jnp.broadcast_to(largest_beside(radius, jnp.stack([jnp.zeros_like(length), length])), (2,))
 
 
 def clamped(scene: Scene, harness: Harness, positions: Any, frames: Any) -> Scene:

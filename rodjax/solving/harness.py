@@ -13,8 +13,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
-from rodjax.model.along import largest_beside
-from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, joint_ends, of_one_rod, rotated
+from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, end_radii, joint_ends, of_one_rod, rotated
 from rodjax.model.scene import Scene, nondimensional
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
@@ -40,7 +39,7 @@ from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
 from rodjax.solving.newton import Newton
-from rodjax.solving.refinement import SAFETY, SIZES, error_by_rtol, next_size
+from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -430,8 +429,7 @@ def contact_forces(
         for number, of_rod in zip(numbers, of_group, strict=True):
             scene = harness.scenes[number]
             bodies, _, offsets = joint_ends(scene, harness.joint_names)
-            assert scene.rod.radius is not None
-            radius = largest_beside(scene.rod.radius, jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
+            radius = end_radii(scene)
             for obstacle, of_ends in zip(scene.obstacles, of_rod, strict=True):
                 of_obstacle = []
                 for body, offset, thick, pressure in zip(bodies, offsets, radius, of_ends, strict=True):
@@ -457,8 +455,9 @@ def _refined(
     is.
     """
     iterations, evaluations = int(result.iterations), int(result.evaluations)
+    depths: dict[tuple[int, ...], Depth] = {}
     while bool(result.converged):
-        counts, worst, all_defects = finer_meshes(result, rtol)
+        counts, worst, all_defects = finer_meshes(result, rtol, depths)
         options = [dataclasses.replace(old, segments=count) for old, count in zip(all_options, counts, strict=True)]
         finer = {
             number: _finer(result.rod(number), all_defects[number], new)
@@ -481,9 +480,12 @@ def _refined(
     return eqx.tree_at(lambda result: (result.iterations, result.evaluations), result, counts)
 
 
-def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], float, dict[int, Any]]:
+def finer_meshes(
+    result: HarnessEquilibrium, rtol: float, depths: dict[tuple[int, ...], Depth]
+) -> tuple[list[int], float, dict[int, Any]]:
     """How many elements rods of one structure need, at least as many as they have; the largest estimated error, of
-    several equilibria of those that converged; the defects of each rod.
+    several equilibria of those that converged; the defects of each rod. `depths`: how deep contacts press the rods of
+    each group in, from mesh to mesh.
     """
     counts, worst, all_defects = result.segments, 0.0, {}
     axis = result.energy.ndim
@@ -493,11 +495,16 @@ def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], fl
         converged = np.moveaxis(np.asarray(group.converged), axis, 0)
         error = float(np.max(sizes[converged], initial=0.0))
         worst = max(worst, error)
+        depth = depths.setdefault(numbers, Depth())
+        penetration = depth.lacking(errors, counts[numbers[0]], np.asarray(group.converged))
         for place, number in enumerate(numbers):
-            all_defects[number] = None if errors.defects is None or axis else errors.defects[place]
+            defects = None if errors.defects is None or axis else errors.defects[place]
+            if penetration and defects is not None and errors.depths is not None:
+                defects = SAFETY * error / rtol * normalized(defects) + penetration * normalized(errors.depths[place])
+            all_defects[number] = defects
             # As many as the neediest: each size of mesh would be a larger program.
-            if SAFETY * error > rtol and counts[number] < SIZES["hermite"][-1]:
-                counts[number] = next_size(counts[number], error, rtol, "hermite")
+            if max(SAFETY * error / rtol, penetration) > 1 and counts[number] < SIZES["hermite"][-1]:
+                counts[number] = next_size(counts[number], max(error, penetration * rtol / SAFETY), rtol, "hermite")
     return counts, worst, all_defects
 
 

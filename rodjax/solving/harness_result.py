@@ -15,8 +15,8 @@ from rodjax.solving.status import Status
 
 
 class BodyPose(eqx.Module):
-    """`position` [..., 3] m; `frame` [..., 3, 3], columns the axes of the body; `contact_force` [..., 3] N: what obstacles
-    do to the body where rods end in it.
+    """`position` [..., 3] m; `frame` [..., 3, 3], columns the axes of the body; `contact_force` [..., 3] N, which
+    obstacles exert on the body where rods end in it.
     """
 
     position: Float[Array, "... 3"]

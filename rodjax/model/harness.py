@@ -51,8 +51,10 @@ class Harness(eqx.Module):
     - `joints`: `{name: Body}`, for bodies with loads or supports; others need not be named.
     - `contact`: between rods; only `False` so far.
 
+    A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it.
+
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with an obstacle, a potential field, a sliding clip or a load without a potential.
+    and for a scene with friction, a sliding clip or a load without a potential.
     """
 
     # In the place of a scene.

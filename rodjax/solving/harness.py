@@ -266,6 +266,8 @@ def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[Solv
     if group.s.shape[-1] - 1 != options.segments or jax.tree.structure(group.scene) != jax.tree.structure(scene):
         return None
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), group)
+    if not eqx.tree_equal(*(jax.tree.map(jnp.shape, each.obstacles) for each in (one.scene, scene))):
+        return None
     return (group.state, last_twist(group)) if _fits(scene, one, options) else None
 
 
@@ -304,7 +306,7 @@ def _solve(
             return Search.of(*in_units_of(scene, state), first, option)
 
         searches = jax.vmap(begin)(stacked, states, firsts)
-        body, frame, offset = _ends(harness, numbers)
+        body, frame, offset = ends_of(harness, numbers)
         groups.append(Rods(searches.form, searches.shape, searches.units, body, frame, offset))
         points.append(searches.point)
         all_searches.append((searches, states))
@@ -349,7 +351,7 @@ def _solve(
     )
 
 
-def _ends(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
+def ends_of(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
     """Of some rods the bodies, frames and offsets of both ends; the number of all bodies for none."""
     count, dtype = len(harness.bodies), harness.scenes[0].rod.length.dtype
     found = [joint_ends(harness.scenes[number], harness.joint_names) for number in numbers]
@@ -614,7 +616,7 @@ def body_forces(
     positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
     frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
     for numbers, group in zip(members, rods, strict=True):
-        body, _, offset = _ends(harness, numbers)
+        body, _, offset = ends_of(harness, numbers)
         of_ends = (group.start_force, group.start_moment), (group.end_force, group.end_moment)
         for end, (sign, (force, moment)) in enumerate(zip((1, -1), of_ends, strict=True)):
             arms = jnp.einsum("kij,kj->ki", frames[body[:, end]], offset[:, end])

@@ -49,7 +49,8 @@ def test_coupling_is_that_of_automatic_derivatives(kind):
         # Bodies under which the clamps are where they are.
         of_body = jnp.stack([end.frame @ own.T for end, own in zip(ends, frames, strict=True)])
         places = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
-        rod = RodInBodies(form, units, jnp.ones(2, bool), frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8))
+        poses, joints = (frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
+        rod = RodInBodies(form, units, joints, *poses, joints)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
         point = form.holding(form.moved(search.point, bases, 0.3 * rotation, 3.0 * force))
@@ -110,7 +111,8 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
         form, units = search.form, search.units
         of_body = jnp.stack([end.frame @ own.T for end, own in zip((START, END), frames, strict=True)])
         places = [end.position - turn @ off for end, turn, off in zip((START, END), of_body, offsets, strict=True)]
-        rod = RodInBodies(form, units, jnp.ones(2, bool), frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8))
+        poses, joints = (frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
+        rod = RodInBodies(form, units, joints, *poses, joints)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
         point = form.holding(form.moved(search.point, bases, 0.3 * rotation, 3.0 * force))

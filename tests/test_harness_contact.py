@@ -151,6 +151,20 @@ def test_a_star_with_a_branch_on_a_floor_is_in_balance():
 
 
 @pytest.mark.slow
+def test_a_joint_that_is_held_may_lie_within_an_obstacle():
+    """As an end of a scene may: a connector on a wall."""
+    body = rodjax.Body(support=rodjax.Pin((0.4, 0.0, -0.052)))
+    joint = Joint("cut", ALONG)
+    cables = {
+        "a": Scene(plain(0.5), START, joint, GRAVITY, obstacles=[FLOOR]),
+        "b": Scene(plain(0.5), joint, END, GRAVITY, obstacles=[FLOOR]),
+    }
+    result = rodjax.solve(Harness(cables, {"cut": body}), segments=4)
+    assert result.converged
+    assert jnp.all(result.joints["cut"].contact_force == 0)
+
+
+@pytest.mark.slow
 def test_sensitivities_of_a_harness_are_its_derivatives(lying):
     names = {"of": ["cables.b.end_force", "joints.cut.position", "energy"], "wrt": ["cables.a.rod.EI"]}
     table = rodjax.sensitivities(lying.harness, **names, segments=4, solver=TIGHT, guess=lying)

@@ -51,7 +51,8 @@ class Harness(eqx.Module):
     - `joints`: `{name: Body}`, for bodies with loads or supports; others need not be named.
     - `contact`: between rods; only `False` so far.
 
-    A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it.
+    A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it,
+    unless a support of its own holds it in a direction.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
     and for a scene with friction, a sliding clip or a load without a potential.
@@ -215,6 +216,11 @@ def _motions(support: Support | None) -> _Motions:
     return _Motions(None, None, everything, everything, None, None)
 
 
+def floating(harness: Harness) -> tuple[bool, ...]:
+    """Of each body whether it may move in all directions."""
+    return tuple(_motions(body.support).translations.shape[1] == 3 for body in harness.bodies)
+
+
 def harness_between(harness: Harness, other: Harness, fraction: Float[Array, ""]) -> Harness:
     """A harness on the way from one to another of its structure, as `rodjax.model.scene.between`."""
     mixed = jax.tree.map(lambda a, b: a + fraction * (b - a), harness, other)
@@ -236,6 +242,8 @@ class Bodies(eqx.Module):
 
     `position`, `frame`: of their supports, of free ones zero and the identity; `translations`, `rotations`: columns,
     the directions and axes along which they move, zero beyond these; springs and loads, `None` where no body has one.
+    `floats`: of bodies that may move in all directions, which obstacles push where rods end in them; the places of
+    others are given, as those of ends of a scene are.
     """
 
     position: Float[Array, "j 3"]
@@ -247,6 +255,7 @@ class Bodies(eqx.Module):
     translation: Float[Array, "j 3 3"] | None
     rotation: Float[Array, "j 3 3"] | None
     has_frame: tuple[bool, ...] = eqx.field(static=True)
+    floats: tuple[bool, ...] = eqx.field(static=True)
     columns: tuple[int, ...] = eqx.field(static=True)  # those of `motions` that are there
 
     @staticmethod
@@ -270,6 +279,7 @@ class Bodies(eqx.Module):
             translation=_stacked_if_any([_matrix(motions.translation) for motions in found], np.zeros((3, 3)), dtype),
             rotation=_stacked_if_any([_matrix(motions.rotation) for motions in found], np.zeros((3, 3)), dtype),
             has_frame=tuple(motions.frame is not None for motions in found),
+            floats=floating(harness),
             columns=tuple(columns),
         )
 

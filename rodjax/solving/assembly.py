@@ -186,13 +186,13 @@ class Assembly(eqx.Module):
     def count(self) -> int:
         return len(self.bodies.position)
 
-    def rods(self, group: Rods, poses: Poses) -> RodInBodies:
+    def rods(self, group: Rods, at: Poses) -> RodInBodies:
         """Stacked."""
-        positions, frames = group.under(poses)
+        positions, frames = group.under(at)
         length = jnp.broadcast_to(self.length, group.units.length.shape)
-        return RodInBodies(
-            group.form, group.units, group.body < self.count, group.frame, group.offset, positions, frames, length
-        )
+        is_joint, touches = group.body < self.count, jnp.array([*self.bodies.floats, False])[group.body]
+        poses = group.frame, group.offset, positions, frames
+        return RodInBodies(group.form, group.units, is_joint, *poses, length, touches)
 
     def shares(self, group: Rods) -> Float[Array, "k"]:
         """The unit of energy of each rod, in that of the assembly."""

@@ -27,7 +27,9 @@ ENDS = (0, -1)
 
 
 class RodInBodies(NamedTuple):
-    """One rod, with the poses of the bodies at its ends, `length` the unit of their displacements."""
+    """One rod, with the poses of the bodies at its ends, `length` the unit of their displacements; `touches`: whether
+    obstacles push the body at an end.
+    """
 
     form: Form
     units: Units
@@ -37,6 +39,7 @@ class RodInBodies(NamedTuple):
     position_of_body: Float[Array, "2 3"]
     frame_of_body: Float[Array, "2 3 3"]
     length: Float[Array, ""]
+    touches: Bool[Array, "2"]
 
     def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
         """The form with its ends at the poses of the bodies, moved."""
@@ -100,11 +103,11 @@ class EndContacts(NamedTuple):
 
 
 def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Float[Array, "o 2 3"]]:
-    """Gaps between obstacles and the ends of a rod that are in bodies, else 1, and directions in which they grow."""
+    """Gaps between obstacles and the ends of a rod in bodies that these push, else 1, and the directions of growth."""
     distances, normals = form.distances_and_normals(_places(form))
     radius = form.radius[np.array([0, -1])]
-    is_joint = rod.is_joint[None]
-    return jnp.where(is_joint, distances - radius[None], 1.0), jnp.where(is_joint[..., None], normals, 0.0)
+    touches = rod.touches[None]
+    return jnp.where(touches, distances - radius[None], 1.0), jnp.where(touches[..., None], normals, 0.0)
 
 
 def _places(form: NodalForm) -> Float[Array, "2 3"]:

@@ -13,7 +13,17 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
-from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, end_radii, joint_ends, of_one_rod, rotated
+from rodjax.model.harness import (
+    Bodies,
+    Harness,
+    clamp_at,
+    clamped,
+    end_radii,
+    floating,
+    joint_ends,
+    of_one_rod,
+    rotated,
+)
 from rodjax.model.scene import Scene, nondimensional
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
@@ -423,7 +433,7 @@ def contact_forces(
     """Forces [N] of obstacles on the bodies where rods end in them, and moments about their positions [N m]; the gaps
     there [m], none at ends that are in no body.
     """
-    count = len(harness.bodies)
+    count, floats = len(harness.bodies), floating(harness)
     total, gaps = jnp.zeros((count + 1, 6), poses.positions.dtype), []
     for numbers, of_group in zip(members, split_pressures(harness, members, pressures), strict=True):
         if of_group is None:
@@ -435,7 +445,7 @@ def contact_forces(
             for obstacle, of_ends in zip(scene.obstacles, of_rod, strict=True):
                 of_obstacle = []
                 for body, offset, thick, pressure in zip(bodies, offsets, radius, of_ends, strict=True):
-                    if body < 0:
+                    if body < 0 or not floats[body]:
                         of_obstacle.append(jnp.ones_like(thick))
                         continue
                     arm = poses.frames[body] @ offset

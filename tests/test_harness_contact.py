@@ -111,13 +111,11 @@ def test_derivatives_of_a_cut_rod_on_a_floor_are_those_of_the_rod(lying):
         found = rodjax.solve(cut(plain, end, obstacles=[floor]), segments=4, solver=TIGHT, guess=lying)
         return jnp.concatenate([found["b"].end_force, found["b"].nodes[0]])
 
-    nowhere = jnp.zeros(2)
-    expected, found = jax.jacfwd(of_whole)(nowhere), jax.jacfwd(of_parts)(nowhere)
+    direction = jnp.array([1.0, 0.5])
+    expected, found = (jax.jvp(of, (jnp.zeros(2),), (direction,))[1] for of in (of_whole, of_parts))
     # Contacts of a linearised system are rigid to about 1e-10.
     assert jnp.max(jnp.abs(found - expected)) < 1e-7 * jnp.max(jnp.abs(expected))
-    step = 1e-6
-    ahead, behind = (of_parts(jnp.array([sign * step, 0.0])) for sign in (1, -1))
-    assert jnp.max(jnp.abs((ahead - behind) / (2 * step) - found[:, 0])) < 1e-4 * jnp.max(jnp.abs(found))
+    assert abs(expected[5] - 1.0) < 1e-6  # the middle goes with the floor
 
 
 def star(floor: Plane) -> Harness:

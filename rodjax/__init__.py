@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from rodjax.io.tables import centerline_table, write_table
     from rodjax.paths.batch import solve_batch
     from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+    from rodjax.paths.harness_modes import HarnessMode
     from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
     from rodjax.paths.path import solve_path
     from rodjax.paths.tracing import BranchEnd
@@ -113,6 +114,7 @@ __all__ = [
     "Guess",
     "Harness",
     "HarnessEquilibrium",
+    "HarnessMode",
     "Hinge",
     "Joint",
     "Law",
@@ -217,6 +219,7 @@ _LATER = {
         ("Branch", "CriticalPoint", "critical_point", "critical_points", "follow", "switch_branch"),
         "paths.continuation",
     ),
+    "HarnessMode": "paths.harness_modes",
     **dict.fromkeys(("Mode", "lowest_mode", "squared_frequencies"), "paths.modes"),
     "solve_path": "paths.path",
     "BranchEnd": "paths.tracing",

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from rodjax import Clamp, Clip, Cylinder, Free, PointForce, Potential, Rod, Scene, frame
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import NodalChange
+from rodjax.linalg.chain import ChainSystem
 from rodjax.solving.assembly import RodStep
 from rodjax.solving.coupling import RodInBodies, linearized_with_ends
 from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of
@@ -121,12 +123,15 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
         point = form.holding(dataclasses.replace(point, nodal=nodal))
         here, coupling = linearized_with_ends(rod, form, point)
         expected = form.linearized(point)
+        assert isinstance(here.system, ChainSystem)
+        assert coupling.of_gaps is not None
 
         def there(rotation, moved, forces, motions):
             change = NodalChange(moved, jnp.zeros_like(pressures))
             step = RodStep(point, here.bases, rotation, form.layout.forces(forces), change)
             value, _, there = step.value(rod, motions.reshape(2, 6), jnp.ones(()))
             near = rod.moved(motions.reshape(2, 6))
+            assert isinstance(near, NodalForm)
             gaps = jnp.concatenate([near.gaps_and_normals(there.nodal.places)[0], near.within_elements(there)[1]])
             return value - jnp.sum(pressures * gaps), gaps
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rodjax
-from rodjax import Clamp, Cylinder, Harness, Joint, Newton, Plane, Potential, Rod, Scene
+from rodjax import Clamp, Harness, Joint, Newton, Plane, Potential, Rod, Scene
 
 GRAVITY = (0.0, 0.0, -9.81)
 ALONG = rodjax.frame((1, 0, 0))
@@ -15,7 +15,6 @@ START, END = Clamp((0, 0, 0), ALONG), Clamp((0.85, 0.02, 0), ALONG)
 # A body whose axes are not those of the rod, beside it.
 ASIDE = {"frame": rodjax.frame((0, 1, 0), (0, 0, 1)), "offset": (0.1, 0, 0.02)}
 FLOOR = Plane((0, 0, -0.05), (0, 0, 1))
-PIPE = Cylinder((0.45, -1, -0.08), (0.45, 1, -0.08), 0.06)
 TIGHT = Newton(tolerance=1e-11)
 
 
@@ -76,10 +75,9 @@ def test_a_cut_rod_on_a_floor_is_the_rod(lying):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rod", "obstacle"), [(bent, FLOOR), (plain, PIPE)])
-def test_a_cut_rod_beside_obstacles_is_the_rod(rod, obstacle):
-    whole = rodjax.solve(Scene(rod(1.0), START, END, GRAVITY, obstacles=[obstacle]), segments=16, solver=TIGHT)
-    parts = rodjax.solve(cut(rod, obstacles=[obstacle]), segments=8, solver=TIGHT)
+def test_a_cut_rod_by_frames_on_a_floor_is_the_rod():
+    whole = rodjax.solve(Scene(bent(1.0), START, END, GRAVITY, obstacles=[FLOOR]), segments=8, solver=TIGHT)
+    parts = rodjax.solve(cut(bent, obstacles=[FLOOR]), segments=4, solver=TIGHT)
     assert jnp.sum(whole.contact_forces[:, 2]) > 0.01
     assert_same(parts, whole)
 

@@ -1,10 +1,12 @@
-"""A harness: a trunk that branches three times to five connectors, under its weight and held by clips; and its cost.
+"""A harness: a trunk that branches three times to five connectors, under its weight, held by clips, on a tray and over
+the edge of a bracket; and its cost.
 
     python experiments/harness.py --out DIR [--repeats N]
 
-Draws all cables, prints one row for each, and times stars of cables of 32 elements against one such cable, in turn:
-processor time of the first answer with all compiling, and the time of a solve from the last equilibrium as the ends of
-the cables move to and fro by 1 mm. Writes `harness.png` and `harness.csv`.
+Draws all cables, prints one row for each with what obstacles do to it, writes a report, and times stars of cables of 32
+elements against one such cable, in turn: processor time of the first answer with all compiling, and the time of a solve
+from the last equilibrium as the ends of the cables move to and fro by 1 mm. Writes `harness.png`, `harness.csv` and the
+report as a page and a picture.
 """
 
 import argparse
@@ -25,6 +27,11 @@ from rodjax.programs import kept
 
 GRAVITY = (0.0, 0.0, -9.81)
 ALONG = rj.frame((1, 0, 0))
+# A tray below all cables, and the rounded edge of a bracket below three of the branches.
+TRAY = rj.Plane((0.0, 0.0, -0.06), (0.0, 0.0, 1.0))
+EDGE = rj.Capsule((0.3, 0.12, -0.02), (1.2, 0.12, -0.02), 0.01)
+# What the report checks.
+LIMITS = rj.Limits(bend_radius=3.0, end_force=5.0)
 # Of the cables of the star.
 ELEMENTS = 32
 
@@ -46,22 +53,21 @@ def cable(length: float, radius: float) -> rj.Rod:
 
 def branching() -> rj.Harness:
     """Fan-outs of 10 g, whose branches leave at 30 degrees to both sides."""
+    around = {"gravity": GRAVITY, "obstacles": [TRAY, EDGE]}
 
     def leaving(side: float) -> Any:
         return rj.frame((np.cos(np.pi / 6), side * np.sin(np.pi / 6), 0.0), (0, 0, 1))
 
     def branch(joint: str, side: float, length: float, position: Sequence[float], tangent: Sequence[float]) -> rj.Scene:
         end = rj.Clamp(position, rj.frame(tangent, (0, 0, 1)))
-        return rj.Scene(cable(length, 3e-3), rj.Joint(joint, leaving(side)), end, gravity=GRAVITY)
+        return rj.Scene(cable(length, 3e-3), rj.Joint(joint, leaving(side)), end, **around)
 
     trunk_clips = [rj.Clip(0.15, (0.15, 0.0, -0.005), (1, 0, 0)), rj.Clip(0.3, (0.29, 0.0, -0.01), (1, 0, 0))]
     straight = [rj.Joint(name, ALONG) for name in ("first", "second", "third")]
     cables = {
-        "trunk": rj.Scene(
-            cable(0.42, 8e-3), rj.Clamp((0, 0, 0), ALONG), straight[0], gravity=GRAVITY, clips=trunk_clips
-        ),
-        "middle": rj.Scene(cable(0.25, 6e-3), straight[0], straight[1], gravity=GRAVITY),
-        "tail": rj.Scene(cable(0.25, 5e-3), straight[1], straight[2], gravity=GRAVITY),
+        "trunk": rj.Scene(cable(0.42, 8e-3), rj.Clamp((0, 0, 0), ALONG), straight[0], clips=trunk_clips, **around),
+        "middle": rj.Scene(cable(0.25, 6e-3), straight[0], straight[1], **around),
+        "tail": rj.Scene(cable(0.25, 5e-3), straight[1], straight[2], **around),
         "A": branch("first", 1, 0.3, (0.6, 0.2, 0.02), (0.3, 1, 0)),
         "B": branch("first", -1, 0.34, (0.62, -0.22, -0.02), (0.5, -1, 0)),
         "C": branch("second", 1, 0.3, (0.86, 0.2, 0.05), (0.2, 1, 0.3)),
@@ -138,8 +144,12 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
         bend = 1 / float(np.max(rod.curvature))
         print(
             f"{name:7} {rod.s.shape[-1] - 1:4} elements, {force:.3f} N, {moment:.4f} N m at its end, bend {bend:.3f} m"
+            f", {np.linalg.norm(np.sum(rod.contact_forces, axis=0)):.3f} N of obstacles"
         )
+    for name, body in result.joints.items():
+        print(f"{name:7} {np.linalg.norm(body.contact_force):.3f} N of obstacles")
     plot_harness(result).savefig(arguments.out / "harness.png", dpi=150)
+    rj.report(result, limits=LIMITS, title="A harness on a tray").save(arguments.out)
     save_rows(rows, arguments.out / "harness.csv")
     return result, rows
 

@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from rodjax.io.tables import centerline_table, write_table
     from rodjax.paths.batch import solve_batch
     from rodjax.paths.continuation import Branch, CriticalPoint, critical_point, critical_points, follow, switch_branch
+    from rodjax.paths.harness_modes import HarnessMode
     from rodjax.paths.modes import Mode, lowest_mode, squared_frequencies
     from rodjax.paths.path import solve_path
     from rodjax.paths.tracing import BranchEnd
@@ -115,6 +116,7 @@ __all__ = [
     "Guess",
     "Harness",
     "HarnessEquilibrium",
+    "HarnessMode",
     "Hinge",
     "Joint",
     "Law",
@@ -220,6 +222,7 @@ _LATER = {
         ("Branch", "CriticalPoint", "critical_point", "critical_points", "follow", "switch_branch"),
         "paths.continuation",
     ),
+    "HarnessMode": "paths.harness_modes",
     **dict.fromkeys(("Mode", "lowest_mode", "squared_frequencies"), "paths.modes"),
     "solve_path": "paths.path",
     "BranchEnd": "paths.tracing",

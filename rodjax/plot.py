@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable, Sequence
 from typing import Literal, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ from rodjax.analysis.reactions import reactions
 from rodjax.analysis.samples import framed_at
 from rodjax.checks import instance, leaf, positive
 from rodjax.model.along import Along, Value, value_at
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.surfaces import Faces, collar, quads, surfaces
 from rodjax.programs.compilation import compiled
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -104,7 +106,8 @@ def picture_html(equilibrium: Equilibrium) -> str:
 
 
 def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", radius: float | None = None) -> Figure:
-    """All rods of one equilibrium of a harness in one picture, with one scale of length and colour, and their names.
+    """All rods of one equilibrium of a harness in one picture, with one scale of length and colour, and their names;
+    obstacles near the first rod that has them.
 
     `color_by` as for `plot_rod`; `radius` [m]: of the thickest. Raises `ValueError` or `TypeError` for arguments that
     make no sense.
@@ -122,9 +125,12 @@ def plot_harness(result: HarnessEquilibrium, *, color_by: Field = "curvature", r
     by_size = [rods[first], *rods]
     thick, note = thickness(by_size, None if radius is None else float(positive(radius, "radius")))
     norm = Normalize(*_limits(np.concatenate([getattr(rod, color_by) for rod in rods])))
-    points = []
+    points, drawn = [], []
     for (name, rod), own in zip(result.items(), true, strict=True):
-        points.append(_draw_tube(axes, rod, thick * own / true[first] if own else thick, color_by, norm))
+        radius = thick * own / true[first] if own else thick
+        new = [obstacle for obstacle in rod.scene.obstacles if not any(eqx.tree_equal(obstacle, one) for one in drawn)]
+        drawn += new
+        points.append(_draw_tube(axes, rod, radius, color_by, norm, _surroundings(rod, radius, tuple(new))))
         middle = np.asarray(rod.nodes)[len(rod.s) // 2]
         x, y, z = map(float, middle)
         axes.text(x, y, z, name, fontsize=8, path_effects=[HALO], zorder=10)
@@ -226,17 +232,20 @@ def _framed(
     return framed_at(equilibrium, s)
 
 
-def _surroundings(equilibrium: Equilibrium, radius: float) -> list[tuple[Faces, tuple[float, ...]]]:
-    """Faces of a collar for each clip of a rod that is drawn this thick, and of the obstacles near it, with their
-    colors.
+def _surroundings(
+    equilibrium: Equilibrium, radius: float, obstacles: Sequence[Obstacle] | None = None
+) -> list[tuple[Faces, tuple[float, ...]]]:
+    """Faces of a collar for each clip of a rod that is drawn this thick, and of the obstacles near it, all of the scene
+    for `None`, with their colors.
     """
     scene = equilibrium.scene
+    obstacles = scene.obstacles if obstacles is None else obstacles
     clips = reactions(equilibrium)[1:-1] if scene.clips else []
     drawn = [(collar(clip.position, clip.axes[0], radius), to_rgba(CLIP_COLOR)) for clip in clips]
-    if scene.obstacles:
+    if obstacles:
         nodes = np.asarray(equilibrium.nodes)
         # The room that the tube takes, so that a patch of a floor lies below all of it.
-        seen = surfaces(scene.obstacles, np.concatenate([nodes - radius, nodes + radius]))
+        seen = surfaces(obstacles, np.concatenate([nodes - radius, nodes + radius]))
         drawn += [(faces, to_rgba(PALETTE[k % len(PALETTE)], OPACITY)) for k, faces in enumerate(seen)]
     return drawn
 

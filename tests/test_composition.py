@@ -161,6 +161,68 @@ def solved(names: dict[str, str]) -> rj.Equilibrium:
     return result
 
 
+# What the rods of harnesses do not have yet, each in one line: loads without a potential, and sliding clips.
+NOT_IN_HARNESSES = {
+    "must have no load without a potential": [
+        "follower force along",
+        "couple along",
+        "point couple",
+        "follower point force",
+        "end moment",
+        "follower end force",
+    ],
+    "must not slide": ["sliding", "sliding tangent"],
+}
+
+
+def harness_of(names: dict[str, str]) -> rj.Harness:
+    """A rod with these features, joined to a plain one that goes on from one of its ends."""
+    scene = scene_of(names)
+    assert scene is not None
+    joint = rj.Joint("j", rj.frame(X))
+    on = Scene(rod(), joint, Clamp((1.6, 0.0, 0.0), rj.frame(X)), scene.gravity)
+    if isinstance(scene.end, Free) and not isinstance(scene.start, Free):
+        on = Scene(rod(), Clamp((-0.8, 0.0, 0.0), rj.frame(X)), joint, scene.gravity)
+        return rj.Harness({"rod": eqx.tree_at(lambda scene: scene.start, scene, joint), "on": on})
+    return rj.Harness({"rod": eqx.tree_at(lambda scene: scene.end, scene, joint), "on": on})
+
+
+OF_HARNESSES = [
+    {kind: name} for kind, names in FEATURES.items() if kind not in ("planar", "ends") for name in list(names)[1:]
+] + [{"ends": name} for name in FEATURES["ends"]]
+
+
+def test_what_harnesses_refuse_is_listed():
+    found = {}
+    for names in OF_HARNESSES:
+        try:
+            harness_of(names)
+        except ValueError as error:
+            found[next(iter(names.values()))] = str(error)
+    expected = {name: message for message, names in NOT_IN_HARNESSES.items() for name in names}
+    assert found.keys() == expected.keys()
+    for name, message in expected.items():
+        assert message in found[name]
+        assert "\n" not in found[name]
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("names", OF_HARNESSES, ids=lambda names: ", ".join(names.values()))
+def test_every_feature_solves_in_a_harness(names):
+    if any(name in refused for refused in NOT_IN_HARNESSES.values() for name in names.values()):
+        pytest.skip("refused")
+    result = rj.solve(harness_of(names), segments=SEGMENTS)
+    assert result.converged, rj.describe(result)
+    at_joint = [
+        (rod.end_force, 1.0) if np.allclose(rod.nodes[-1], result.joints["j"].position) else (rod.start_force, -1.0)
+        for rod in result.values()
+    ]
+    force = sum(-sign * force for force, sign in at_joint) + result.joints["j"].contact_force
+    # The residual of 1e-8 EI/L^2, of forces of about 100.
+    np.testing.assert_allclose(force, 0.0, rtol=0, atol=1e-6)
+
+
 # Each feature that solves at least once, several at a time.
 TOGETHER = [
     {"rod": "varying", "ends": "clamp and swivel", "load": "point force", "clip": "tangent"},

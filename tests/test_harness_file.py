@@ -2,13 +2,29 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import BRANCHES, ROD
 
 import rodjax
-from rodjax import Clamp, Hinge, Joint, Scene, SceneFileError, Slider, Spring, cli
+from rodjax import (
+    Body,
+    Clamp,
+    Clip,
+    Harness,
+    Hinge,
+    Joint,
+    Plane,
+    Rod,
+    Scene,
+    SceneFileError,
+    Slider,
+    Spring,
+    cli,
+)
+from rodjax.io.harness_file import read_harness_file
 
 ONE = f"""
 rod = {ROD}
@@ -39,6 +55,35 @@ def test_a_file_of_cables_is_a_harness(written):
     assert jnp.allclose(end.offset, jnp.array([-0.005, 0, 0]))
     assert jnp.allclose(end.frame[:, 2], jnp.array([1.0, 0, 0]))
     assert [scene.gravity is not None and float(scene.gravity[2]) for scene in harness.scenes] == [-9.81] * 3
+
+
+def test_obstacles_of_a_file_are_those_of_all_cables_without_their_own(written):
+    floor = '[[obstacles]]\nkind = "plane"\npoint = "[0, 0, -20] cm"\nnormal = [0, 0, 1]\n'
+    own = '[[cables.left.obstacles]]\nkind = "sphere"\ncenter = "[0, 0, -1] m"\nradius = "10 cm"\n'
+    harness = rodjax.read_scene(written(BRANCHES + floor + own))
+    assert isinstance(harness, rodjax.Harness)
+    kinds = {name: [type(one).__name__ for one in harness[name].obstacles] for name in harness}
+    assert kinds == {"trunk": ["Plane"], "left": ["Sphere"], "right": ["Plane"]}
+
+
+def test_a_harness_is_written_and_read_to_the_last_bit(tmp_path):
+    rod = Rod.circular(0.5, 0.005, 1e7, poisson_ratio=0.5, density=1200.0)
+    joint, along = Joint('a "b"', rodjax.frame((1, 0, 0)), (0.01, 0, 1 / 3)), rodjax.frame((1, 0, 0))
+    supports = [Hinge((0, 0, 0), along, (0, 1, 0)), Slider((0, 0, 0), [(1, 0, 0), (0, 1, 0)])]
+    for support in (*supports, Spring(Clamp((0.95, 0, 0), along), 50.0, 1 / 3), None):
+        cables = {
+            "the trunk": Scene(
+                rod, Clamp((0, 0, 0), along), joint, (0, 0, -9.81), obstacles=[Plane((0, 0, -1), (0, 0, 1))]
+            ),
+            "x.y": Scene(rod, joint, Joint("far"), (0, 0, -9.81), clips=[Clip(0.2, (0.3, 0, 0))]),
+        }
+        harness = Harness(cables, {'a "b"': Body((1 / 3, 0, 0), None, 0.1), "far": Body(support=support)})
+        rodjax.write_scene(harness, tmp_path / "harness.toml", segments=7)
+        file = read_harness_file(tmp_path / "harness.toml")
+        assert file.segments == 7
+        assert jax.tree.structure(file.harness) == jax.tree.structure(harness)
+        for one, other in zip(jax.tree.leaves(file.harness), jax.tree.leaves(harness), strict=True):
+            assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
 
 
 @pytest.mark.parametrize(
@@ -77,7 +122,7 @@ def test_a_file_has_ends_that_move(written, end, kind):
         ("[joints.y]", "[joints.z]", "joints['z'] has no rod: the ends of the cables name 'y'"),
         ('force = "[0, 0, -0.1] N"', 'mass = "-1 g"', "joints.y.mass must not be negative"),
         ("tangent = [1, 1, 0], d2 = [0, 0, 1]", "tangent = [1, 1, 0]", "cables.left.start.d2 or start.frame is needed"),
-        ("[loads]", "[load]", "load is not allowed here; allowed are cables, joints, loads, solve"),
+        ("[loads]", "[load]", "load is not allowed here; allowed are cables, joints, loads, obstacles, solve"),
     ],
 )
 def test_mistakes_in_a_file_are_told_in_one_line(written, old, new, message):

@@ -108,10 +108,20 @@ def test_files_of_harnesses_have_a_format_of_their_own(single, tmp_path):
     with h5py.File(tmp_path / "strip.vtkhdf", "r") as file:
         assert file["rodjax"].attrs["format"] == FORMAT == 13
     with h5py.File(tmp_path / "harness.vtkhdf", "r+") as file:
-        assert file["rodjax"].attrs["format"] == HARNESS_FORMAT == 14
-        file["rodjax"].attrs["format"] = 15
-    with pytest.raises(ValueError, match=r"has format 15, written by .* reads formats up to 14: update it"):
+        assert file["rodjax"].attrs["format"] == HARNESS_FORMAT == 15
+        file["rodjax"].attrs["format"] = 16
+    with pytest.raises(ValueError, match=r"has format 16, written by .* reads formats up to 15: update it"):
         load(tmp_path / "harness.vtkhdf")
+
+
+def test_files_without_contacts_are_read(path, tmp_path):
+    """Of format 14, before rods of harnesses touched anything."""
+    save(path, tmp_path / "harness.vtkhdf")
+    with h5py.File(tmp_path / "harness.vtkhdf", "r+") as file:
+        file["rodjax"].attrs["format"] = 14
+        for name in ("contact_forces", "end_pressures"):
+            del file["rodjax"][name]
+    assert_same(load(tmp_path / "harness.vtkhdf"), path)
 
 
 def test_damage_is_told(single, tmp_path):

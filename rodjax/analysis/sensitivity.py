@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -41,11 +41,13 @@ FIELDS = (
     "clip_forces",
     "clip_moments",
 )
+# Of a joint of a harness.
+JOINT_FIELDS = ("position", "frame", "contact_force")
 
 
 @one_answer
 def sensitivities(
-    scene: Scene, *, of: Sequence[str], wrt: Sequence[str], **options: Any
+    scene: Scene | Harness, *, of: Sequence[str], wrt: Sequence[str], **options: Any
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
     """The derivatives of an equilibrium by numbers of its scene: `{of: {wrt: array}}`.
 
@@ -55,26 +57,32 @@ def sensitivities(
 
     **Arguments:**
 
-    - `scene`: `Scene`.
-    - `of`: names of fields of `Equilibrium` that are real numbers, such as `"nodes"` or `"end_force"`.
+    - `scene`: `Scene` or `Harness`.
+    - `of`: names of fields of `Equilibrium` that are real numbers, such as `"nodes"` or `"end_force"`; of a harness
+        those of a cable, `"cables.NAME.end_force"`, of a joint, `"joints.NAME.position"`, `"joints.NAME.frame"` or
+        `"joints.NAME.contact_force"`, or `"energy"`.
     - `wrt`: dotted names of numbers of the scene: `"rod.EI"`, `"end.position"`, `"point_forces.0.force"`,
         `"clips.0.at"`, `"gravity"`. A frame changes by a rotation vector [rad] about global axes, as in
         `rodjax.rotate`; of the tangent of a `Swivel` or `Clip` only changes across it matter. What is absent from a
-        scene, such as a gravity of `None`, has no derivative.
+        scene, such as a gravity of `None`, has no derivative. Of a harness `"cables.NAME.rod.EI"`, of the scene of a
+        cable, and `"joints.NAME.mass"`, of a `Body`.
     - `options`: of `rodjax.solve`. They choose the mesh, on which the derivatives are exact.
 
     Each array has the shape of the field followed by that of the number, (3,) for a frame, in SI units of the one over
     those of the other. Where the solve did not converge, or at a critical equilibrium, they are NaN. Raises
     `ValueError` or `TypeError` for names that are not among these, or options that `rodjax.solve` refuses.
     """
+    instance(scene, "scene", (Scene, Harness))
     if isinstance(scene, Harness):
-        raise ValueError("sensitivities is for a Scene; of a Harness jax.jacfwd of rodjax.solve gives any derivative")
-    instance(scene, "scene", Scene)
-    of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
-    if "shear_strain" in of and scene.rod.GA is None:
-        raise ValueError("of must not have 'shear_strain' of a rod without GA: its sections do not shear")
-    wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
-    found = _derivatives(scene, solve(scene, **options), of, wrt)
+        of = _checked_names("of", of, _fields_of(scene), "real fields of this harness")
+        wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this harness")
+        found = _derivatives_of(scene, solve(scene, **options), of, wrt)
+    else:
+        of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
+        if "shear_strain" in of and scene.rod.GA is None:
+            raise ValueError("of must not have 'shear_strain' of a rod without GA: its sections do not shear")
+        wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
+        found = _derivatives(scene, solve(scene, **options), of, wrt)
     return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names
 
 
@@ -136,7 +144,10 @@ def _stiffness(scene: Scene, result: Equilibrium, near: Callable[[Scene], Equili
     return jnp.block([force, moment])
 
 
-def moved(scene: Scene, changes: dict[str, Float[Array, "..."]]) -> Scene:
+_T = TypeVar("_T", Scene, Harness)
+
+
+def moved(scene: _T, changes: dict[str, Float[Array, "..."]]) -> _T:
     """The scene with changes added to the numbers of these names; frames are turned by rotation vectors (3,) [rad]."""
     numbers = named_numbers(scene)
     changed = [
@@ -153,27 +164,62 @@ def _derivatives(
     return _by_numbers(scene, result, lambda near: differentiable(near, result), of, wrt)
 
 
+@functools.partial(compiled, static_argnames=("of", "wrt"))
+def _derivatives_of(
+    harness: Harness, result: HarnessEquilibrium, of: tuple[str, ...], wrt: tuple[str, ...]
+) -> dict[str, dict[str, Float[Array, "..."]]]:
+    return _by_numbers(harness, result, lambda near: differentiable_harness(near, result), of, wrt)
+
+
+def _fields_of(harness: Harness) -> tuple[str, ...]:
+    """The names of real numbers of its equilibrium."""
+    of_rods = [
+        f"cables.{name}.{field}"
+        for name in harness
+        for field in FIELDS
+        if field != "shear_strain" or harness[name].rod.GA is not None
+    ]
+    of_joints = [f"joints.{name}.{field}" for name in harness.joint_names for field in JOINT_FIELDS]
+    return (*of_rods, *of_joints, "energy")
+
+
+def _field(result: Equilibrium | HarnessEquilibrium, name: str) -> Float[Array, "..."]:
+    if isinstance(result, Equilibrium) or name == "energy":
+        return getattr(result, name)
+    kind, rest = name.split(".", 1)
+    owner, field = rest.rsplit(".", 1)
+    return getattr(result[owner] if kind == "cables" else result.joints[owner], field)
+
+
 def _by_numbers(
-    scene: Scene,
-    result: Equilibrium,
-    near: Callable[[Scene], Equilibrium],
+    scene: _T,
+    result: Equilibrium | HarnessEquilibrium,
+    near: Callable[[_T], Equilibrium | HarnessEquilibrium],
     of: tuple[str, ...],
     wrt: tuple[str, ...],
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
     def fields(changes: dict[str, Float[Array, "..."]]) -> dict[str, Float[Array, "..."]]:
         found = near(moved(scene, changes))
-        return {name: getattr(found, name) for name in of}
+        return {name: _field(found, name) for name in of}
 
     numbers = named_numbers(scene)
     nowhere = {name: jnp.zeros_like(numbers[name][0] if _is_frame(name) else numbers[name]) for name in wrt}
-    outputs = sum(getattr(result, name).size for name in of)
+    outputs = sum(_field(result, name).size for name in of)
     inputs = sum(change.size for change in nowhere.values())
     return (jax.jacfwd if inputs <= outputs else jax.jacrev)(fields)(nowhere)
 
 
-def named_numbers(scene: Scene) -> dict[str, Float[Array, "..."]]:
+def named_numbers(scene: Scene | Harness) -> dict[str, Float[Array, "..."]]:
     """The numbers of a scene by their dotted names; turns are whole and have no derivative."""
-    leaves, _ = jax.tree.flatten_with_path(scene)
+    if isinstance(scene, Harness):
+        parts = {f"cables.{name}": one for name, one in zip(scene.names, scene.scenes, strict=True)}
+        parts |= {f"joints.{name}": one for name, one in zip(scene.joint_names, scene.bodies, strict=True)}
+        return {f"{where}.{name}": leaf for where, part in parts.items() for name, leaf in _named(part).items()}
+    return _named(scene)
+
+
+def _named(part: eqx.Module) -> dict[str, Float[Array, "..."]]:
+    leaves, _ = jax.tree.flatten_with_path(part)
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     return {name: leaf for name, leaf in named.items() if name != "turns"}
 

@@ -27,6 +27,7 @@ import dataclasses
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +48,7 @@ from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.obstacles import InUnits, Obstacle, least
-from rodjax.model.supports import Held
+from rodjax.model.supports import Clamp, Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
@@ -107,8 +108,14 @@ class Contacts(NamedTuple):
 
 class NodalForm(Form):
     """A nondimensional scene; the `end_force` of its points is (3, n): that through each element, and their `nodal` is
-    there.
+    there. `ends_move`: of a linearisation in which clamped ends have no given place (`released`).
     """
+
+    ends_move: bool = eqx.field(kw_only=True, static=True, default=False)
+
+    def released(self, point: Any) -> Linearization:
+        """The ends that clamps hold may turn and move; `residual` without these."""
+        return dataclasses.replace(self, ends_move=True).linearized(point)
 
     @abstractmethod
     def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
@@ -123,6 +130,10 @@ class NodalForm(Form):
         """What stretch and forces add to L under other forces, and the ways of the elements; `elements`: as of
         `turning_elements`.
         """
+
+    @abstractmethod
+    def in_cells_at(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        """What the cells add to L, all of it, and their ways."""
 
     @abstractmethod
     def turning_elements(self, point: Any, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]) -> Any:
@@ -311,8 +322,20 @@ class NodalForm(Form):
 
     @property
     def is_held(self) -> Bool[Array, "n+1"]:
+        """Whether the place of a node is given."""
+        return self.is_at_support & ~self._is_at_joint if self.ends_move else self.is_at_support
+
+    @property
+    def is_at_support(self) -> Bool[Array, "n+1"]:
         _, nodes = self.held_places
         return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
+
+    @property
+    def _is_at_joint(self) -> Bool[np.ndarray, "n+1"]:
+        """At ends that clamps hold, whose poses bodies of a harness may have."""
+        is_at_joint = np.zeros(len(self.field.s), bool)
+        is_at_joint[[0, -1]] = [isinstance(end, Clamp) for end in (self.scene.start, self.scene.end)]
+        return is_at_joint
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
@@ -345,12 +368,16 @@ class NodalForm(Form):
         found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
         return jnp.stack([distance for distance, _ in found]), jnp.stack([normals for _, normals in found])
 
+    def curvatures(self, places: Float[Array, "p 3"]) -> Float[Array, "k p 3 3"]:
+        """The second derivatives of the distances from the obstacles."""
+        return jnp.stack([jax.vmap(jax.hessian(obstacle.at))(places) for obstacle in self.scene.obstacles])
+
     def gaps_and_normals(self, places: Float[Array, "n+1 3"]) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
         if not self.scene.obstacles:
             return jnp.zeros((0, len(places)), places.dtype), jnp.zeros((0, *places.shape), places.dtype)
         distances, normals = self.distances_and_normals(places)
-        return jnp.where(self.is_held[None], 1.0, distances - self.radius[None]), normals
+        return jnp.where(self.is_at_support[None], 1.0, distances - self.radius[None]), normals
 
     @property
     def smooth(self) -> tuple[int, ...]:
@@ -393,7 +420,7 @@ class NodalForm(Form):
     def contacts(self, point: Any) -> Contacts:
         nodal = point.nodal
         gaps, normals = self.gaps_and_normals(nodal.places)
-        is_free = jnp.where(self.is_held, 0.0, 1.0).astype(normals.dtype)[:, None]
+        is_free = jnp.where(self.is_at_support, 0.0, 1.0).astype(normals.dtype)[:, None]
         normals *= is_free[None]
         curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures[: len(gaps)])
         inner, inner_rows, across = None, None, self._across(normals) if nodal.friction is not None else None
@@ -475,11 +502,12 @@ class NodalForm(Form):
         return total
 
     def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
-        """The closure of contacts and nodes, and what is out of balance there."""
+        """The closure of contacts and nodes, and the most that is out of balance there."""
         nodal, gaps = point.nodal, contacts.gaps
         pressures, forces = nodal.pressures, nodal.contact_forces
         balance = self.applied(point).T - contacts.rows.pushed(forces)
         balance = jnp.where(self.is_held[:, None], 0.0, balance)
+        off_balance = jnp.where(self.is_at_support[:, None], 0.0, balance) if self.ends_move else balance
         # Of a gap and a pressure one is zero, none is negative.
         weighted = GAP_WEIGHT * gaps
         amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
@@ -492,7 +520,15 @@ class NodalForm(Form):
             amiss = jnp.where(off > amiss, off, amiss)
             gaps = jnp.concatenate([gaps, jnp.swapaxes(slips, 1, 2).reshape(-1, gaps.shape[1])])
         rows = -jnp.where(contacts.rows.is_closed, gaps, forces)
-        return rows.reshape(-1), balance, amiss
+        return rows.reshape(-1), balance, larger(jnp.max(jnp.abs(off_balance)), amiss)
+
+    def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        """Without contacts."""
+        energy, ways = self.in_cells_at(point)
+        energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0))
+        if self.scene.potentials:
+            energy += jnp.sum(potentials.node_energies(self.scene, self.field.s, *self._node_lines(point)))
+        return energy, self.gap_of_elements(point, ways).reshape(-1)
 
     def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """What the elements lack of the ways between their nodes."""
@@ -582,7 +618,15 @@ class NodalForm(Form):
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         softness, model = here.system.contacts.softness, self.model(point, here.gaps, here.ways)
-        return here.energy + softness * model.energy(model.pressures - model.gaps / softness) / 2
+        return here.energy + model.energy(model.pressures - model.gaps / softness, softness)
+
+    def contact_energy(self, there: Any, point: Any) -> Float[Array, ""]:
+        """That of `objective`, on the way of a step from a point."""
+        gaps, _ = self.gaps_and_normals(there.nodal.places)
+        if self.smooth:
+            gaps = jnp.concatenate([gaps, self.within_elements(there)[1]])
+        softness, model = self.softness, self.model(point, gaps, None)
+        return model.energy(model.pressures - model.gaps / softness, softness)
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -595,18 +639,13 @@ class NodalForm(Form):
         assert isinstance(system, ChainSystem)
         assert here.gaps is not None
         nodal = point.nodal
-        first, _, balance, gaps = system.parted(-here.closure)
-        forces = nodal.contact_forces
-        balance -= system.contacts.pushed(forces)  # which the model has
-        moments = -system.contacts.turned(forces, here.gradient)
-        c = jnp.concatenate([part.reshape(-1) for part in (first, jnp.zeros_like(forces), balance, gaps)])
         if not self.scene.obstacles:
             return super().sought(here, point, system, push)
+        moments, c = self.without_contacts(here, nodal.contact_forces)
         contacts = self.model(point, here.gaps, here.ways)
-        # What lies on an obstacle without pressure is more likely to press on it than to leave it.
         is_closed = system.contacts.is_closed
         if nodal.friction is None:
-            is_closed |= contacts.gaps < LIES_ON
+            is_closed = self.first_closed(is_closed, contacts)
         else:
             k = len(here.gaps)
             # What slips, and by how much, is a matter of the model.
@@ -616,6 +655,22 @@ class NodalForm(Form):
         system = system.closed_where(is_closed)
         found = minimized(system, push + moments, c, contacts)
         return found.is_minimum, found.x, found.y
+
+    def first_closed(self, is_closed: Bool[Array, "k n+1"], contacts: Unilateral) -> Bool[Array, "k n+1"]:
+        """What lies on an obstacle without pressure is more likely to press on it than to leave it."""
+        return is_closed | (contacts.gaps < LIES_ON)
+
+    def without_contacts(
+        self, here: Linearization, forces: Float[Array, "r n+1"]
+    ) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        """What is out of balance without the forces of contacts, as right sides."""
+        system = here.system
+        assert isinstance(system, ChainSystem)
+        first, _, balance, gaps = system.parted(-here.closure)
+        balance -= system.contacts.pushed(forces)
+        moments = -system.contacts.turned(forces, here.gradient)
+        parts = (first, jnp.zeros_like(forces), balance, gaps)
+        return moments, jnp.concatenate([part.reshape(-1) for part in parts])
 
     def under_force(
         self,
@@ -739,6 +794,11 @@ class NodalForm(Form):
         if not self.scene.obstacles:
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
+
+
+def larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+    """With the derivative of one of them."""
+    return jnp.where(a > b, a, b)
 
 
 def pressure_rows(obstacles: tuple[Obstacle, ...]) -> int:

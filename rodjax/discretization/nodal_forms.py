@@ -13,19 +13,19 @@ from rodjax.discretization import nonconservative
 from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
 from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
-from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm, FramePoint, Kinematics
+from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm, FramePoint, HeldFrame, Kinematics
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import NodalForm, larger
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import product, short_sum
 from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, with_pins
 from rodjax.model.supports import Free, Held
 
 
@@ -47,13 +47,23 @@ class NodalTangents(NodalForm, MixedForm):
     def node_slopes(self, point: MixedPoint) -> Float[Array, "n+1 3"]:
         return self.slopes(point)[:, ::2].T
 
+    @property
+    def _held_by(self) -> Scene:
+        """Whose supports hold tangents."""
+        return with_pins(self.scene) if self.ends_move else self.scene
+
+    def bases_at(self, point: MixedPoint) -> Float[Array, "3 b m"]:
+        holding = self._held_by
+        return self.field.basis(holding, self.bases(self.field.append_prescribed(holding, point.tangents)))
+
     def node_axes(self, point: MixedPoint) -> Float[Array, "3 b n+1"]:
         return cross(point.tangents[:, None, ::2], self.bases_at(point)[..., ::2])
 
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
         assert isinstance(field, QuadraticRotationElements)
-        bases, energy, blocks, torque_column, softness = self._elastic(point)
+        holding = self._held_by
+        bases, energy, blocks, torque_column, softness = self._elastic(point, holding)
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
@@ -78,10 +88,11 @@ class NodalTangents(NodalForm, MixedForm):
         else:
             border, compliance = columns[0], softness[None, None]
             closure = [jnp.zeros(1, dtype), *closure]
-        forces = short_sum(bases * gradient[None], axis=1)
+        free = field.basis(self.scene, bases) if self.ends_move else bases
+        forces = short_sum(free * gradient[None], axis=1)
         residual = field.residual(self.scene, forces, lengths)
         system = ChainSystem(
-            field.held(self.scene, diagonal),
+            field.held(holding, diagonal),
             blocks.lower,
             blocks.across,
             border,
@@ -100,13 +111,18 @@ class NodalTangents(NodalForm, MixedForm):
             closure=jnp.concatenate(closure),
             system=system if contacts.inner is None else system.with_elements(contacts.inner.blocks),
             energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
-            residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, residual)),
+            residual=larger(amiss, residual),
             gaps=contacts.gaps,
             ways=contacts.ways,
         )
 
     def unbalanced(self, point: MixedPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         return super().unbalanced(self.by_law(point))
+
+    def in_cells_at(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        energy, ways = self.in_elements(point, point.tangents, jnp.zeros_like(point.end_force))
+        energy += self.field.bending_energy(self.scene, point.tangents)
+        return energy + density(self.scene.rod, twist=point.total_twist) if self.has_torsion else energy, ways
 
     def turning_elements(
         self, point: MixedPoint, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]
@@ -144,6 +160,13 @@ class NodalFrames(NodalForm, FrameForm):
 
     def node_axes(self, point: FramePoint) -> Float[Array, "3 3 n+1"]:
         return product(columns(point.quaternions[:, ::2]), self._projections[..., ::2])
+
+    @property
+    def held_frames(self) -> list[HeldFrame]:
+        """All but those of ends that are no longer held."""
+        held = super().held_frames
+        is_end = [isinstance(one.number, int) and one.frame is not None for one in held]
+        return [one for one, end in zip(held, is_end, strict=True) if not (end and self.ends_move)]
 
     # --- loads without a potential -----------------------------------------------------------------------------------
 
@@ -249,6 +272,7 @@ class NodalFrames(NodalForm, FrameForm):
             is_backward=not isinstance(self.scene.start, Held),
         )
         gaps = self.gap_of_elements(point, cells.way.T)
+        held = dataclasses.replace(self, ends_move=False)
         energy = jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0))
         return Linearization(
             bases=self.bases_at(point),
@@ -256,7 +280,7 @@ class NodalFrames(NodalForm, FrameForm):
             closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=system if contacts.inner is None else system.with_elements(contacts.inner.blocks),
             energy=energy if fields is None else energy + jnp.sum(fields.energy),
-            residual=_larger(jnp.max(jnp.abs(balance)), _larger(amiss, self._residual(gradient))),
+            residual=larger(amiss, self._residual(held.projected(gradient) if self.ends_move else gradient)),
             gaps=contacts.gaps,
             ways=contacts.ways,
         )
@@ -279,6 +303,10 @@ class NodalFrames(NodalForm, FrameForm):
         gaps = self.gap_of_elements(point, self.edges(point))
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 
+    def in_cells_at(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        kinematics = self._kinematics(self.field.gather(point.quaternions))
+        return self.in_elements(point, kinematics, jnp.zeros_like(point.end_force))
+
     def turning_elements(
         self, point: FramePoint, rotation: Float[Array, "3 m"], bases: Float[Array, "3 3 m"]
     ) -> tuple[Kinematics, Kinematics]:
@@ -289,8 +317,3 @@ class NodalFrames(NodalForm, FrameForm):
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
         value, ways = self.in_cells(elements, point.end_force + change)
         return value, ways.T
-
-
-def _larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
-    """With the derivative of one of them."""
-    return jnp.where(a > b, a, b)

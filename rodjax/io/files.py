@@ -47,7 +47,10 @@ SUFFIX = ".vtkhdf"
 FORMAT = 13
 OLDEST_FORMAT = 7
 # Of the equilibrium of a harness, which rodjax of format 13 cannot read.
-HARNESS_FORMAT = 14
+HARNESS_FORMAT = 15
+
+# What files of harnesses lack until format 14, which had no obstacles.
+_OF_CONTACTS = ("contact_forces", "end_pressures")
 
 # Units and meaning of each field, by its place under /rodjax.
 FIELDS = {
@@ -169,6 +172,8 @@ HARNESS_FIELDS = {
     "harness/stable": ("1", "whether no motion of rods and joints lowers the energy"),
     "harness/index": ("1", "independent motions of rods and joints that lower the energy"),
     "harness/residual": ("1", "largest component of the gradient, in EI/L^2 of each rod"),
+    "harness/contact_forces": ("N", "forces of obstacles on the joints, where rods end in them"),
+    "harness/end_pressures": ("N", "of contacts of the joints, of each stack of rods by rod, obstacle and end"),
     **{f"harness/{name}": FIELDS[name] for name in ("converged", "status", "iterations", "evaluations")},
     "end/frame": ("1", "frame of the end of the rod in the axes of the joint, columns d1, d2, t"),
     "end/offset": ("m", "from the position of the joint to the end of the rod, in the axes of the joint"),
@@ -509,9 +514,15 @@ def _read_harness(group: h5py.Group, path: Path) -> HarnessEquilibrium:
         jax.tree.map(lambda *leaves: np.stack(leaves, axis), *(rods[number] for number in numbers))
         for numbers in members
     )
+    written = int(np.asarray(group.attrs["format"]))
     arrays = {
-        name: _read_value(group, name, annotation, path, shape, KINDS) for name, annotation in _harness_arrays().items()
+        name: _read_value(group, name, annotation, path, shape, KINDS)
+        for name, annotation in _harness_arrays().items()
+        if written >= HARNESS_FORMAT or name not in _OF_CONTACTS
     }
+    if written < HARNESS_FORMAT:
+        arrays["contact_forces"] = np.zeros_like(arrays["positions"])
+        arrays["end_pressures"] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)
     return HarnessEquilibrium(groups=stacked, harness=harness, members=members, **arrays)
 
 

@@ -3,7 +3,7 @@
 A complete example: a trunk that branches into two, one of them on a pin.
 
     [cables.trunk.rod]             # the tables of a cable are those of `rodjax.io.scene_file`: rod, start, end, loads,
-    section = "circular"           # clips
+    section = "circular"           # clips, obstacles
     length = "40 cm"
     radius = "5 mm"
     youngs_modulus = "10 MPa"
@@ -40,6 +40,11 @@ A complete example: a trunk that branches into two, one of them on a pin.
     [loads]                        # optional, of all cables that have none of their own
     gravity = "[0, 0, -9.81] m/s^2"
 
+    [[obstacles]]                  # optional, of all cables that have none of their own: keys as in scene files
+    kind = "plane"
+    point = "[0, 0, -20] cm"
+    normal = [0, 0, 1]
+
     [solve]                        # optional: rtol, segments of each cable, strain_limit
     rtol = 1e-3
 """
@@ -56,8 +61,8 @@ from rodjax.model.scene import Scene
 from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
-HARNESS_TABLES = ("cables", "joints", "loads", "solve")
-CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips")
+HARNESS_TABLES = ("cables", "joints", "loads", "obstacles", "solve")
+CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles")
 
 
 class HarnessFile(NamedTuple):
@@ -105,6 +110,9 @@ def harness_file(content: dict[str, Any]) -> HarnessFile:
         if not isinstance(table, dict) or not all(isinstance(one, dict) for one in table.values()):
             raise SceneFileError(f"{name} must hold a table for each, [{name}.NAME], got {shown(table)}")
     shared = check_keys(content.get("loads", {}), "loads", (), ("gravity",))
+    around = content.get("obstacles", [])
+    if not isinstance(around, list):
+        raise SceneFileError(f"obstacles must be tables [[obstacles]], got {shown(around)}")
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "strain_limit"))
     with named("solve"):
         segments = whole_number(solve["segments"], "segments", 2, MAX_SEGMENTS) if "segments" in solve else None
@@ -118,7 +126,8 @@ def harness_file(content: dict[str, Any]) -> HarnessFile:
         check_keys(table, where, *CABLE_TABLES)
         loads = shared | table.get("loads", {}) if isinstance(table.get("loads", {}), dict) else table["loads"]
         try:
-            cables[name] = reader.read(table | {"loads": loads}).scenes[0]
+            near = table.get("obstacles", around)
+            cables[name] = reader.read(table | {"loads": loads} | ({"obstacles": near} if near else {})).scenes[0]
         except SceneFileError as error:
             raise SceneFileError(f"{where}.{error}") from None
     joints = {name: _body(reader, table, f"joints.{name}") for name, table in content.get("joints", {}).items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from rodjax.analysis.samples import Samples, samples_at, smooth_samples
 from rodjax.atomic_write import replace_file
@@ -19,12 +19,15 @@ SUFFIX = ".csv"
 AXES = ("x", "y", "z")
 
 
-def centerline_table(equilibrium: Equilibrium, s: Any = None) -> dict[str, Float[np.ndarray, "k"]]:
+def centerline_table(
+    equilibrium: Equilibrium | HarnessEquilibrium, s: Any = None
+) -> dict[str, Shaped[np.ndarray, "k"]]:
     """The centerline of one equilibrium and what there is along it, by columns whose names end with their SI units.
 
     **Arguments:**
 
-    - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
+    - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`. Of a harness all
+      cables, by a leading column `cable`.
     - `s`: arclengths (k,) [m] from 0 to L; or how many equally spaced ones, at least 2; `None`: the nodes, and as many
       between them as a smooth curve needs: its chords depart from it by 5e-5 of the length at most.
 
@@ -37,7 +40,9 @@ def centerline_table(equilibrium: Equilibrium, s: Any = None) -> dict[str, Float
     `pandas.DataFrame(rj.centerline_table(result))` makes a data frame of it; `rj.write_table` and `rodjax solve --csv`
     write it to a file. Raises `ValueError` or `TypeError` for other arguments.
     """
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
+    if isinstance(equilibrium, HarnessEquilibrium):
+        return _by_cable({name: centerline_table(rod, s) for name, rod in equilibrium.items()})
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call this outside jax.jit, vmap and grad")
     if equilibrium.s.ndim != 1:
@@ -91,12 +96,7 @@ def write_table(equilibrium: Equilibrium | HarnessEquilibrium, path: str | os.Pa
     instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     path = file_path(path, "path", SUFFIX)
     if isinstance(equilibrium, HarnessEquilibrium):
-        tables = {name: _table(rod, s) for name, rod in equilibrium.items()}
-        shared = [name for name in next(iter(tables.values())) if all(name in table for table in tables.values())]
-        cables = np.concatenate([np.full(len(table["s [m]"]), name) for name, table in tables.items()])
-        columns = {"cable": cables} | {
-            name: np.concatenate([table[name] for table in tables.values()]) for name in shared
-        }
+        columns = _by_cable({name: _table(rod, s) for name, rod in equilibrium.items()})
     else:
         columns = _table(equilibrium, s)
     text = io.StringIO()
@@ -104,6 +104,13 @@ def write_table(equilibrium: Equilibrium | HarnessEquilibrium, path: str | os.Pa
     writer.writerow(columns)
     writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
     replace_file(path, text.getvalue().encode())
+
+
+def _by_cable(tables: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """One table, of the columns that all have."""
+    shared = [name for name in next(iter(tables.values())) if all(name in table for table in tables.values())]
+    cables = np.concatenate([np.full(len(table["s [m]"]), name) for name, table in tables.items()])
+    return {"cable": cables} | {name: np.concatenate([table[name] for table in tables.values()]) for name in shared}
 
 
 def _table(equilibrium: Equilibrium, s: Any) -> dict[str, np.ndarray]:

@@ -45,6 +45,14 @@ class InnerRows(eqx.Module):
     def rows(self) -> slice:
         return slice(self.first, self.first + len(self.by_place))
 
+    def holding(self, turns: Float[Array, "n+1"], moves: Float[Array, "n+1"]) -> "InnerRows":
+        """`turns`, `moves`: 0 at nodes whose rotation or place is held, else 1."""
+        return dataclasses.replace(
+            self,
+            by_rotation=self.by_rotation * _at_ends(turns[None])[None],
+            by_place=self.by_place * _at_ends(moves[None])[None],
+        )
+
     def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "q n+1"]:
         nodes, places = _at_ends(x[:, ::2]), _at_ends(u.T)
         rates = jnp.einsum("qben,ben->qn", self.by_rotation, nodes) + jnp.einsum("qcen,cen->qn", self.by_place, places)
@@ -181,6 +189,32 @@ class ChainSystem(eqx.Module):
         identity = jnp.eye(len(self.diagonal), dtype=shift.dtype)[..., None]
         shift = jnp.broadcast_to(shift, self.diagonal.shape[-1:])
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
+
+    def holding(self, turns: Float[Array, "m"], moves: Float[Array, "n+1"]) -> "ChainSystem":
+        """With the rotations of points, and the places of nodes, held where these are 0, else 1."""
+        identity = jnp.eye(len(self.diagonal), dtype=turns.dtype)[..., None]
+        of_elements = jnp.stack([turns[:-1:2], turns[1::2], turns[2::2]])
+        b, contacts = len(self.diagonal), self.contacts
+        of_nodes = jnp.concatenate([jnp.tile(turns[None, ::2], (b, 1)), jnp.tile(moves[None], (3, 1))])
+        if contacts.inner is not None:
+            contacts = dataclasses.replace(contacts, inner=contacts.inner.holding(turns[::2], moves))
+        between, turning = self.between, self.turning
+        if between is not None:
+            between = of_nodes[:, None, 1:] * between * of_nodes[None, :, :-1]
+        if turning is not None:
+            turning = turning * (turns[::2] * moves)[None, None]
+        return dataclasses.replace(
+            self,
+            diagonal=self.diagonal * turns[None, None] + identity * (1 - turns)[None, None],
+            lower=self.lower * (turns[1:] * turns[:-1])[None, None],
+            across=self.across * (turns[2::2] * turns[:-1:2])[None, None],
+            border=self.border * turns[None, None],
+            by_force=self.by_force * of_elements[None, None],
+            held=self.held | (moves == 0),
+            contacts=contacts,
+            turning=turning,
+            between=between,
+        )
 
     def closed_where(self, is_closed: Bool[Array, "k p"]) -> "ChainSystem":
         """With these contacts closed."""

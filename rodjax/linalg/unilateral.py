@@ -1,4 +1,4 @@
-"""The minimum of a quadratic model of a rod whose gaps may only close: which contacts of a `ChainSystem` are closed.
+"""The minimum of a quadratic model of a rod, or several, whose gaps may only close: which contacts are closed.
 
 With u the motion of the nodes, a contact of the pressure p0 and the gap g has in the model the pressure
 
@@ -19,6 +19,8 @@ Coulomb friction with bounds that are given stays within that: with s the slip, 
 of the energy softness |q|^2/2, and beyond the bound one that is linear in |q0 - (s + P u)/softness|: convex as well.
 A contact that sticks is three closed rows, P; what one that slips does as it turns is in the stiffness of its node.
 """
+
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -65,8 +67,10 @@ class Unilateral(eqx.Module):
         sticks = _lengths(tangential) < self.bounds
         return self._joined(normal > 0, jnp.broadcast_to(sticks[:, None], tangential.shape))
 
-    def energy(self, trial: Float[Array, "r n+1"]) -> Float[Array, ""]:
-        """Twice that of the contacts, over their softness."""
+    def energy(self, trial: Float[Array, "r n+1"], softness: Float[Array, ""]) -> Float[Array, ""]:
+        return softness / 2 * self._squares(trial)
+
+    def _squares(self, trial: Float[Array, "r n+1"]) -> Float[Array, ""]:
         if self.bounds is None:
             return jnp.sum(jnp.where(trial > 0, trial, 0.0) ** 2)
         normal, tangential = self._parted(trial)
@@ -74,8 +78,15 @@ class Unilateral(eqx.Module):
         of_friction = jnp.where(lengths < bounds, lengths**2, bounds * (2 * lengths - bounds))
         return jnp.sum(jnp.where(normal > 0, normal, 0.0) ** 2) + jnp.sum(of_friction)
 
-    def growth(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"]) -> Float[Array, ""]:
-        """The second derivative of half of that along -falls."""
+    def slope(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], softness: Array) -> Float[Array, ""]:
+        """The derivative of that along -falls."""
+        return -softness * jnp.sum(self.allowed(trial) * falls)
+
+    def growth(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], softness: Array) -> Float[Array, ""]:
+        """The second derivative of it."""
+        return softness * self._squares_of(trial, falls)
+
+    def _squares_of(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"]) -> Float[Array, ""]:
         if self.bounds is None:
             return jnp.sum(jnp.where(trial > 0, falls, 0.0) * falls)
         normal, tangential = self._parted(trial)
@@ -157,71 +168,81 @@ class ModelMinimum(eqx.Module):
     count: Int[Array, ""]
 
 
-class _State(eqx.Module):
-    x: Float[Array, "b m"]
-    y: Float[Array, "j"]
-    trial: Float[Array, "r n+1"]  # what contacts would exert there, if they could pull, and had no bounds
-    is_closed: Bool[Array, "r n+1"]
-    softness: Float[Array, ""]
+class Model(Protocol):
+    """A quadratic model but for its contacts; motions and `memory` are any pytrees."""
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Without symmetry there is no model that could be least."""
+        ...
+
+    def solved(self, is_closed: Array, trial: Array, softness: Array, memory: Any) -> tuple[Bool[Array, ""], Any, Any]:
+        """With these contacts closed, and what they would exert at the last iterate: whether that is a minimum, the
+        motion to it, and what the next solution needs to know.
+        """
+        ...
+
+    def opening(self, motion: Any) -> Array:
+        """By how much the gaps grow."""
+        ...
+
+    def along(self, motion: Any, change: Any, memory: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Slope and curvature of the model without contacts from a motion along a change: the rows of multipliers hold
+        at both.
+        """
+        ...
+
+
+class Contacts(Protocol):
+    """As `Unilateral`."""
+
+    gaps: Array
+    pressures: Array
+
+    def allowed(self, trial: Array) -> Array: ...
+    def is_closed(self, trial: Array) -> Array: ...
+    def energy(self, trial: Array, softness: Array) -> Float[Array, ""]: ...
+    def slope(self, trial: Array, falls: Array, softness: Array) -> Float[Array, ""]: ...
+    def growth(self, trial: Array, falls: Array, softness: Array) -> Float[Array, ""]: ...
+    def turned(self, trial: Array, other: Array) -> Bool[Array, ""]: ...
+
+
+class Sought(eqx.Module):
+    """Where a search ended, with the last of `Model.solved`; `trial`: what contacts would exert there, if they could
+    pull, and had no bounds.
+    """
+
+    motion: Any
+    memory: Any
+    trial: Array
+    is_closed: Array
+    level: Float[Array, ""]  # the least softness
     is_minimum: Bool[Array, ""]
     is_done: Bool[Array, ""]
-    since: Int[Array, ""]  # factorisations with this softness
+    since: Int[Array, ""]  # factorisations with this level
     count: Int[Array, ""]
 
 
-def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"], contacts: Unilateral) -> ModelMinimum:
-    """From right sides f and c without what the pressures do: forces on the rotations, gaps of the elements, forces on
-    the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
-    what they change by.
-    """
-    final = system.contacts.softness
-    open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
-    of_border, _, of_nodes, of_elements = open_system.parted(c)
+def sought(
+    model: Model, contacts: Contacts, is_closed: Array, softness: Array, nowhere: Any, memory: Any = None
+) -> Sought:
+    """The minimum of a model from the contacts that are closed first, with contacts of this softness."""
 
-    def solved(is_closed: Bool[Array, "r n+1"], trial: Float[Array, "r n+1"], softness: Float[Array, ""]):
-        here = eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
-        pressures = jnp.where(is_closed, contacts.pressures, 0.0)
-        pushed = here.contacts.pushed(pressures)
-        slipping = contacts.slipping(trial, here.contacts, softness)
-        if slipping is not None:
-            here = eqx.tree_at(lambda system: system.stiffness, here, here.stiffness + slipping[0])
-            pushed += slipping[1]
-        by_contacts = jnp.where(is_closed, contacts.gaps, contacts.pressures)
-        nodes = of_nodes + jnp.where(here.held[:, None], 0.0, pushed)
-        right = [part.reshape(-1) for part in (of_border, by_contacts, nodes, of_elements)]
-        factors = factor_chain(here)
-        turned = here.contacts.turned(pressures, f)
-        return factors.is_minimum, *factors.solve_softly(turned, jnp.concatenate(right))
-
-    def opening(x: Float[Array, "b m"], y: Float[Array, "j"]) -> Float[Array, "r n+1"]:
-        """By how much the gaps grow."""
-        return open_system.contacts.rates(x, open_system.parted(y)[2])
-
-    def work(x: Array, y: Array, by: tuple[Array, Array]) -> Float[Array, ""]:
-        first, _, u, force = open_system.parted(y)
-        moments, rows = by
-        border, _, balance, gap = open_system.parted(rows)
-        return jnp.sum(x * moments) + jnp.sum(u * balance) - jnp.sum(force * gap) - jnp.sum(first * border)
-
-    def improved(state: _State) -> _State:
-        softness = state.softness
-        is_minimum, x, y = solved(state.is_closed, state.trial, softness)
-        # Without symmetry there is no model that could be least.
-        is_early = (state.since < WHOLE_STEPS) | (system.loads is not None and contacts.bounds is None)
-        dx, dy = x - state.x, y - state.y
-        _, _, du, _ = open_system.parted(dy)
-        # The model along the way from the last iterate to this one: the rows of border and elements hold at both.
-        ahead, here = open_system.times(dx, dy), open_system.times(state.x, state.y)
-        slope = (work(state.x, state.y, ahead) + work(dx, dy, here)) / 2 - jnp.sum(f * dx) - jnp.sum(of_nodes * du)
-        curvature = work(dx, dy, ahead)
-        before, rate = contacts.gaps + opening(state.x, state.y), opening(dx, dy)
-        pressures, falls = contacts.pressures - before / softness, rate / softness
+    def improved(state: Sought) -> Sought:
+        here = jnp.maximum(softness, state.level)
+        is_minimum, motion, memory = model.solved(state.is_closed, state.trial, here, state.memory)
+        is_early = (state.since < WHOLE_STEPS) | (not model.is_symmetric)
+        change = jax.tree.map(jnp.subtract, motion, state.motion)
+        # The model along the way from the last iterate to this one.
+        slope, curvature = model.along(state.motion, change, memory)
+        before, rate = contacts.gaps + model.opening(state.motion), model.opening(change)
+        pressures, falls = contacts.pressures - before / here, rate / here
 
         def rise(part: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
             """The slope of the model there, and how much that grows."""
             there = pressures - part * falls
-            work = softness * jnp.sum(contacts.allowed(there) * falls)
-            return slope + part * curvature - work, curvature + softness * contacts.growth(there, falls)
+            rise = slope + part * curvature + contacts.slope(there, falls, here)
+            return rise, curvature + contacts.growth(there, falls, here)
 
         def closer(_, bracket: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             low, high, part = bracket
@@ -231,33 +252,113 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
             return low, high, jnp.where((newton > low) & (newton < high), newton, (low + high) / 2)
 
         zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)
-        squares = [contacts.energy(pressures), contacts.energy(pressures - falls)]
-        is_whole = is_early | (slope + curvature / 2 + softness / 2 * (squares[1] - squares[0]) <= 0)
+        gained = contacts.energy(pressures - falls, here) - contacts.energy(pressures, here)
+        is_whole = is_early | (slope + curvature / 2 + gained <= 0)
         part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
         trial = pressures - part * falls
         is_closed = contacts.is_closed(trial)
         is_same = jnp.all(is_closed == state.is_closed) & ~contacts.turned(trial, state.trial) & is_whole
         # Where the contacts are not found at once, softer ones are, and harder ones from these.
+        hardest = jnp.min(softness)
         is_late = (state.count + 1 == FIRST_FACTORS) & ~is_same
-        harder = jnp.where(softness > HARDENING * final, softness / HARDENING, final)
-        return _State(
-            state.x + part * dx,
-            state.y + part * dy,
+        harder = jnp.where(state.level > HARDENING * hardest, state.level / HARDENING, 0.0)
+        return Sought(
+            jax.tree.map(lambda here, change: here + part * change, state.motion, change),
+            memory,
             trial,
             is_closed,
-            jnp.where(is_late & (final < SOFTEST), SOFTEST, jnp.where(is_same, harder, softness)),
+            jnp.where(is_late & (hardest < SOFTEST), SOFTEST, jnp.where(is_same, harder, state.level)),
             is_minimum,
-            (is_same & (softness <= final)) | ~is_minimum,
+            (is_same & (state.level <= hardest)) | ~is_minimum,
             jnp.where(is_late | is_same, 0, state.since + 1),
             state.count + 1,
         )
 
-    count = jnp.zeros((), int)
-    no = jnp.array(False)
-    trial = contacts.pressures - contacts.gaps / final
-    begin = _State(jnp.zeros_like(f), jnp.zeros_like(c), trial, system.contacts.is_closed, final, no, no, count, count)
-    end = jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
-    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + opening(end.x, end.y)) / final)
-    first, _, u, force = open_system.parted(end.y)
+    count, no = jnp.zeros((), int), jnp.array(False)
+    trial = contacts.pressures - contacts.gaps / softness
+    level = jnp.zeros((), trial.dtype)
+    begin = Sought(nowhere, memory, trial, is_closed, level, no, no, count, count)
+    return jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
+
+
+class _OfChain(eqx.Module):
+    """The model of `minimized`, whose motions are x and y."""
+
+    system: ChainSystem  # with no contact closed
+    f: Float[Array, "b m"]
+    c: Float[Array, "j"]
+    contacts: Unilateral
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.system.loads is None or self.contacts.bounds is not None
+
+    def solved(
+        self, is_closed: Bool[Array, "r n+1"], trial: Float[Array, "r n+1"], softness: Float[Array, ""], memory: None
+    ) -> tuple[Bool[Array, ""], tuple[Array, Array], None]:
+        here = closed_softly(self.system, is_closed, softness)
+        f, c = with_pressures(here, self.contacts, self.f, self.c)
+        slipping = self.contacts.slipping(trial, here.contacts, softness)
+        if slipping is not None:
+            here = eqx.tree_at(lambda system: system.stiffness, here, here.stiffness + slipping[0])
+            first, rows, nodes, gaps = here.parted(c)
+            nodes += jnp.where(here.held[:, None], 0.0, slipping[1])
+            c = jnp.concatenate([part.reshape(-1) for part in (first, rows, nodes, gaps)])
+        factors = factor_chain(here)
+        return factors.is_minimum, factors.solve_softly(f, c), None
+
+    def opening(self, motion: tuple[Array, Array]) -> Float[Array, "r n+1"]:
+        x, y = motion
+        return self.system.contacts.rates(x, self.system.parted(y)[2])
+
+    def along(
+        self, motion: tuple[Array, Array], change: tuple[Array, Array], memory: None
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        ahead, here = self.system.times(*change), self.system.times(*motion)
+        _, _, du, _ = self.system.parted(change[1])
+        _, _, of_nodes, _ = self.system.parted(self.c)
+        slope = (work(self.system, motion, ahead) + work(self.system, change, here)) / 2
+        slope -= jnp.sum(self.f * change[0]) + jnp.sum(of_nodes * du)
+        return slope, work(self.system, change, ahead)
+
+
+def closed_softly(system: ChainSystem, is_closed: Bool[Array, "r n+1"], softness: Float[Array, ""]) -> ChainSystem:
+    return eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
+
+
+def with_pressures(
+    system: ChainSystem, contacts: Unilateral, f: Float[Array, "b m"], c: Float[Array, "j"]
+) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
+    """The right sides of a model with the pressures of the contacts that are closed."""
+    is_closed = system.contacts.is_closed
+    pressures = jnp.where(is_closed, contacts.pressures, 0.0)
+    first, _, nodes, elements = system.parted(c)
+    nodes += jnp.where(system.held[:, None], 0.0, system.contacts.pushed(pressures))
+    rows = jnp.where(is_closed, contacts.gaps, contacts.pressures)
+    right = [part.reshape(-1) for part in (first, rows, nodes, elements)]
+    return system.contacts.turned(pressures, f), jnp.concatenate(right)
+
+
+def work(system: ChainSystem, motion: tuple[Array, Array], by: tuple[Array, Array]) -> Float[Array, ""]:
+    """Of a motion on rows of the system, those of multipliers with the other sign."""
+    (x, y), (moments, rows) = motion, by
+    first, _, u, force = system.parted(y)
+    border, _, balance, gap = system.parted(rows)
+    return jnp.sum(x * moments) + jnp.sum(u * balance) - jnp.sum(force * gap) - jnp.sum(first * border)
+
+
+def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"], contacts: Unilateral) -> ModelMinimum:
+    """From right sides f and c without what the pressures do: forces on the rotations, gaps of the elements, forces on
+    the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
+    what they change by.
+    """
+    softness = system.contacts.softness
+    open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
+    model = _OfChain(open_system, f, c, contacts)
+    nowhere = jnp.zeros_like(f), jnp.zeros_like(c)
+    end = sought(model, contacts, system.contacts.is_closed, softness, nowhere)
+    x, y = end.motion
+    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / softness)
+    first, _, u, force = open_system.parted(y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force)])
-    return ModelMinimum(end.x, y, end.is_minimum & end.is_done, end.count)
+    return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
 from rodjax.geometry.rotations import from_frame
-from rodjax.model.scene import Scene, between, has_potential, slides, support_between
+from rodjax.model.along import largest_beside
+from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -50,8 +51,11 @@ class Harness(eqx.Module):
     - `joints`: `{name: Body}`, for bodies with loads or supports; others need not be named.
     - `contact`: between rods; only `False` so far.
 
+    A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it,
+    unless a support of its own holds it in a direction.
+
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with an obstacle, a potential field, a sliding clip or a load without a potential.
+    and for a scene with friction, a sliding clip or a load without a potential.
     """
 
     # In the place of a scene.
@@ -126,9 +130,8 @@ def _check_scene(scene: Scene, name: str) -> None:
 
 def check_movable(scene: Scene, name: str) -> None:
     """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
-    for part, why in (("obstacles", "obstacles"), ("potentials", "fields")):
-        if getattr(scene, part):
-            raise ValueError(f"{name}.{part} must be () where ends have unknown poses: {why} are not computed there")
+    if has_friction(scene):
+        raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
     if slides(scene):
         raise ValueError(f"{name}.clips must not slide where ends of the rod have unknown poses")
     if not has_potential(scene):
@@ -213,6 +216,11 @@ def _motions(support: Support | None) -> _Motions:
     return _Motions(None, None, everything, everything, None, None)
 
 
+def floating(harness: Harness) -> tuple[bool, ...]:
+    """Of each body whether it may move in all directions."""
+    return tuple(_motions(body.support).translations.shape[1] == 3 for body in harness.bodies)
+
+
 def harness_between(harness: Harness, other: Harness, fraction: Float[Array, ""]) -> Harness:
     """A harness on the way from one to another of its structure, as `rodjax.model.scene.between`."""
     mixed = jax.tree.map(lambda a, b: a + fraction * (b - a), harness, other)
@@ -234,6 +242,8 @@ class Bodies(eqx.Module):
 
     `position`, `frame`: of their supports, of free ones zero and the identity; `translations`, `rotations`: columns,
     the directions and axes along which they move, zero beyond these; springs and loads, `None` where no body has one.
+    `floats`: of bodies that may move in all directions, which obstacles push where rods end in them; the places of
+    others are given, as those of ends of a scene are.
     """
 
     position: Float[Array, "j 3"]
@@ -245,6 +255,7 @@ class Bodies(eqx.Module):
     translation: Float[Array, "j 3 3"] | None
     rotation: Float[Array, "j 3 3"] | None
     has_frame: tuple[bool, ...] = eqx.field(static=True)
+    floats: tuple[bool, ...] = eqx.field(static=True)
     columns: tuple[int, ...] = eqx.field(static=True)  # those of `motions` that are there
 
     @staticmethod
@@ -268,6 +279,7 @@ class Bodies(eqx.Module):
             translation=_stacked_if_any([_matrix(motions.translation) for motions in found], np.zeros((3, 3)), dtype),
             rotation=_stacked_if_any([_matrix(motions.rotation) for motions in found], np.zeros((3, 3)), dtype),
             has_frame=tuple(motions.frame is not None for motions in found),
+            floats=floating(harness),
             columns=tuple(columns),
         )
 
@@ -365,6 +377,13 @@ def joint_ends(scene: Scene, joint_names: tuple[str, ...]) -> tuple[tuple[int, i
     frames = [end.frame if isinstance(end, Joint) else np.eye(3) for end in ends]
     offsets = [end.offset if isinstance(end, Joint) else np.zeros(3) for end in ends]
     return (numbers[0], numbers[1]), frames, offsets
+
+
+def end_radii(scene: Scene) -> Float[Array, "2"]:
+    """Of the rod at its ends [m]."""
+    length, radius = scene.rod.length, scene.rod.radius
+    assert radius is not None
+    return jnp.broadcast_to(largest_beside(radius, jnp.stack([jnp.zeros_like(length), length])), (2,))
 
 
 def clamped(scene: Scene, harness: Harness, positions: Any, frames: Any) -> Scene:

@@ -13,6 +13,7 @@ from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
 from rodjax.solving.harness import finer_meshes, solve_harness, warn_of_harness
 from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.refinement import Depth
 from rodjax.solving.result import NotConvergedWarning
 from rodjax.warn import warn
 
@@ -87,11 +88,12 @@ def _on_one_mesh(
 ) -> HarnessEquilibrium:
     """All equilibria on the mesh of the first, refined until none needs a finer one, unless `segments` are given."""
     tolerance = DEFAULT_RTOL if rtol is None else checked_rtol(rtol)
+    depths: dict[tuple[int, ...], Depth] = {}
     while True:
         found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *solved(first))
         if segments is not None or not is_known(found.status):
             return found
-        counts, worst, _ = finer_meshes(found, tolerance)
+        counts, worst, _ = finer_meshes(found, tolerance, depths)
         if counts == first.segments:
             if worst > tolerance:
                 warn(

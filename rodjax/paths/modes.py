@@ -17,8 +17,10 @@ from rodjax.discretization.nodal_forms import NodalFrames
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
 from rodjax.model.scene import nondimensional, slides
+from rodjax.paths.harness_modes import HarnessMode, harness_mode
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium, form_and_point, over_leading_axes
 from rodjax.solving.stability import softest
 from rodjax.solving.status import Status
@@ -39,16 +41,23 @@ class Mode(eqx.Module):
 
 
 @one_answer
-def lowest_mode(equilibrium: Equilibrium) -> Mode:
+def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | HarnessMode:
     """The lowest eigenvalue of the energy's second variation at an equilibrium under its supports, and its motion.
 
     Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
-    where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n).
+    where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n). Of a harness
+    a `HarnessMode`, of all rods and joints together, without derivatives.
 
-    Raises `TypeError` for anything but an `Equilibrium`, `ValueError` for one of the continuum, of a rod that slides
-    through clips or under loads without a potential.
+    Raises `TypeError` for anything but an equilibrium, `ValueError` for one of the continuum, of a rod that slides
+    through clips or under loads without a potential, and for several of a harness.
     """
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
+    if isinstance(equilibrium, HarnessEquilibrium):
+        if equilibrium.energy.ndim:
+            raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.energy.shape}")
+        if not equilibrium.harness.has_potential:
+            raise ValueError("equilibrium must have a potential: a dead moment on a joint has none")
+        return harness_mode(jax.lax.stop_gradient(equilibrium))
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
     if slides(equilibrium.scene):

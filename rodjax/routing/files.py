@@ -180,7 +180,8 @@ def _harness(content: dict[str, Any], path: Path) -> HarnessFile | None:
         with in_file(path):
             if scene is not None:
                 raise SceneFileError("scene is not allowed together with the tables of a harness")
-            return harness_file({key: content[key] for key in HARNESS_TABLES if key in content})
+            tables = [key for key in HARNESS_TABLES if key in content and key not in OF_A_ROUTE]
+            return harness_file({key: content[key] for key in tables})
     if "joints" in content:
         with in_file(path):
             raise SceneFileError("joints is not allowed without the tables [cables.NAME] of a harness")

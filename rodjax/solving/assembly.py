@@ -14,6 +14,7 @@ Steps are judged as those of `newton`: by L with the new forces and the square o
 body: displacement in parts of a mean length, and rotation vector about global axes.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,13 +26,21 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import generic_field
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
 from rodjax.model.scene import held_position, scene_axes
-from rodjax.solving.coupling import Coupling, RodInBodies, linearized_with_ends
+from rodjax.solving.coupling import (
+    Coupling,
+    EndContacts,
+    RodInBodies,
+    end_contact_energy,
+    end_contacts,
+    linearized_with_ends,
+)
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -49,6 +58,7 @@ from rodjax.solving.newton import (
     Newton,
 )
 from rodjax.solving.status import Status
+from rodjax.solving.touching import Touched, TouchingModel, TouchingRods, touched
 from rodjax.units import Units
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
@@ -90,23 +100,29 @@ class Rods(eqx.Module):
 
 
 class RodStep(NamedTuple):
-    """Where a rod is, and a step from there."""
+    """Where a rod is, and a step from there; `others`: as of `Form.others`; `at_ends`: contacts of its bodies."""
 
     point: Any
     bases: Float[Array, "3 b m"]
     rotation: Float[Array, "b m"]
     force_change: Float[Array, "3 parts"]
+    others: Any = None
+    at_ends: EndContacts | None = None
 
     def value(
         self, rod: RodInBodies, motions: Float[Array, "2 6"], part: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
-        """L after a part of the rotations, under the new force, with its ends moved; what it lacks of its spans; the
-        point there.
+        """L after a part of the rotations, under the new force, with its ends moved and with contacts as of the model;
+        what it lacks of its spans; the point there.
         """
         form = rod.moved(motions)
-        there = form.holding(form.moved(self.point, self.bases, part * self.rotation, self.force_change))
+        others = jax.tree.map(lambda change: part * change, self.others)
+        there = form.holding(form.moved(self.point, self.bases, part * self.rotation, self.force_change, others))
         value, closure = form.lagrangian(there)
         scene = form.scene
+        if self.at_ends is not None:
+            assert isinstance(form, NodalForm)
+            value += form.contact_energy(there, self.point) + end_contact_energy(rod, form, self.at_ends)
         return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
 
 
@@ -132,9 +148,12 @@ def eliminated(here: Linearization, coupling: Coupling, shift: Float[Array, ""],
 
 
 class State(NamedTuple):
-    """What a turn leaves to the next one; of each group of rods points and shifts of their systems."""
+    """What a turn leaves to the next one; of each group of rods points, pressures of the bodies where these end (`None`
+    without obstacles), and shifts of their systems.
+    """
 
     points: tuple[Any, ...]
+    at_ends: tuple[Float[Array, "k o 2"] | None, ...]
     poses: Poses
     shifts: tuple[Float[Array, "k"], ...]
     damping: Float[Array, ""]
@@ -167,13 +186,13 @@ class Assembly(eqx.Module):
     def count(self) -> int:
         return len(self.bodies.position)
 
-    def rods(self, group: Rods, poses: Poses) -> RodInBodies:
+    def rods(self, group: Rods, at: Poses) -> RodInBodies:
         """Stacked."""
-        positions, frames = group.under(poses)
+        positions, frames = group.under(at)
         length = jnp.broadcast_to(self.length, group.units.length.shape)
-        return RodInBodies(
-            group.form, group.units, group.body < self.count, group.frame, group.offset, positions, frames, length
-        )
+        is_joint, touches = group.body < self.count, jnp.array([*self.bodies.floats, False])[group.body]
+        poses = group.frame, group.offset, positions, frames
+        return RodInBodies(group.form, group.units, is_joint, *poses, length, touches)
 
     def shares(self, group: Rods) -> Float[Array, "k"]:
         """The unit of energy of each rod, in that of the assembly."""
@@ -197,17 +216,24 @@ class Assembly(eqx.Module):
         second = jax.vmap(column, out_axes=-1)(jnp.eye(6, dtype=nowhere.dtype))
         return first(nowhere), second
 
-    def begin(self, points: tuple[Any, ...], poses: Poses) -> State:
+    def begin(self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], poses: Poses) -> State:
         dtype = poses.positions.dtype
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
         nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
         status = jnp.full((), Status.RUNNING, int)
-        return State(points, poses, nothing, zero, zero, nothing, count, count, count, status, count)
+        return State(points, at_ends, poses, nothing, zero, zero, nothing, count, count, count, status, count)
 
 
-def find_assembly(assembly: Assembly, points: tuple[Any, ...], poses: Poses, solver: Newton, find: Find) -> State:
-    """The equilibrium reached from points of the rods and poses of the bodies."""
-    begin = assembly.begin(points, poses)
+def find_assembly(
+    assembly: Assembly,
+    points: tuple[Any, ...],
+    at_ends: tuple[Float[Array, "k o 2"] | None, ...],
+    poses: Poses,
+    solver: Newton,
+    find: Find,
+) -> State:
+    """The equilibrium reached from points of the rods, pressures of the bodies where these end, and poses of them."""
+    begin = assembly.begin(points, at_ends, poses)
     return jax.lax.while_loop(
         lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
     )
@@ -220,6 +246,7 @@ class _Here(NamedTuple):
     points: Any
     linearization: Linearization
     coupling: Coupling
+    at_ends: EndContacts | None
     floor: Float[Array, "k"]
     aside: Float[Array, "k b m"]
 
@@ -239,9 +266,11 @@ class _Balance(NamedTuple):
 
 
 class _Rods(NamedTuple):
-    """The systems of all rods eliminated, group by group, and what these tell together."""
+    """The systems of all rods eliminated, group by group, and what these tell together; `None` of those with contacts,
+    which are sought together.
+    """
 
-    found: list["Eliminated"]
+    found: list["Eliminated | None"]
     shifts: tuple[Float[Array, "k"], ...]
     is_definite: Bool[Array, ""]
     negative: Int[Array, ""]
@@ -281,13 +310,16 @@ class _Trial(NamedTuple):
 def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:
     """One linearisation, the step that follows from it, and the part of it that is taken."""
     all_here = []
-    for group, points in zip(assembly.groups, state.points, strict=True):
+    for group, points, pressures in zip(assembly.groups, state.points, state.at_ends, strict=True):
         rods = assembly.rods(group, state.poses)
-        all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points)))
+        all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points, pressures)))
     balance = _balance(assembly, all_here, state, solver)
     rods = _eliminated_rods(all_here, state, balance, find)
-    bodies = _condensed(assembly, all_here, rods, state, balance, find)
-    steps = _steps(assembly, all_here, rods, bodies, balance, solver)
+    if all(here.at_ends is None for here in all_here):
+        bodies, contacts = _condensed(assembly, all_here, rods, state, balance, find), None
+    else:
+        rods, bodies, contacts = _touching(assembly, all_here, rods, state, balance, find)
+    steps = _steps(assembly, all_here, rods, bodies, contacts, balance, solver)
     is_sought = (rods.is_definite & (bodies.below == 0)) if find == "minimum" else jnp.array(True)
     is_pushed = rods.is_pushed | bodies.is_pushed
     trial = _searched(assembly, all_here, state, steps, balance, is_pushed | (find != "minimum"), is_sought)
@@ -298,8 +330,12 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     poses, points = jax.tree.map(
         lambda new, old: jnp.where(goes, new, old), there, (state.poses, tuple(here.points for here in all_here))
     )
+    at_ends = state.at_ends
+    if contacts is not None:
+        at_ends = _split(all_here, at_ends, contacts.at_ends, lambda pressures, change: pressures + taken * change)
     return State(
         points=points,
+        at_ends=at_ends,
         poses=poses,
         shifts=rods.shifts,
         damping=_damping(state, trial),
@@ -313,12 +349,28 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     )
 
 
-def _linearized(rod: RodInBodies, point: Any) -> tuple[Any, Linearization, Coupling, Array, Array]:
+def _linearized(
+    rod: RodInBodies, point: Any, pressures: Float[Array, "o 2"] | None
+) -> tuple[Any, Linearization, Coupling, EndContacts | None, Array, Array]:
     form = rod.moved()
     point = form.holding(point)
     here, coupling = linearized_with_ends(rod, form, point)
+    point, at_ends = form.accepted(point, here), None
+    if pressures is not None:
+        assert isinstance(form, NodalForm)
+        at_ends, coupling = end_contacts(rod, form, pressures, coupling)
+        here = dataclasses.replace(here, residual=jnp.maximum(here.residual, at_ends.residual))
     aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
-    return point, here, coupling, form.rounding_floor(point), aside
+    return point, here, coupling, at_ends, form.rounding_floor(point), aside
+
+
+def _split(all_here: list[_Here], of_all: Any, of_touching: Any, changed: Any) -> tuple[Any, ...]:
+    """What all groups have, changed by what those with contacts have."""
+    touching = iter(of_touching)
+    return tuple(
+        one if here.at_ends is None else changed(one, next(touching))
+        for here, one in zip(all_here, of_all, strict=True)
+    )
 
 
 # --- balance ---------------------------------------------------------------------------------------------------------
@@ -360,6 +412,10 @@ def _eliminated_rods(all_here: list[_Here], state: State, balance: _Balance, fin
     all_found, shifts = [], []
     is_definite, negative, is_pushed = jnp.array(True), jnp.zeros((), int), jnp.array(False)
     for here, last in zip(all_here, state.shifts, strict=True):
+        if here.at_ends is not None:
+            all_found.append(None)
+            shifts.append(last)
+            continue
         found, shift, pushed = _eliminated(here, last, state, balance, find)
         all_found.append(found)
         shifts.append(shift)
@@ -380,14 +436,10 @@ def _eliminated(
         shift = jnp.full_like(last, least)
         found = jax.vmap(eliminated)(here.linearization, here.coupling, shift, nothing)
         return found, shift, jnp.array(False)
-    shift = jnp.where(balance.is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
-    shift = jnp.maximum(shift, state.damping)
-    may_push = state.pushes < MAX_PUSHES
+    shift = _first_shift(last, state, balance)
 
     def pushes(shift: Float[Array, "k"]) -> Float[Array, "k"]:
-        is_near = balance.is_balanced | (balance.residual <= NEAR * shift)
-        pushed = may_push & ((state.pushes == 0) | is_near) & (shift > least) & (state.damping == 0)
-        return jnp.where(pushed, PUSH * h * shift, 0.0)
+        return PUSH * h * _pushing(shift, state, balance)
 
     def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
         shift, tries, found = trial
@@ -404,6 +456,19 @@ def _eliminated(
         (shift, jnp.zeros((), int), blank),
     )
     return found, shift, jnp.any(pushes(shift) > 0)
+
+
+def _first_shift(last: Float[Array, "k"], state: State, balance: _Balance) -> Float[Array, "k"]:
+    least = jnp.asarray(NEUTRAL, last.dtype)
+    shift = jnp.where(balance.is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
+    return jnp.maximum(shift, state.damping)
+
+
+def _pushing(shift: Float[Array, "k"], state: State, balance: _Balance) -> Float[Array, "k"]:
+    """The shifts of rods that are to be pushed aside, of others 0."""
+    is_near = balance.is_balanced | (balance.residual <= NEAR * shift)
+    pushed = (state.pushes < MAX_PUSHES) & ((state.pushes == 0) | is_near) & (shift > NEUTRAL) & (state.damping == 0)
+    return jnp.where(pushed, shift, 0.0)
 
 
 # --- the bodies ------------------------------------------------------------------------------------------------------
@@ -441,6 +506,10 @@ def _condensed_system(
     right = -jnp.pad(balance.gradient, ((0, 1), (0, 0)))
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
         shares, couple = assembly.shares(group), here.coupling
+        if found is None:  # its forces are those of the model
+            of_ends = shares[:, None, None] * couple.first.reshape(-1, 2, 6)
+            right = right.at[group.body].add(of_ends)
+            continue
         condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
         condensed -= jnp.einsum("kci,kcj->kij", couple.of_closure, found.multipliers_by_motions)
         loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
@@ -461,22 +530,72 @@ def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
     return np.cos(1.0 + 2.0 * np.arange(count)).astype(dtype)
 
 
+def _touching(
+    assembly: Assembly, all_here: list[_Here], rods: _Rods, state: State, balance: _Balance, find: Find
+) -> tuple[_Rods, _Bodies, Touched]:
+    """The same with the contacts of rods and bodies, which are sought with both."""
+    stiffness, force = _condensed_system(assembly, all_here, rods, balance)
+    least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
+    may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
+    groups, shifts, is_pushed = [], [], rods.is_pushed
+    for group, here, last in zip(assembly.groups, all_here, state.shifts, strict=True):
+        if here.at_ends is None:
+            continue
+        shift = _first_shift(last, state, balance) if find == "minimum" else jnp.full_like(last, least)
+        pushing = _pushing(last, state, balance) if find == "minimum" else jnp.zeros_like(last)
+        is_pushed |= jnp.any(pushing > 0)
+        pushes = (PUSH / here.aside.shape[2] * pushing)[:, None, None] * here.aside
+        forms = jax.vmap(lambda rod: rod.moved())(here.rods)
+        parts = forms, here.points, here.linearization, here.coupling, here.at_ends, pushes
+        groups.append(TouchingRods.of(*parts, group.body, assembly.shares(group)))
+        shifts.append(shift)
+    push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
+    pattern = jnp.asarray(_generic(len(force), dtype))
+    motions = assembly.bodies.motions
+    model = TouchingModel(tuple(groups), motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum")
+    found = touched(model, tuple(shifts), state.damping)
+    is_definite = rods.is_definite & found.is_found
+    for shift in found.shifts:
+        is_definite &= jnp.all(shift <= least)
+    together = _Rods(
+        rods.found,
+        _split(all_here, rods.shifts, found.shifts, lambda _, shift: shift),
+        is_definite,
+        rods.negative + found.negative,
+        is_pushed,
+    )
+    pushes_bodies = (found.below > 0) & (push > 0)
+    bodies = _Bodies((motions @ found.bodies).reshape(assembly.count, 6), found.below, pushes_bodies)
+    return together, bodies, found
+
+
 # --- the step --------------------------------------------------------------------------------------------------------
 
 
 def _steps(
-    assembly: Assembly, all_here: list[_Here], rods: _Rods, bodies: _Bodies, balance: _Balance, solver: Newton
+    assembly: Assembly,
+    all_here: list[_Here],
+    rods: _Rods,
+    bodies: _Bodies,
+    contacts: Touched | None,
+    balance: _Balance,
+    solver: Newton,
 ) -> _Steps:
     largest = jnp.max(jnp.sum(bodies.motions[:, 3:] ** 2, axis=1), initial=0.0)
     padded = jnp.pad(bodies.motions, ((0, 1), (0, 0)))
     steps, ends = [], []
+    touching = iter(() if contacts is None else contacts.motions)
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
         of_ends = padded[group.body]
-        flat = of_ends.reshape(-1, 12)
-        rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
-        multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
+        if found is None:
+            rotation, multipliers = next(touching)
+        else:
+            flat = of_ends.reshape(-1, 12)
+            rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
+            multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
         change = jax.vmap(lambda form, y: form.layout.forces(form.closure(y)))(group.form, multipliers)
-        steps.append(RodStep(here.points, here.linearization.bases, rotation, change))
+        others = jax.vmap(lambda form, y: form.others(y))(group.form, multipliers)
+        steps.append(RodStep(here.points, here.linearization.bases, rotation, change, others, here.at_ends))
         ends.append(of_ends)
         largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
     part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
@@ -521,6 +640,12 @@ def _searched(
         bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
         bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
         is_better = (tries > 0) & (is_unjudged | (merit <= bound))
+        for group, here, point in zip(assembly.groups, all_here, points, strict=True):
+            if here.at_ends is not None:
+                passes = jax.vmap(
+                    lambda form, here, there, is_better: form.accepts(here, there, is_better), (0, 0, 0, None)
+                )
+                is_better &= jnp.all(passes(group.form, here.points, point, is_better))
         return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
 
     # At the end no step is tried.
@@ -537,6 +662,12 @@ def _slopes(
     """
     slope, rate = jnp.sum(gradient * steps.bodies), jnp.zeros((), gradient.dtype)
     for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
+        shares = assembly.shares(group)
+        if isinstance(group.form, NodalForm):
+            (_, closing), (along, rates) = _rates(here, step, of_ends)
+            slope += jnp.sum(shares * along)
+            rate += jnp.sum(shares[:, None] * closing * rates)
+            continue
 
         def of_rod(form: Form, here: Linearization, coupling: Coupling, step: RodStep, motions: Array):
             nothing = jnp.zeros_like(here.gradient)
@@ -552,10 +683,21 @@ def _slopes(
             return along, jnp.sum(form.closure(here.closure + lost) * form.closure(closing))
 
         along, closing = jax.vmap(of_rod)(group.form, here.linearization, here.coupling, step, of_ends.reshape(-1, 12))
-        shares = assembly.shares(group)
         slope += jnp.sum(shares * along)
         rate += jnp.sum(shares * closing)
     return slope, rate
+
+
+def _rates(here: _Here, step: RodStep, of_ends: Float[Array, "k 2 6"]) -> tuple[Any, Any]:
+    """L of rods with positions of nodes and what they lack of their spans, and how fast these change as a step begins
+    under the new forces.
+    """
+
+    def of_rod(step: RodStep, rod: RodInBodies, of_ends: Float[Array, "2 6"]) -> tuple[Any, Any]:
+        zero = jnp.zeros((), of_ends.dtype)
+        return jax.jvp(lambda part: step.value(rod, part * of_ends, part)[:2], (zero,), (jnp.ones_like(zero),))
+
+    return jax.vmap(of_rod)(step, here.rods, of_ends)
 
 
 # --- what follows ----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 A motion (u, r) of a body: displacement in parts of a length, and rotation vector about global axes. It carries the end
 of a rod to position + length u + exp(r) arm, and turns its frame by r. L depends on positions through the spans alone,
 linearly; its derivatives by the frame of an end are those of a linearisation in which the ends may turn
-(`Form.released`).
+(`Form.released`). Where nodes have positions of their own, the ends of that one may move too.
 """
 
 import dataclasses
@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import EndTurn, Form, Linearization
 from rodjax.discretization.layout import SpanForces
+from rodjax.discretization.nodal import GAP_WEIGHT, LEAST_RELAXED, LIES_ON, NodalForm
+from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
 from rodjax.model.supports import Clamp, rotate
 from rodjax.units import Units
@@ -25,7 +27,9 @@ ENDS = (0, -1)
 
 
 class RodInBodies(NamedTuple):
-    """One rod, with the poses of the bodies at its ends, `length` the unit of their displacements."""
+    """One rod, with the poses of the bodies at its ends, `length` the unit of their displacements; `touches`: whether
+    obstacles push the body at an end.
+    """
 
     form: Form
     units: Units
@@ -35,6 +39,7 @@ class RodInBodies(NamedTuple):
     position_of_body: Float[Array, "2 3"]
     frame_of_body: Float[Array, "2 3 3"]
     length: Float[Array, ""]
+    touches: Bool[Array, "2"]
 
     def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
         """The form with its ends at the poses of the bodies, moved."""
@@ -68,12 +73,83 @@ class RodInBodies(NamedTuple):
 
 
 class Coupling(NamedTuple):
-    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure."""
+    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure; those of the
+    gaps of contacts apart, `None` without obstacles.
+    """
 
     first: Float[Array, "12"]
     second: Float[Array, "12 12"]
     of_gradient: Float[Array, "b m 12"]
     of_closure: Float[Array, "k 12"]
+    of_gaps: Float[Array, "r n+1 12"] | None
+
+
+class EndContacts(NamedTuple):
+    """Of the bodies with each obstacle, where a rod ends in them: gaps as a step is to see them and as they are, their
+    rates by the motions of the body, and pressures.
+    """
+
+    gaps: Float[Array, "o 2"]
+    found: Float[Array, "o 2"]
+    rates: Float[Array, "o 2 6"]
+    pressures: Float[Array, "o 2"]
+    is_closed: Bool[Array, "o 2"]
+
+    @property
+    def residual(self) -> Float[Array, ""]:
+        """Of a gap and a pressure one is zero, none is negative."""
+        weighted = GAP_WEIGHT * self.found
+        return jnp.max(jnp.abs(jnp.where(self.pressures < weighted, self.pressures, weighted)))
+
+
+def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Float[Array, "o 2 3"]]:
+    """Gaps between obstacles and the ends of a rod in bodies that these push, else 1, and the directions of growth."""
+    distances, normals = form.distances_and_normals(_places(form))
+    radius = form.radius[np.array([0, -1])]
+    touches = rod.touches[None]
+    return jnp.where(touches, distances - radius[None], 1.0), jnp.where(touches[..., None], normals, 0.0)
+
+
+def _places(form: NodalForm) -> Float[Array, "2 3"]:
+    """Of clamped ends."""
+    nowhere = jnp.zeros(3, form.field.s.dtype)
+    ends = (form.scene.start, form.scene.end)
+    return jnp.stack([end.position if isinstance(end, Clamp) else nowhere for end in ends])
+
+
+def end_contact_energy(rod: RodInBodies, form: NodalForm, here: EndContacts) -> Float[Array, ""]:
+    """As `NodalForm.contact_energy`, from where a step begins."""
+    gaps, _ = end_gaps(rod, form)
+    pressures = here.pressures - (gaps + here.gaps - here.found) / form.softness
+    return form.softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+
+
+def end_contacts(
+    rod: RodInBodies, form: NodalForm, pressures: Float[Array, "o 2"], coupling: Coupling
+) -> tuple[EndContacts, Coupling]:
+    """And with what these contacts add to L."""
+    gaps, normals = end_gaps(rod, form)
+    relaxed = jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0)
+    carried = jnp.stack([rod.carried(0), rod.carried(1)])
+    rates = jnp.einsum("oec,eci->oei", normals, carried)
+    pulls = -jnp.einsum("oe,oec->ec", pressures, normals)
+    curved = -jnp.einsum("oe,oecd->ecd", pressures, form.curvatures(_places(form)))
+    first = jnp.einsum("ec,eci->ei", pulls, carried)
+    second = jnp.einsum("eci,ecd,edj->eij", carried, curved, carried)
+    second = second.at[:, 3:, 3:].add(jnp.stack([lifted(pulls[e], rod.arm(e)) for e in range(2)]))
+    at_ends = EndContacts(
+        gaps + relaxed, gaps, rates, pressures, (pressures > GAP_WEIGHT * (gaps + relaxed)) | (gaps + relaxed < LIES_ON)
+    )
+    coupling = coupling._replace(
+        first=coupling.first + first.reshape(12), second=coupling.second + jax.scipy.linalg.block_diag(*second)
+    )
+    return at_ends, coupling
+
+
+def lifted(pull: Float[Array, "3"], arm: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The second derivative of pull . exp(r) arm: exp(r) arm = arm + r x arm + r x (r x arm) / 2."""
+    both = pull[:, None] * arm[None] + arm[:, None] * pull[None]
+    return both / 2 - (pull @ arm) * jnp.eye(3, dtype=pull.dtype)
 
 
 def linearized_with_ends(rod: RodInBodies, form: Form, point: Any) -> tuple[Linearization, Coupling]:
@@ -85,7 +161,14 @@ def linearized_with_ends(rod: RodInBodies, form: Form, point: Any) -> tuple[Line
 def held(form: Form, released: Linearization) -> Linearization:
     """With the ends held that clamps hold."""
     free, system = _free(form, released), released.system
-    assert isinstance(system, SaddlePointSystem)
+    gradient, bases = released.gradient * free[None], released.bases * free[None, None]
+    released = dataclasses.replace(released, bases=bases, gradient=gradient)
+    if isinstance(system, ChainSystem):
+        nodes = free[::2]
+        system = system.holding(free, nodes)
+        first, contacts, balance, gaps = system.parted(released.closure)
+        parts = [part.reshape(-1) for part in (first, contacts, balance * nodes[:, None], gaps)]
+        return dataclasses.replace(released, system=system, closure=jnp.concatenate(parts))
     identity = np.eye(len(system.diagonal), dtype=free.dtype)[..., None]
     blocks = free[None, None]
     across = system.across
@@ -98,8 +181,7 @@ def held(form: Form, released: Linearization) -> Linearization:
         system.compliance,
         across=across,
     )
-    bases, gradient = released.bases * blocks, released.gradient * free[None]
-    return dataclasses.replace(released, bases=bases, gradient=gradient, system=system)
+    return dataclasses.replace(released, system=system)
 
 
 def _free(form: Form, released: Linearization) -> Float[Array, "m"]:
@@ -112,39 +194,69 @@ def _free(form: Form, released: Linearization) -> Float[Array, "m"]:
 
 
 def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) -> Coupling:
-    (b, m), dtype = released.gradient.shape, released.gradient.dtype
+    (b, m), dtype, system = released.gradient.shape, released.gradient.dtype, released.system
     ends = [
         _Turning(number, end, form.end_turn(point, released, end))
         for number, (end, support) in enumerate(zip(ENDS, (form.scene.start, form.scene.end), strict=True))
         if isinstance(support, Clamp)
     ]
-    # By rotations of the frames, as if arms had no length: three columns for each end.
-    columns = jnp.zeros((b, m, 2, 3), dtype)
+    # By rotations of the frames, and where ends have places of their own by these: columns for each end.
+    width = 6 if isinstance(system, ChainSystem) else 3
+    columns = jnp.zeros((b, m, 2, width), dtype)
+    others = jnp.zeros((len(released.closure), 2, width), dtype)
     for number, end, turn in ends:
-        columns = columns.at[:, end, number].set(turn.rotation)
-    columns = columns.reshape(b, m, 6)
-    nothing = jnp.zeros_like(released.closure)
-    turned, lacking = jax.vmap(lambda column: released.system.times(column, nothing), -1, -1)(columns)
-    bent = jnp.einsum("bmk,bml->kl", columns, turned).reshape(2, 3, 2, 3)
+        columns = columns.at[:, end, number, -3:].set(turn.rotation)
+        if isinstance(system, ChainSystem):
+            others = others.at[_rows_of(system, end), number].set(rod.carried(number))
+    columns, others = columns.reshape(b, m, 2 * width), others.reshape(-1, 2 * width)
+    turned, lacking = jax.vmap(released.system.times, (-1, -1), -1)(columns, others)
+    bent = jnp.einsum("bmk,bml->kl", columns, turned)
+    of_gaps = None
+    if isinstance(system, ChainSystem):
+        bent += others.T @ lacking
+        lacking, of_gaps = _without_gaps(system, ends, columns, others, lacking)
+    bent = bent.reshape(2, width, 2, width)
     turned = turned * _free(form, released)[None, :, None]
+    before = 6 - width
     first = jnp.zeros((2, 6), dtype)
-    second = jnp.zeros((2, 6, 2, 6), dtype).at[:, 3:, :, 3:].set(bent)
-    of_gradient = jnp.pad(turned.reshape(b, m, 2, 3), ((0, 0), (0, 0), (0, 0), (3, 0)))
-    of_closure = jnp.pad(lacking.reshape(-1, 2, 3), ((0, 0), (0, 0), (3, 0)))
+    second = jnp.zeros((2, 6, 2, 6), dtype).at[:, before:, :, before:].set(bent)
+    of_gradient = jnp.pad(turned.reshape(b, m, 2, width), ((0, 0), (0, 0), (0, 0), (before, 0)))
+    of_closure = jnp.pad(lacking.reshape(-1, 2, width), ((0, 0), (0, 0), (before, 0)))
     for number, end, turn in ends:
         arm, carried = rod.arm(number), rod.carried(number)
-        pull, spans = _by_position(form, point, end)
+        pull = (1.0 if end else -1.0) * form.end_forces(point)[end]
         by_turn = turn.first + turn.rotation.T @ released.gradient[:, end]
         first = first.at[number].set(pull @ carried).at[number, 3:].add(by_turn)
-        # exp(r) arm = arm + r x arm + r x (r x arm) / 2
-        lifted = (pull[:, None] * arm[None] + arm[:, None] * pull[None]) / 2 - (pull @ arm) * jnp.eye(3, dtype=dtype)
-        second = second.at[number, 3:, number, 3:].add(turn.second + lifted)
-        of_closure = of_closure.at[len(of_closure) - len(spans) :, number].add(spans @ carried)
+        second = second.at[number, 3:, number, 3:].add(turn.second + lifted(pull, arm))
+        if not isinstance(system, ChainSystem):
+            spans = _spans_by_position(form, end, dtype)
+            of_closure = of_closure.at[len(of_closure) - len(spans) :, number].add(spans @ carried)
         if turn.torque is not None:
             of_closure = of_closure.at[0, number, 3:].add(turn.torque)
     return Coupling(
-        first.reshape(12), second.reshape(12, 12), of_gradient.reshape(b, m, 12), of_closure.reshape(-1, 12)
+        first.reshape(12), second.reshape(12, 12), of_gradient.reshape(b, m, 12), of_closure.reshape(-1, 12), of_gaps
     )
+
+
+def _rows_of(system: ChainSystem, end: int) -> slice:
+    """Those of the place of the node at an end among the multipliers."""
+    nodes = len(system.held)
+    before = len(system.compliance) + system.contacts.is_closed.size + (3 * (nodes - 1) if end else 0)
+    return slice(before, before + 3)
+
+
+def _without_gaps(
+    system: ChainSystem, ends: list["_Turning"], columns: Array, others: Array, lacking: Array
+) -> tuple[Float[Array, "k 12"], Float[Array, "r n+1 12"] | None]:
+    """The rows of a rod whose ends are held, but for contacts, and the rates of the gaps of these."""
+    for _, end, _ in ends:
+        lacking = lacking.at[_rows_of(system, end)].set(0.0)
+    size = system.contacts.is_closed.size
+    if not size:
+        return lacking, None
+    rates = jax.vmap(lambda x, y: system.contacts.rates(x, system.parted(y)[2]), (-1, -1), -1)(columns, others)
+    first = len(system.compliance)
+    return lacking.at[first : first + size].set(0.0), rates
 
 
 class _Turning(NamedTuple):
@@ -155,11 +267,10 @@ class _Turning(NamedTuple):
     turn: EndTurn
 
 
-def _by_position(form: Form, point: Any, end: int) -> tuple[Float[Array, "3"], Float[Array, "size 3"]]:
-    """The derivatives of L and of the spans by the position of an end."""
+def _spans_by_position(form: Form, end: int, dtype: Any) -> Float[Array, "size 3"]:
+    """The derivatives of the spans by the position of an end."""
     layout, sign = form.layout, 1.0 if end else -1.0
     assert isinstance(layout, SpanForces)
     direction = np.zeros((3, layout.parts, 3))
     direction[:, end] = sign * np.eye(3)
-    pull = sign * form.end_forces(point)[end]
-    return pull, jax.vmap(layout.components, -1, -1)(jnp.asarray(direction, pull.dtype))
+    return jax.vmap(layout.components, -1, -1)(jnp.asarray(direction, dtype))

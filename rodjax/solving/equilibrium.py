@@ -748,7 +748,7 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
         else:
             end = find_equilibrium(search.form, search.point, solver, options.find)
         found = search.found(end)
-        return _on_one_side(search, found, guess) if scene.obstacles else found
+        return on_one_side(search, search.form, found, guess.before) if scene.obstacles else found
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, first)
     minimum = minimize(problem, start, solver)
@@ -757,22 +757,23 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
 
 
-def _on_one_side(search: Search, found: Found, guess: SolverState) -> Found:
-    """Not converged where the rod came through an obstacle on the way, or lies within one.
+def on_one_side(search: Search, form: Form, found: Found, before: Before | None) -> Found:
+    """Not converged where the rod came through an obstacle on the way, or lies within one; `form`: of what was found.
 
     No step of the search leads through. So a rod that begins on the side of all obstacles where it last was sound has
     stayed there, however far it slid around one; of others the shape in the end is compared with the last sound one.
     """
-    form, before = search.form, guess.before
+    begun = search.form
+    assert isinstance(begun, NodalForm)
     assert isinstance(form, NodalForm)
     assert before is not None
     assert search.point.nodal is not None
     places = search.point.nodal.places
-    begin, _, _ = form.places(places, search.point)
-    begin = guess.units.origin[None] + guess.units.length * begin
+    begin, _, _ = begun.places(places, search.point)
+    begin = search.units.origin[None] + search.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
-    begins, _ = passage_to(form, search.point, places, guess.units, before)
-    passed, now = passage_to(form, found.point, found.state.shape.nodes, guess.units, before)
+    begins, _ = passage_to(begun, search.point, places, search.units, before)
+    passed, now = passage_to(form, found.point, found.state.shape.nodes, found.state.units, before)
     is_sound = passed.is_sound | (begins.is_sound & ~passed.lies_within)
     converged = is_converged(found.outcome.status)
     status = jnp.where(converged & ~is_sound, Status.PASSED_THROUGH, found.outcome.status)

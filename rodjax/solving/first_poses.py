@@ -2,12 +2,14 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.geometry.rotations import columns
-from rodjax.model.harness import Bodies, Harness
+from rodjax.model.harness import Bodies, Harness, end_radii
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Held, Joint, Swivel
 from rodjax.programs.compilation import compiled
@@ -19,6 +21,8 @@ FRAME_WEIGHT = 0.05
 LEAST_CHORD = 1e-6
 # How far rods longer than their chords let a body down, as a part of how far they would reach taut.
 SAG = 0.7
+# How often the way down is looked at: each time on by the distance from what is nearest.
+MOST_LOOKS = 16
 
 
 class _Reach(NamedTuple):
@@ -35,6 +39,8 @@ class _Reach(NamedTuple):
     sign: int
     joint: Joint
     other_joint: Joint | None
+    obstacles: tuple[Obstacle, ...] = ()
+    radius: Any = None
 
 
 @compiled
@@ -123,6 +129,9 @@ def _reaches(scene: Scene, harness: Harness) -> list[_Reach]:
             found.append(_Reach(body, None, there.position, frame, length, sign, here, None))
         else:
             found.append(_Reach(body, None, None, None, length, sign, here, None))
+        if scene.obstacles:
+            radius = end_radii(scene)[0 if sign == 1 else 1]
+            found[-1] = found[-1]._replace(obstacles=scene.obstacles, radius=radius)
     return found
 
 
@@ -176,7 +185,23 @@ def _lowered(body: int, positions: list[Any], reaches: list[_Reach], gravity: Fl
     size = jnp.sqrt(jnp.sum(gravity**2))
     down = gravity / jnp.where(size > 0, size, 1.0)
     fall = jnp.min(jnp.stack(falls)) if falls else jnp.zeros_like(size)
-    return positions[body] + SAG * jnp.sqrt(jnp.maximum(fall, 0.0)) * down
+    fall = SAG * jnp.sqrt(jnp.maximum(fall, 0.0))
+    near = [(obstacle, reach.radius) for reach in beside for obstacle in reach.obstacles]
+    if near:
+        fall = _until_touched(positions[body], down, fall, near)
+    return positions[body] + fall * down
+
+
+def _until_touched(
+    position: Float[Array, "3"], down: Float[Array, "3"], fall: Float[Array, ""], near: list[tuple[Obstacle, Any]]
+) -> Float[Array, ""]:
+    """How far a body falls before an end of a rod in it would touch an obstacle."""
+
+    def further(_, fallen: Float[Array, ""]) -> Float[Array, ""]:
+        gaps = [obstacle.at(position + fallen * down) - radius for obstacle, radius in near]
+        return jnp.minimum(fallen + jnp.maximum(jnp.min(jnp.stack(gaps)), 0.0), fall)
+
+    return jax.lax.fori_loop(0, MOST_LOOKS, further, jnp.zeros_like(fall))
 
 
 def _frame_at(body: int, positions: list[Any], reaches: list[_Reach]) -> Float[Array, "3 3"]:

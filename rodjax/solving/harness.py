@@ -10,10 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, is_known
+from rodjax.checks import instance, is_known, leaf
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
-from rodjax.model.harness import Bodies, Harness, clamp_at, clamped, joint_ends, of_one_rod, rotated
+from rodjax.model.harness import (
+    Bodies,
+    Harness,
+    clamp_at,
+    clamped,
+    end_radii,
+    floating,
+    joint_ends,
+    of_one_rod,
+    rotated,
+)
 from rodjax.model.scene import Scene, nondimensional
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
@@ -32,13 +42,14 @@ from rodjax.solving.equilibrium import (
     in_units_of,
     is_here,
     last_twist,
+    on_one_side,
 )
 from rodjax.solving.first_poses import first_poses
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
 from rodjax.solving.newton import Newton
-from rodjax.solving.refinement import SAFETY, SIZES, error_by_rtol, next_size
+from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -54,6 +65,10 @@ from rodjax.solving.status import Outcome, is_converged
 from rodjax.warn import warn
 
 Members = tuple[tuple[int, ...], ...]
+
+# Of contacts of bodies, beside the stiffest motion of these, and how often what it gives way by is asked for again.
+ENDS_SOFTNESS = 1e-4
+ENDS_HARDENINGS = 4
 
 
 def solve_harness(
@@ -141,6 +156,8 @@ def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
         iterations=guess.iterations,
         evaluations=guess.evaluations,
         residual=guess.residual,
+        contact_forces=jnp.zeros((len(harness.bodies), 3), guess.energy.dtype),
+        end_pressures=no_pressures(harness, ((0,),)),
         harness=harness,
         members=((0,),),
     )
@@ -243,7 +260,10 @@ def _solved(
             start = _stacked_starts(tuple(each))
         starts.append(start)
     options = tuple(all_options[group[0]] for group in members)
-    return _solve(harness, poses, tuple(starts), strain_limit, options, members=members)
+    pressures = no_pressures(harness, members) if guess is None else guess.end_pressures
+    if guess is not None and (guess.members != members or pressures.shape != no_pressures(harness, members).shape):
+        pressures = no_pressures(harness, members)
+    return _solve(harness, poses, tuple(starts), pressures, strain_limit, options, members=members)
 
 
 @compiled
@@ -256,6 +276,8 @@ def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[Solv
     if group.s.shape[-1] - 1 != options.segments or jax.tree.structure(group.scene) != jax.tree.structure(scene):
         return None
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), group)
+    if not eqx.tree_equal(*(jax.tree.map(jnp.shape, each.obstacles) for each in (one.scene, scene))):
+        return None
     return (group.state, last_twist(group)) if _fits(scene, one, options) else None
 
 
@@ -280,31 +302,41 @@ def _solve(
     harness: Harness,
     poses: Poses,
     starts: tuple[tuple[SolverState, FirstTwist], ...],
+    end_pressures: Float[Array, "c"],
     strain_limit: Float[Array, ""] | float,
     options: tuple[Options, ...],
     members: Members,
 ) -> HarnessEquilibrium:
-    groups, points = [], []
-    for numbers, (states, firsts), option in zip(members, starts, options, strict=True):
+    groups, points, all_searches, at_ends = [], [], [], []
+    of_groups = split_pressures(harness, members, end_pressures)
+    for numbers, (states, firsts), option, pressures in zip(members, starts, options, of_groups, strict=True):
         stacked = _stack([clamped(harness.scenes[number], harness, *poses) for number in numbers])
 
         def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
             return Search.of(*in_units_of(scene, state), first, option)
 
         searches = jax.vmap(begin)(stacked, states, firsts)
-        body, frame, offset = _ends(harness, numbers)
+        body, frame, offset = ends_of(harness, numbers)
         groups.append(Rods(searches.form, searches.shape, searches.units, body, frame, offset))
         points.append(searches.point)
+        all_searches.append((searches, states))
+        at_ends.append(None if pressures is None else pressures / searches.units.force[:, None, None])
     bodies = Bodies.of(harness)
     assembly = Assembly.of(tuple(groups), bodies)
     solver = options[0].solver
     assert isinstance(solver, Newton)
-    end = find_assembly(assembly, tuple(points), poses, solver, options[0].find)
+    end = find_assembly(assembly, tuple(points), tuple(at_ends), poses, solver, options[0].find)
     is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
-    for number, (rod, numbers) in enumerate(zip(groups, members, strict=True)):
+    for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_searches, strict=True)):
         now = tuple(clamped(harness.scenes[k], harness, *end.poses) for k in numbers)
-        rods.append(_equilibria(_stack(list(now)), rod, end, number, is_stable, strain_limit))
+        rods.append(_equilibria(_stack(list(now)), rod, begun, end, number, is_stable, strain_limit))
+    pressures = [
+        (pressures * rod.units.force[:, None, None]).reshape(-1)
+        for rod, pressures in zip(groups, end.at_ends, strict=True)
+        if pressures is not None
+    ]
+    end_pressures = jnp.concatenate(pressures) if pressures else end_pressures
     status = end.status
     for rod in rods:
         # A strain beyond the limit in one of them is said of the whole.
@@ -322,12 +354,14 @@ def _solve(
         iterations=end.iterations,
         evaluations=end.evaluations,
         residual=end.residual,
+        contact_forces=contact_forces(harness, members, end.poses, end_pressures)[0][:, :3],
+        end_pressures=end_pressures,
         harness=harness,
         members=members,
     )
 
 
-def _ends(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
+def ends_of(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
     """Of some rods the bodies, frames and offsets of both ends; the number of all bodies for none."""
     count, dtype = len(harness.bodies), harness.scenes[0].rod.length.dtype
     found = [joint_ends(harness.scenes[number], harness.joint_names) for number in numbers]
@@ -337,21 +371,90 @@ def _ends(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Arr
     return bodies, frames, offsets
 
 
-def _equilibria(scenes: Scene, rods: Rods, end: State, group: int, is_stable: Array, strain_limit: Any) -> Equilibrium:
-    def one(scene: Scene, rod: Rods, point: Any, residual: Array) -> Equilibrium:
+def _equilibria(
+    scenes: Scene,
+    rods: Rods,
+    begun: tuple[Search, SolverState],
+    end: State,
+    group: int,
+    is_stable: Array,
+    strain_limit: Any,
+) -> Equilibrium:
+    def one(scene: Scene, rod: Rods, search: Search, begin: SolverState, point: Any, residual: Array) -> Equilibrium:
         scaled, units = nondimensional(scene)
         form = form_of(scaled, rod.shape)
+        if point.nodal is not None:
+            # From the units of the search, whose origin is where the rod began.
+            places = point.nodal.places + (rod.units.origin - units.origin)[None] / units.length
+            point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, places=places))
         point = form.settled(form.holding(point))
-        state = SolverState(rod.shape.reached(form, point), point.end_force, units)
+        pressures = point.nodal.pressures if scene.obstacles else None
+        state = SolverState(rod.shape.reached(form, point), point.end_force, units, pressures=pressures)
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
-        return build_result(scene, Found(state, point, outcome, is_stable), jnp.ones((), int), strain_limit)
+        found = Found(state, point, outcome, is_stable)
+        if scene.obstacles:
+            found = on_one_side(search, form, found, begin.before)
+        return build_result(scene, found, jnp.ones((), int), strain_limit)
 
-    return jax.vmap(one)(scenes, rods, end.points[group], end.residuals[group])
+    return jax.vmap(one)(scenes, rods, *begun, end.points[group], end.residuals[group])
 
 
 def _energy(rods: list[Equilibrium], bodies: Bodies, poses: Poses) -> Float[Array, ""]:
     energies = bodies.energies(*poses, jnp.zeros_like(poses.positions))
     return jnp.sum(energies) + sum(jnp.sum(rod.energy) for rod in rods)
+
+
+# --- contacts of the bodies ------------------------------------------------------------------------------------------
+
+
+def _of_obstacles(harness: Harness, members: Members) -> list[int]:
+    """How many obstacles the rods of each group have."""
+    return [len(harness.scenes[numbers[0]].obstacles) for numbers in members]
+
+
+def no_pressures(harness: Harness, members: Members) -> Float[Array, "c"]:
+    counts = [2 * count * len(numbers) for count, numbers in zip(_of_obstacles(harness, members), members, strict=True)]
+    return leaf(np.zeros(sum(counts), harness.scenes[0].rod.length.dtype))
+
+
+def split_pressures(harness: Harness, members: Members, pressures: Float[Array, "c"]) -> list[Array | None]:
+    """Of each group (rods, obstacles, ends); `None` without obstacles."""
+    found, first = [], 0
+    for count, numbers in zip(_of_obstacles(harness, members), members, strict=True):
+        size = 2 * count * len(numbers)
+        found.append(pressures[first : first + size].reshape(len(numbers), count, 2) if count else None)
+        first += size
+    return found
+
+
+def contact_forces(
+    harness: Harness, members: Members, poses: Poses, pressures: Float[Array, "c"]
+) -> tuple[Float[Array, "j 6"], Float[Array, "c"]]:
+    """Forces [N] of obstacles on the bodies where rods end in them, and moments about their positions [N m]; the gaps
+    there [m], none at ends that are in no body.
+    """
+    count, floats = len(harness.bodies), floating(harness)
+    total, gaps = jnp.zeros((count + 1, 6), poses.positions.dtype), []
+    for numbers, of_group in zip(members, split_pressures(harness, members, pressures), strict=True):
+        if of_group is None:
+            continue
+        for number, of_rod in zip(numbers, of_group, strict=True):
+            scene = harness.scenes[number]
+            bodies, _, offsets = joint_ends(scene, harness.joint_names)
+            radius = end_radii(scene)
+            for obstacle, of_ends in zip(scene.obstacles, of_rod, strict=True):
+                of_obstacle = []
+                for body, offset, thick, pressure in zip(bodies, offsets, radius, of_ends, strict=True):
+                    if body < 0 or not floats[body]:
+                        of_obstacle.append(jnp.ones_like(thick))
+                        continue
+                    arm = poses.frames[body] @ offset
+                    distance, normal = jax.value_and_grad(obstacle.at)(poses.positions[body] + arm)
+                    force = pressure * normal
+                    total = total.at[body].add(jnp.concatenate([force, jnp.cross(arm, force)]))
+                    of_obstacle.append(distance - thick)
+                gaps.append(jnp.stack(of_obstacle))
+    return total[:count], jnp.concatenate(gaps) if gaps else jnp.zeros_like(pressures)
 
 
 # --- the mesh --------------------------------------------------------------------------------------------------------
@@ -364,8 +467,9 @@ def _refined(
     is.
     """
     iterations, evaluations = int(result.iterations), int(result.evaluations)
+    depths: dict[tuple[int, ...], Depth] = {}
     while bool(result.converged):
-        counts, worst, all_defects = finer_meshes(result, rtol)
+        counts, worst, all_defects = finer_meshes(result, rtol, depths)
         options = [dataclasses.replace(old, segments=count) for old, count in zip(all_options, counts, strict=True)]
         finer = {
             number: _finer(result.rod(number), all_defects[number], new)
@@ -388,9 +492,12 @@ def _refined(
     return eqx.tree_at(lambda result: (result.iterations, result.evaluations), result, counts)
 
 
-def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], float, dict[int, Any]]:
+def finer_meshes(
+    result: HarnessEquilibrium, rtol: float, depths: dict[tuple[int, ...], Depth]
+) -> tuple[list[int], float, dict[int, Any]]:
     """How many elements rods of one structure need, at least as many as they have; the largest estimated error, of
-    several equilibria of those that converged; the defects of each rod.
+    several equilibria of those that converged; the defects of each rod. `depths`: how deep contacts press the rods of
+    each group in, from mesh to mesh.
     """
     counts, worst, all_defects = result.segments, 0.0, {}
     axis = result.energy.ndim
@@ -400,11 +507,16 @@ def finer_meshes(result: HarnessEquilibrium, rtol: float) -> tuple[list[int], fl
         converged = np.moveaxis(np.asarray(group.converged), axis, 0)
         error = float(np.max(sizes[converged], initial=0.0))
         worst = max(worst, error)
+        depth = depths.setdefault(numbers, Depth())
+        penetration = depth.lacking(errors, counts[numbers[0]], np.asarray(group.converged))
         for place, number in enumerate(numbers):
-            all_defects[number] = None if errors.defects is None or axis else errors.defects[place]
+            defects = None if errors.defects is None or axis else errors.defects[place]
+            if penetration and defects is not None and errors.depths is not None:
+                defects = SAFETY * error / rtol * normalized(defects) + penetration * normalized(errors.depths[place])
+            all_defects[number] = defects
             # As many as the neediest: each size of mesh would be a larger program.
-            if SAFETY * error > rtol and counts[number] < SIZES["hermite"][-1]:
-                counts[number] = next_size(counts[number], error, rtol, "hermite")
+            if max(SAFETY * error / rtol, penetration) > 1 and counts[number] < SIZES["hermite"][-1]:
+                counts[number] = next_size(counts[number], max(error, penetration * rtol / SAFETY), rtol, "hermite")
     return counts, worst, all_defects
 
 
@@ -451,12 +563,19 @@ def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harn
             for numbers, group in zip(result.members, result.groups, strict=True)
         ]
 
-    def out_of_balance(harness: Harness, motions: Float[Array, "k"]) -> Float[Array, "k"]:
+    is_closed = jax.lax.stop_gradient(result.end_pressures > 0)
+
+    def out_of_balance(harness: Harness, unknown: tuple[Float[Array, "k"], Float[Array, "c"]]) -> Float[Array, "k+c"]:
+        """And the gaps that are closed, pressures where they are open."""
+        motions, pressures = unknown
         bodies, there = Bodies.of(harness), poses(harness, motions)
         forces = body_forces(harness, rods_at(harness, motions), bodies, there, result.members)
-        return bodies.motions.T @ forces.reshape(-1)
+        pushes, gaps = contact_forces(harness, result.members, there, pressures)
+        balance = bodies.motions.T @ (forces + pushes).reshape(-1)
+        return jnp.concatenate([balance, jnp.where(is_closed, gaps, pressures)])
 
-    def whole(harness: Harness, motions: Float[Array, "k"]) -> HarnessEquilibrium:
+    def whole(harness: Harness, unknown: tuple[Float[Array, "k"], Float[Array, "c"]]) -> HarnessEquilibrium:
+        motions, pressures = unknown
         rods, there, bodies = rods_at(harness, motions), poses(harness, motions), Bodies.of(harness)
         return dataclasses.replace(
             result,
@@ -464,15 +583,36 @@ def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harn
             positions=there.positions,
             frames=there.frames,
             energy=_energy(rods, bodies, there),
+            contact_forces=contact_forces(harness, result.members, there, pressures)[0][:, :3],
+            end_pressures=pressures,
             harness=harness,
         )
 
-    nowhere = jnp.zeros(len(others.columns), result.positions.dtype)
-    stiffness = jax.jacfwd(lambda motions: out_of_balance(harness, motions))(nowhere)
+    nowhere = jnp.zeros(len(others.columns), result.positions.dtype), result.end_pressures
+    stiffness = jax.jacfwd(lambda unknown: out_of_balance(harness, unknown))(nowhere)
+    stiffness = jnp.concatenate(stiffness, axis=1)
     _, lacking = jax.jvp(lambda harness: out_of_balance(harness, nowhere), (harness,), (change,))
-    motions = -jnp.linalg.solve(stiffness, lacking)
-    _, found = jax.jvp(whole, (harness, nowhere), (change, motions))
+    unknown = _solved_with_contacts(stiffness, -lacking, len(nowhere[0]))
+    unknown = unknown[: len(nowhere[0])], unknown[len(nowhere[0]) :]
+    _, found = jax.jvp(whole, (harness, nowhere), (change, unknown))
     return jax.tree.map(lambda leaf: None if leaf.dtype == jax.dtypes.float0 else leaf, found)
+
+
+def _solved_with_contacts(
+    matrix: Float[Array, "k+c k+c"], right: Float[Array, "k+c"], count: int
+) -> Float[Array, "k+c"]:
+    """Where contacts of several rods with a body are one, who bears it is undetermined: softened, and what that gives
+    way by asked for again.
+    """
+    if len(right) == count:
+        return jnp.linalg.solve(matrix, right)
+    stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]))
+    is_pressure = np.arange(len(right)) >= count
+    soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_SOFTNESS / stiffest, 0.0).astype(right.dtype))
+    found = jnp.linalg.solve(soft, right)
+    for _ in range(ENDS_HARDENINGS):
+        found += jnp.linalg.solve(soft, right - matrix @ found)
+    return found
 
 
 def body_forces(
@@ -486,7 +626,7 @@ def body_forces(
     positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
     frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
     for numbers, group in zip(members, rods, strict=True):
-        body, _, offset = _ends(harness, numbers)
+        body, _, offset = ends_of(harness, numbers)
         of_ends = (group.start_force, group.start_moment), (group.end_force, group.end_moment)
         for end, (sign, (force, moment)) in enumerate(zip((1, -1), of_ends, strict=True)):
             arms = jnp.einsum("kij,kj->ki", frames[body[:, end]], offset[:, end])

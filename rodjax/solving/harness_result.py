@@ -15,10 +15,13 @@ from rodjax.solving.status import Status
 
 
 class BodyPose(eqx.Module):
-    """`position` [..., 3] m; `frame` [..., 3, 3], columns the axes of the body."""
+    """`position` [..., 3] m; `frame` [..., 3, 3], columns the axes of the body; `contact_force` [..., 3] N, which
+    obstacles exert on the body where rods end in it.
+    """
 
     position: Float[Array, "... 3"]
     frame: Float[Array, "... 3 3"]
+    contact_force: Float[Array, "... 3"]
 
 
 class HarnessEquilibrium(Described):
@@ -27,7 +30,7 @@ class HarnessEquilibrium(Described):
     `result["trunk"]` is the `Equilibrium` of that rod, with clamps at the poses that were found in the place of its
     joints: its `index`, `critical`, `neutral` and estimated errors are those of the rod between these clamps.
     Iteration, `len`, `names`, `keys`, `values` and `items` are as of a dict of rods; `joints["y"].position` and
-    `.frame` the pose of a body.
+    `.frame` the pose of a body, and `.contact_force` what obstacles do there, of `contact_forces` [..., joints, 3] N.
 
     - `energy` [...] J: of rods, springs and dead loads, zero of height at the origin, without the work of dead moments
     - `converged` [...] bool, `status` [...] code, in words by `rodjax.describe`
@@ -36,6 +39,7 @@ class HarnessEquilibrium(Described):
     - `index` [...] int: how many independent motions lower it
     - `iterations`, `evaluations` [...] of the solver; `residual` [...] largest component of the gradient, in EI/L^2 of
       each rod, of a body in that of its stiffest rod
+    - `end_pressures` [..., c] N: of the contacts of bodies, of each stack of `groups` by rod, obstacle and end
     """
 
     # In the place of an equilibrium.
@@ -52,6 +56,8 @@ class HarnessEquilibrium(Described):
     iterations: Int[Array, "..."]
     evaluations: Int[Array, "..."]
     residual: Float[Array, "..."]
+    contact_forces: Float[Array, "... j 3"]
+    end_pressures: Float[Array, "... c"]
     harness: Harness
     members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
@@ -62,7 +68,7 @@ class HarnessEquilibrium(Described):
     @property
     def joints(self) -> dict[str, BodyPose]:
         return {
-            name: BodyPose(self.positions[..., j, :], self.frames[..., j, :, :])
+            name: BodyPose(self.positions[..., j, :], self.frames[..., j, :, :], self.contact_forces[..., j, :])
             for j, name in enumerate(self.harness.joint_names)
         }
 

@@ -1,5 +1,7 @@
 """How firmly an equilibrium stands: whether its softest motion has any stiffness left."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -105,41 +107,23 @@ def softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array,
     stiffness, motion = _softest(*jax.lax.stop_gradient((form, point, here)))
     moments, gaps = here.system.times(motion.rotation, motion.multipliers)
     work = jnp.sum(motion.rotation * moments) + jnp.sum(motion.multipliers * gaps)
-    quotient = work / jnp.sum(_inertia(form, here)[None] * motion.rotation**2)
+    quotient = work / jnp.sum(inertia(form, here)[None] * motion.rotation**2)
     return stiffness + quotient - jax.lax.stop_gradient(quotient), motion
 
 
-def _inertia(form: Form, here: Linearization) -> Float[Array, "m"]:
+def inertia(form: Form, here: Linearization) -> Float[Array, "m"]:
     """By the length of rod; none where a support holds the tangent."""
     return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
 
 
 def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
     """The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion."""
-    mass = _inertia(form, here)
-    one = jnp.ones((), mass.dtype)
+    mass = inertia(form, here)
 
     def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
         return factor(here.system.shifted(-value * mass)).negative > 0
 
-    # Outwards from zero until the sign changes, then by halves.
-    sign = jnp.where(lies_below(0 * one), -1.0, 1.0).astype(one.dtype)
-    width = jax.lax.while_loop(
-        lambda width: (lies_below(sign * width) == (sign < 0)) & (width < BRACKET_GROWTH**MAX_BRACKETS),
-        lambda width: BRACKET_GROWTH * width,
-        one,
-    )
-    inner = jnp.where(width > 1, width / BRACKET_GROWTH, 0.0)
-    bounds = jnp.minimum(sign * inner, sign * width), jnp.maximum(sign * inner, sign * width)
-
-    def halved(_, bounds: tuple[Float[Array, ""], Float[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        low, high = bounds
-        middle = (low + high) / 2
-        is_below = lies_below(middle)
-        return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
-
-    low, high = jax.lax.fori_loop(0, HALVINGS, halved, bounds)
-    low -= high - low
+    low = below_lowest(lies_below, jnp.ones((), mass.dtype))
     factors = factor(here.system.shifted(-low * mass))
     generic = components(here.bases, generic_field(point.tangents))
     first = Motion(generic, jnp.zeros_like(here.closure)), low
@@ -153,3 +137,25 @@ def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array
 
     motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
     return stiffness, motion
+
+
+def below_lowest(lies_below: Callable[[Float[Array, ""]], Bool[Array, ""]], unit: Float[Array, ""]) -> Float[Array, ""]:
+    """A number a little below the lowest eigenvalue, of which is known whether it lies below others."""
+    # Outwards from zero until the sign changes, then by halves.
+    sign = jnp.where(lies_below(0 * unit), -1.0, 1.0).astype(unit.dtype)
+    width = jax.lax.while_loop(
+        lambda width: (lies_below(sign * width) == (sign < 0)) & (width < BRACKET_GROWTH**MAX_BRACKETS * unit),
+        lambda width: BRACKET_GROWTH * width,
+        unit,
+    )
+    inner = jnp.where(width > unit, width / BRACKET_GROWTH, 0.0)
+    bounds = jnp.minimum(sign * inner, sign * width), jnp.maximum(sign * inner, sign * width)
+
+    def halved(_, bounds: tuple[Float[Array, ""], Float[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        low, high = bounds
+        middle = (low + high) / 2
+        is_below = lies_below(middle)
+        return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
+
+    low, high = jax.lax.fori_loop(0, HALVINGS, halved, bounds)
+    return 2 * low - high

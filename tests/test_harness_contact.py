@@ -1,0 +1,179 @@
+"""Harnesses beside obstacles and in fields: against the uncut rod, balance, and differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax
+from rodjax import Clamp, Harness, Joint, Newton, Plane, Potential, Rod, Scene
+
+GRAVITY = (0.0, 0.0, -9.81)
+ALONG = rodjax.frame((1, 0, 0))
+START, END = Clamp((0, 0, 0), ALONG), Clamp((0.85, 0.02, 0), ALONG)
+# A body whose axes are not those of the rod, beside it.
+ASIDE = {"frame": rodjax.frame((0, 1, 0), (0, 0, 1)), "offset": (0.1, 0, 0.02)}
+FLOOR = Plane((0, 0, -0.05), (0, 0, 1))
+TIGHT = Newton(tolerance=1e-11)
+
+
+def bedding(position, s):
+    return 5.0 * position[2] ** 2 + 0.3 * jnp.sin(5 * position[0])
+
+
+def plain(length: float) -> Rod:
+    return Rod.circular(length, 0.005, 1e7, poisson_ratio=0.5, density=1200.0)
+
+
+def bent(length: float) -> Rod:
+    rod = plain(length)
+    stiffnesses = (rod.EI, 1.5 * rod.EI), rod.GJ, rod.EA
+    return Rod(length, *stiffnesses, rod.mass_per_length, radius=0.005, rest_curvature=(0.5, 0.3), rest_twist=0.3)
+
+
+def cut(rod, end=END, **around) -> Harness:
+    first = Scene(rod(0.5), START, Joint("cut", **ASIDE), GRAVITY, **around)
+    return Harness({"a": first, "b": Scene(rod(0.5), Joint("cut", **ASIDE), end, GRAVITY, **around)})
+
+
+def assert_same(parts, whole):
+    """Two parts of the same elements, and the rod."""
+    assert parts.converged
+    assert parts.stable
+    nodes = jnp.concatenate([parts["a"].nodes, parts["b"].nodes[1:]])
+    # Residuals of 1e-11 EI/L^2, and of contacts of some 200 EI/L^3 of stiffness less.
+    assert jnp.max(jnp.abs(nodes - whole.nodes)) < 1e-9
+    largest = jnp.max(jnp.abs(whole.start_force))
+    assert jnp.max(jnp.abs(parts["a"].start_force - whole.start_force)) < 1e-9 * largest
+    assert jnp.max(jnp.abs(parts["b"].end_moment - whole.end_moment)) < 1e-9
+    assert abs(parts.energy - whole.energy) < 1e-9 * abs(whole.energy)
+    contacts = jnp.concatenate([parts["a"].contact_forces, parts["b"].contact_forces[1:]])
+    n = len(parts["a"].s) - 1
+    contacts = contacts.at[n].add(parts["b"].contact_forces[0] + parts.joints["cut"].contact_force)
+    assert jnp.max(jnp.abs(contacts - whole.contact_forces)) < 1e-8 * largest
+
+
+@pytest.mark.parametrize("rod", [plain, pytest.param(bent, marks=pytest.mark.slow)])
+def test_a_cut_rod_in_a_field_is_the_rod(rod):
+    field = [Potential(bedding)]
+    whole = rodjax.solve(Scene(rod(1.0), START, END, GRAVITY, potentials=field), segments=8, solver=TIGHT)
+    parts = rodjax.solve(cut(rod, potentials=field), segments=4, solver=TIGHT)
+    assert_same(parts, whole)
+
+
+@pytest.fixture(scope="module")
+def lying() -> rodjax.HarnessEquilibrium:
+    return rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=4, solver=TIGHT)
+
+
+def test_a_cut_rod_on_a_floor_is_the_rod(lying):
+    """The joint lies on the floor as the node does."""
+    whole = rodjax.solve(Scene(plain(1.0), START, END, GRAVITY, obstacles=[FLOOR]), segments=8, solver=TIGHT)
+    assert lying.joints["cut"].contact_force[2] > 1e-3
+    assert_same(lying, whole)
+
+
+@pytest.mark.slow
+def test_a_cut_rod_by_frames_on_a_floor_is_the_rod():
+    parts = rodjax.solve(cut(bent, obstacles=[FLOOR]), segments=4, solver=TIGHT)
+    # It may lie to either side.
+    nodes = jnp.concatenate([parts["a"].nodes, parts["b"].nodes[1:]])
+    guess = rodjax.Guess(nodes, parts["a"].total_twist + parts["b"].total_twist)
+    scene = Scene(bent(1.0), START, END, GRAVITY, obstacles=[FLOOR])
+    whole = rodjax.solve(scene, segments=8, solver=TIGHT, guess=guess)
+    assert jnp.sum(whole.contact_forces[:, 2]) > 0.01
+    assert_same(parts, whole)
+
+
+def test_what_lies_on_a_floor_comes_back_from_a_file(lying, tmp_path):
+    rodjax.save(lying, tmp_path / "lying.vtkhdf")
+    loaded = rodjax.load(tmp_path / "lying.vtkhdf")
+    assert isinstance(loaded, rodjax.HarnessEquilibrium)
+    assert jnp.array_equal(loaded.end_pressures, lying.end_pressures)
+    assert rodjax.solve(loaded.harness, segments=4, guess=loaded, solver=Newton(tolerance=1e-10)).iterations == 0
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_cut_rod_on_a_floor_are_those_of_the_rod(lying):
+    whole = rodjax.solve(Scene(plain(1.0), START, END, GRAVITY, obstacles=[FLOOR]), segments=8, solver=TIGHT)
+
+    def changed(numbers):
+        floor = Plane(jnp.stack([0 * numbers[0], 0 * numbers[0], -0.05 + numbers[0]]), (0, 0, 1))
+        return floor, Clamp(jnp.stack([0.85 + 0 * numbers[0], 0.02 + numbers[1], 0 * numbers[0]]), END.frame)
+
+    def of_whole(numbers):
+        floor, end = changed(numbers)
+        scene = Scene(plain(1.0), START, end, GRAVITY, obstacles=[floor])
+        found = rodjax.solve(scene, segments=8, solver=TIGHT, guess=whole)
+        return jnp.concatenate([found.end_force, found.nodes[4]])
+
+    def of_parts(numbers):
+        floor, end = changed(numbers)
+        found = rodjax.solve(cut(plain, end, obstacles=[floor]), segments=4, solver=TIGHT, guess=lying)
+        return jnp.concatenate([found["b"].end_force, found["b"].nodes[0]])
+
+    direction = jnp.array([1.0, 0.5])
+    expected, found = (jax.jvp(of, (jnp.zeros(2),), (direction,))[1] for of in (of_whole, of_parts))
+    # Contacts of a linearised system are rigid to about 1e-10.
+    assert jnp.max(jnp.abs(found - expected)) < 1e-7 * jnp.max(jnp.abs(expected))
+    assert abs(expected[5] - 1.0) < 1e-6  # the middle goes with the floor
+
+
+def star(floor: Plane) -> Harness:
+    """Three branches of 40 cm from a hub of 20 g; one of them hangs down to a floor."""
+    cables = {}
+    for k, (x, y, z, length) in enumerate([(0.3, 0.05, 0.1, 0.4), (-0.1, 0.3, 0.1, 0.4), (-0.15, -0.3, -0.1, 0.55)]):
+        outwards = rodjax.frame((x, y, 0), (0, 0, 1))
+        end = Clamp((x, y, z), outwards)
+        near = [floor] if k == 2 else []
+        cables[f"branch {k}"] = Scene(plain(length), Joint("hub", outwards), end, GRAVITY, obstacles=near)
+    return Harness(cables, {"hub": rodjax.Body(mass=0.02)})
+
+
+@pytest.mark.slow
+def test_a_star_with_a_branch_on_a_floor_is_in_balance():
+    result = rodjax.solve(star(Plane((0, 0, -0.15), (0, 0, 1))), segments=12, solver=Newton(tolerance=1e-10))
+    assert result.stable
+    assert result["branch 2"].contact_forces[:, 2].sum() > 1e-3
+    total = sum(cable.end_force for cable in result.values()) + jnp.sum(result["branch 2"].contact_forces, axis=0)
+    rods = [cable.scene.rod for cable in result.values()]
+    weight = sum(rod.length * rod.mean_mass_per_length for rod in rods) + 0.02
+    assert jnp.max(jnp.abs(total + weight * jnp.array(GRAVITY))) < 1e-9
+    force = sum(cable.start_force for cable in result.values()) + 0.02 * jnp.array(GRAVITY)
+    moment = sum(cable.start_moment for cable in result.values())
+    assert jnp.max(jnp.abs(force)) < 1e-9
+    assert jnp.max(jnp.abs(moment)) < 1e-9
+    # No node is deeper than the rod is thick, and what lies above the floor is not pushed.
+    gaps = result["branch 2"].nodes[:, 2] + 0.15 - 0.005
+    assert jnp.min(gaps) > -1e-9
+    assert jnp.max(jnp.where(gaps > 1e-3, jnp.abs(result["branch 2"].contact_forces[:, 2]), 0.0)) < 1e-9
+
+
+@pytest.mark.slow
+def test_a_joint_that_is_held_may_lie_within_an_obstacle():
+    """As an end of a scene may: a connector on a wall."""
+    body = rodjax.Body(support=rodjax.Pin((0.4, 0.0, -0.052)))
+    joint = Joint("cut", ALONG)
+    cables = {
+        "a": Scene(plain(0.5), START, joint, GRAVITY, obstacles=[FLOOR]),
+        "b": Scene(plain(0.5), joint, END, GRAVITY, obstacles=[FLOOR]),
+    }
+    result = rodjax.solve(Harness(cables, {"cut": body}), segments=4)
+    assert result.converged
+    assert jnp.all(result.joints["cut"].contact_force == 0)
+
+
+@pytest.mark.slow
+def test_sensitivities_of_a_harness_are_its_derivatives(lying):
+    names = {"of": ["cables.b.end_force", "joints.cut.position", "energy"], "wrt": ["cables.a.rod.EI"]}
+    table = rodjax.sensitivities(lying.harness, **names, segments=4, solver=TIGHT, guess=lying)
+    assert {name: list(row) for name, row in table.items()} == dict.fromkeys(names["of"], names["wrt"])
+
+    def height(EI):
+        harness = eqx.tree_at(lambda harness: harness.scenes[0].rod.EI, lying.harness, EI)
+        return rodjax.solve(harness, segments=4, solver=TIGHT, guess=lying)["b"].end_force
+
+    at = lying.harness["a"].rod.EI
+    expected = jax.jacfwd(height)(at)
+    np.testing.assert_allclose(table["cables.b.end_force"]["cables.a.rod.EI"], expected, rtol=1e-9)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
-from rodjax.discretization.nodal_point import Friction, Nodal
+from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import OnElements
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
@@ -134,6 +134,18 @@ class Form(eqx.Module):
     ) -> Any:
         """The point turned by rotations in its bases, and under another force; `others`: as of `others`."""
 
+    def no_others(self, point: Any) -> Any:
+        """A step that changes nothing of that."""
+        return None if point.nodal is None else NodalChange.nothing(point.nodal)
+
+    def longest_step(self, point: Any, others: Any) -> Float[Array, ""] | None:
+        """The most of a step that may be taken for what it changes of `others`; `None` where that is all."""
+        return None
+
+    def is_blocked(self, point: Any) -> Bool[Array, ""] | None:
+        """Whether a search has come to where only another form goes on; `None` where none does."""
+        return None
+
     def nodal_held(self, nodal: Any) -> Any:
         """With held nodes where the supports are."""
         return nodal
@@ -149,6 +161,10 @@ class Form(eqx.Module):
     @abstractmethod
     def in_plane(self, point: Any, normal: Float[Array, "3"], axes: Float[Array, "3 2"]) -> tuple["Form", Any]:
         """Of a rod that stays in the plane of two axes, and a point moved into it."""
+
+    @abstractmethod
+    def in_plane_of(self, other: "Form") -> "Form":
+        """The same in the plane of another form of the same scene, or in all of space as that is."""
 
     @abstractmethod
     def out_of_plane(self, normal: Float[Array, "3"]) -> "Form":

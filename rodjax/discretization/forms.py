@@ -1,5 +1,8 @@
 """The form of a scene on the mesh of a shape: by tangents where these say all, else by frames."""
 
+from typing import Any
+
+from rodjax.discretization.cells import ElementCells, JointCells
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm
@@ -14,12 +17,14 @@ from rodjax.model.scene import Scene, has_node_places
 
 def form_of(scene: Scene, shape: Shape) -> Form:
     """Of a nondimensional scene."""
-    if isinstance(shape, FramedCurve):
-        cells = cells_of(scene, shape)
-        return NodalFrames.of(scene, cells) if has_node_places(scene) else FrameForm.of(scene, cells)
-    if has_node_places(scene):
-        return NodalTangents.of(scene, field_of(scene, shape))
-    return MixedForm.of(scene, field_of(scene, shape))
+    return form_on(scene, cells_of(scene, shape) if isinstance(shape, FramedCurve) else field_of(scene, shape))
+
+
+def form_on(scene: Scene, field: Any) -> Form:
+    """On a mesh that is given: a `TangentField`, or `Cells` of frames."""
+    if isinstance(field, JointCells | ElementCells):
+        return NodalFrames.of(scene, field) if has_node_places(scene) else FrameForm.of(scene, field)
+    return NodalTangents.of(scene, field) if has_node_places(scene) else MixedForm.of(scene, field)
 
 
 def field_of(scene: Scene, shape: Shape) -> TangentField:

@@ -185,6 +185,10 @@ class FrameForm(Form):
         form = dataclasses.replace(self, across=across, layout=self.layout.in_axes(axes))
         return form, point.flattened(normal, across)
 
+    def in_plane_of(self, other: Form) -> "FrameForm":
+        assert isinstance(other, FrameForm)
+        return dataclasses.replace(self, across=other.across, layout=other.layout)
+
     def out_of_plane(self, normal: Float[Array, "3"]) -> "FrameForm":
         return dataclasses.replace(self, across=None, layout=self.layout.in_axes(None))
 

@@ -130,6 +130,10 @@ class MixedForm(Form):
     ) -> tuple["MixedForm", MixedPoint]:
         return self.in_axes(axes), point.flattened(axes)
 
+    def in_plane_of(self, other: Form) -> "MixedForm":
+        assert isinstance(other, MixedForm)
+        return dataclasses.replace(self, axes=other.axes, layout=other.layout)
+
     def out_of_plane(self, normal: Float[Array, "3"]) -> "MixedForm":
         return self.in_axes(normal[:, None])
 

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
+from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
@@ -104,8 +105,8 @@ class Factors(eqx.Module):
         return x - short_sum(self.border_solution * y[None, :, None], axis=1), y
 
 
-AnyFactors = Factors | ChainFactors
-AnySystem = SaddlePointSystem | ChainSystem
+AnyFactors = Factors | ChainFactors | BorderedFactors
+AnySystem = SaddlePointSystem | ChainSystem | BorderedSystem
 
 
 def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
@@ -119,6 +120,9 @@ def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
     """
     if isinstance(system, ChainSystem):
         return factor_chain(system)
+    if isinstance(system, BorderedSystem):
+        columns = system.columns
+        return system.factored(*_factor_and_solve_all(system.inner, columns.x, columns.y, is_regularized))
     return _factor(system, system.border, is_regularized)[0]
 
 
@@ -129,8 +133,26 @@ def factor_and_solve(
     if isinstance(system, ChainSystem):
         factors = factor(system)
         return factors, *factors.solve(f, c)
+    if isinstance(system, BorderedSystem):
+        g, c = system.parted(c)
+        all_f, all_c = (jnp.concatenate([part, last[None]]) for part, last in zip(system.columns, (f, c), strict=True))
+        inner, found = _factor_and_solve_all(system.inner, all_f, all_c, is_regularized)
+        factors = system.factored(inner, Vectors(found.x[:-1], found.y[:-1]))
+        return factors, *factors.joined(found.x[-1], found.y[-1], g)
     factors, x = _factor(system, jnp.concatenate([system.border, f[:, None]], axis=1), is_regularized)
     return factors, *factors._bordered(x[:, -1], c)
+
+
+def _factor_and_solve_all(
+    system: SaddlePointSystem | ChainSystem, f: Float[Array, "r b n"], c: Float[Array, "r k"], is_regularized: bool
+) -> tuple[Factors | ChainFactors, Vectors]:
+    """The same for r right sides."""
+    if isinstance(system, ChainSystem):
+        chain = factor_chain(system)
+        return chain, Vectors(*jax.vmap(chain.solve)(f, c))
+    k = system.border.shape[1]
+    factors, x = _factor(system, jnp.concatenate([system.border, jnp.swapaxes(f, 0, 1)], axis=1), is_regularized)
+    return factors, Vectors(*jax.vmap(factors._bordered, in_axes=(1, 0))(x[:, k:], c))
 
 
 def _factor(

@@ -29,6 +29,7 @@ from rodjax.discretization.nodal import NodalForm, pressure_rows
 from rodjax.discretization.nodal_point import Friction
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.passage import PLACES, Before
 from rodjax.model.plane import check_planar, is_planar, plane
@@ -79,7 +80,6 @@ from rodjax.solving.result import (
     warn_of_single_precision,
     warn_of_unknown_mesh,
 )
-from rodjax.solving.sliding_search import INNER_TOLERANCE, solve_sliding
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 from rodjax.warn import warn
@@ -106,6 +106,8 @@ MOST_FAILURES = 3
 # Where no finer mesh has an equilibrium, that of a coarser one is one if the rod lies no deeper than this part of its
 # radius within an obstacle between nodes.
 MOST_DEPTH_LEFT = 0.05
+# On so many meshes at most a rod slides through its clips.
+MOST_MESHES = 12
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
 MAX_SEGMENTS = 100_000
 
@@ -742,12 +744,7 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     solver = options.solver
     if isinstance(solver, Newton):
         search = Search.of(scene, guess, first, options)
-        if has_node_places(scene) and not has_potential(scene):
-            is_cold = jnp.all(guess.end_force == 0)
-            end = found_under_loads(search.form, search.point, solver, options.find, is_cold)
-        else:
-            end = find_equilibrium(search.form, search.point, solver, options.find)
-        found = search.found(end)
+        found = search.found(_sought(search.form, search.point, guess, solver, options.find))
         return on_one_side(search, search.form, found, guess.before) if scene.obstacles else found
     assert isinstance(guess.shape, Polyline)
     problem, start = FiniteDifference.begin(scene, guess.shape, first)
@@ -755,6 +752,13 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
     point = minimum.problem.mixed_point(minimum.point)
     stable = is_stable(MixedForm.of(scene, field_of(scene, guess.shape)), point)
     return Found(SolverState(minimum.point, point.end_force, guess.units), point, minimum.outcome, stable)
+
+
+def _sought(form: Form, point: Point, guess: SolverState, solver: Newton, find: Find) -> NewtonEnd:
+    """Where the search ends that begins at a point."""
+    if not has_potential(form.scene) and (has_node_places(form.scene) or slides(form.scene)):
+        return found_under_loads(form, point, solver, find, jnp.all(guess.end_force == 0))
+    return find_equilibrium(form, point, solver, find)
 
 
 def on_one_side(search: Search, form: Form, found: Found, before: Before | None) -> Found:
@@ -787,23 +791,78 @@ def on_one_side(search: Search, form: Form, found: Found, before: Before | None)
 
 
 def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Found:
-    """The same where the rod slides through clips."""
+    """The same where the rod slides through clips: their arclengths are unknowns.
+
+    The mesh goes along with them. Where it was stretched by that, or another one belongs to where they have come, the
+    search goes on from there on a mesh that is made anew.
+    """
     assert guess.places is not None
-    assert isinstance(options.solver, Newton)
-    _, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
+    shape, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
     if scene.turns is not None:
         # They are those of the first shape.
+        guess = dataclasses.replace(guess, shape=shape.with_unknowns(point))
         scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
 
-    tolerance = options.solver.tolerance
-    inner = eqx.tree_at(lambda options: options.solver.tolerance, options, INNER_TOLERANCE * tolerance)
-
-    def find_at(scene: Scene, last: Found) -> Found:
-        return _found(scene, last.state, FirstTwist(last.point.total_twist), inner)
+    def search(last: _Sliding) -> _Sliding:
+        state = last.found.state
+        assert state.places is not None
+        here = slid(scene, state.places)
+        anew = _on_mesh_of(here, state.shape, guess.shape)
+        shape = jax.tree.map(lambda old, new: jnp.where(last.count == 0, old, new), state.shape, anew)
+        state = dataclasses.replace(state, shape=shape)
+        found, goes_on = _slid_once(here, state, FirstTwist(last.found.point.total_twist), options)
+        before, after = last.found.outcome, found.outcome
+        count = last.count + 1
+        outcome = Outcome(
+            after.residual,
+            before.iterations + after.iterations,
+            before.evaluations + after.evaluations,
+            jnp.where(goes_on & (count == MOST_MESHES), Status.MAX_ITERATIONS, after.status),
+        )
+        return _Sliding(dataclasses.replace(found, outcome=outcome), count, goes_on)
 
     count = jnp.zeros((), int)
-    begin = Found(guess, point, Outcome(jnp.zeros_like(point.total_twist), count, count, count), jnp.array(False))
-    return solve_sliding(scene, find_at, begin, tolerance, options.find)
+    nothing = Outcome(jnp.zeros_like(point.total_twist), count, count, count)
+    begin = _Sliding(Found(guess, point, nothing, jnp.array(False)), count, jnp.array(True))
+    return jax.lax.while_loop(lambda last: last.goes_on & (last.count < MOST_MESHES), search, begin).found
+
+
+class _Sliding(eqx.Module):
+    """What has been found on so many meshes, and whether another one is needed."""
+
+    found: Found
+    count: Int[Array, ""]
+    goes_on: Bool[Array, ""]
+
+
+def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> tuple[Found, Bool[Array, ""]]:
+    """What a search finds on one mesh, and whether it is to go on on another one."""
+    assert isinstance(options.solver, Newton)
+    assert guess.places is not None
+    search = Search.of(scene, guess, first, options)
+    descends = options.find == "minimum"
+    form = SlidingForm(scene=scene, made=scene, shape=search.shape, first=search.form, descends=descends)  # pyright: ignore
+    is_warm = jnp.any(guess.end_force != 0)
+    point = SlidingPoint(search.point, guess.places, is_warm, jnp.zeros_like(guess.places))
+    end = _sought(form, point, guess, options.solver, options.find)
+    assert isinstance(end.point, SlidingPoint)
+    reached = dataclasses.replace(search, form=form.at(end.point.places))
+    found = reached.found(dataclasses.replace(end, point=end.point.inner))
+    if scene.obstacles:
+        found = on_one_side(search, reached.form, found, guess.before)
+    goes_on = is_converged(end.outcome.status) & form.is_misplaced(end.point)
+    is_blocked = form.is_blocked(end.point)
+    return found, goes_on if is_blocked is None else goes_on | is_blocked
+
+
+def _on_mesh_of(scene: Scene, shape: Shape, other: Shape) -> Shape:
+    """A shape on the mesh of another one, as a scene has it."""
+    if isinstance(shape, Curve) and isinstance(other, Curve):
+        return shape.on(form_of(scene, shape.on(other.s)).field.s)
+    if isinstance(shape, FramedCurve) and isinstance(other, FramedCurve):
+        nodes = form_of(scene, shape.on(other.s, of_joints=False)).field.s
+        return shape.on(nodes, of_joints=False)
+    return shape
 
 
 def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Shape, Point]:

@@ -6,7 +6,6 @@ border, says which rotations and forces take it away: O(n). All of it is made of
 derivative has derivatives itself, and a transpose.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -16,10 +15,10 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import is_known
 from rodjax.discretization.form import Point
-from rodjax.discretization.forms import form_of
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
-from rodjax.model.scene import Scene, nondimensional, slid, sliding_places
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
+from rodjax.model.scene import Scene, nondimensional
 from rodjax.programs.linear import linear
 from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to, examined
@@ -86,67 +85,46 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
     _, point = form_and_point(result)
-    places, of_places = result.state.places, None
-    if places is None:
-        changes = _response(scaled, shape, point, result)(scaled_change)
-    else:
-        changes, of_places = _slid_change(slid(scaled, places), scaled_change, shape, point, result)
-    _, change = jax.jvp(same, (scene, shape, point, places), (scene_change, *changes, of_places))
+    places = result.state.places
+    changes = _change(scaled, scaled_change, shape, point, places, result)
+    _, change = jax.jvp(same, (scene, shape, point, places), (scene_change, *changes))
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
-def _slid_change(
-    scene: Scene, scene_change: Scene, shape: Shape, point: Point, result: Equilibrium
-) -> tuple[tuple[Shape, Point], Float[Array, "slides"]]:
-    """The change of shape and point of an equilibrium with that of its nondimensional scene and of the arclengths of
-    its sliding clips, and the latter: by as much as leaves them without axial force.
-    """
-    respond = _response(scene, shape, point, result)
-
-    def with_axial(change: Scene) -> tuple[tuple[Shape, Point], Float[Array, "slides"]]:
-        """And what the axial forces gain."""
-        changes = respond(change)
-
-        def axial(scene: Scene, shape: Shape, point: Point) -> Float[Array, "slides"]:
-            return form_of(scene, shape).axial_forces(point)
-
-        return changes, jax.jvp(axial, (scene, shape, point), (change, *changes))[1]
-
-    places = sliding_places(scene)
-    assert places is not None
-    alone = jax.tree.map(jnp.zeros_like, scene)
-    each = jnp.eye(len(places), dtype=places.dtype)
-    by_places, rates = jax.vmap(lambda change: with_axial(slid(alone, change)))(each)
-    fixed, gained = with_axial(slid(scene_change, jnp.zeros_like(places)))
-    of_places = -jnp.linalg.solve(rates.T, gained)
-    return jax.tree.map(lambda one, rate: one + jnp.tensordot(of_places, rate, 1), fixed, by_places), of_places
-
-
-def _response(scene: Scene, shape: Shape, point: Point, result: Equilibrium) -> Callable[[Scene], tuple[Shape, Point]]:
-    """How shape and point of an equilibrium change with its scene, nondimensional.
+def _change(
+    scene: Scene,
+    scene_change: Scene,
+    shape: Shape,
+    point: Point,
+    places: Float[Array, "slides"] | None,
+    result: Equilibrium,
+) -> tuple[Shape, Point, Float[Array, "slides"] | None]:
+    """How shape and point of an equilibrium change with its scene, nondimensional, and the arclengths at which it
+    slides through clips.
 
     Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
     """
-    form, begin = carried_to(scene, shape, point)
+    unknown = point if places is None else SlidingPoint.settled_at(point, places)
+    form, begin = carried_to(scene, shape, unknown)
     here = form.linearized(begin)
     factors, is_critical, neutral = examined(form, begin, here, result.residual)
 
-    def gradient(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        form, here = carried_to(scene, shape, point)
+    def unbalanced(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        form, here = carried_to(scene, shape, unknown)
         return form.unbalanced(here)
 
-    def reached(scene: Scene, motion: Motion) -> tuple[Shape, Point]:
-        form, there = carried_to(scene, shape, point, motion)
-        return shape.reached(form, there), form.settled(there)
+    def reached(scene: Scene, motion: Motion) -> tuple[Shape, Point, Float[Array, "slides"] | None]:
+        form, there = carried_to(scene, shape, unknown, motion)
+        places = None
+        if isinstance(form, SlidingForm):
+            assert isinstance(there, SlidingPoint)
+            form, there, places = form.at(there.places), there.inner, there.places
+        return shape.reached(form, there), form.settled(there), places
 
-    def respond(scene_change: Scene) -> tuple[Shape, Point]:
-        _, (f, c) = jax.jvp(gradient, (scene,), (scene_change,))
-        # A factor, as a choice between numbers would leave the transpose without the one that is none.
-        sign = jnp.where(result.converged & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
-        f, c = sign * f, sign * c
-        motion = neutral.taken_from(Motion(*factors.solve(f, c)))
-        nothing = jax.tree.map(jnp.zeros_like, motion)
-        _, changes = jax.jvp(reached, (scene, nothing), (scene_change, motion))
-        return changes
-
-    return respond
+    _, (f, c) = jax.jvp(unbalanced, (scene,), (scene_change,))
+    # A factor, as a choice between numbers would leave the transpose without the one that is none.
+    sign = jnp.where(result.converged & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
+    f, c = sign * f, sign * c
+    motion = neutral.taken_from(Motion(*factors.solve(f, c)))
+    nothing = jax.tree.map(jnp.zeros_like, motion)
+    return jax.jvp(reached, (scene, nothing), (scene_change, motion))[1]

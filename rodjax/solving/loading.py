@@ -33,7 +33,9 @@ class _State(eqx.Module):
 
 
 def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> NewtonEnd:
-    """The equilibrium of a form with node places, from a point, which is one under other loads if it is not cold."""
+    """The equilibrium of a form with node places or sliding clips, from a point that is one under other loads if it is
+    not cold.
+    """
     without: Form = dataclasses.replace(form, scene=conservative(form.scene))
     count = jnp.zeros((), int)
     outcome = Outcome(jnp.zeros_like(point.total_twist), count, count, count)

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import not_negative, plain_number, whole_number
 from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
-from rodjax.discretization.nodal_point import NodalChange
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.scene import scene_axes
@@ -204,6 +203,9 @@ def _advanced(
     force_change = form.layout.forces(form.closure(multipliers))
     largest = jnp.sqrt(jnp.max(dot(rotation, rotation)))
     step = jnp.minimum(1.0, solver.max_rotation / largest)
+    longest = form.longest_step(point, others)
+    if longest is not None:
+        step = jnp.minimum(step, longest)
     if _descends(form, find):
         force_change = step * force_change
 
@@ -234,6 +236,9 @@ def _advanced(
         point = eqx.tree_at(lambda point: point.total_twist, point, twist)
     again |= is_lost
     status = jnp.where(again, Status.RUNNING, status)
+    is_blocked = form.is_blocked(point)
+    if is_blocked is not None:
+        status = jnp.where(is_blocked & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
     return NewtonState(
         point=point,
         bases=here.bases,
@@ -295,7 +300,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),
-        others=None if point.nodal is None else NodalChange.nothing(point.nodal),
+        others=form.no_others(point),
         weight=zero,
         merit=zero,
         slope=zero,

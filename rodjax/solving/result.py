@@ -27,7 +27,7 @@ from rodjax.discretization.error import (
     on_elements,
 )
 from rodjax.discretization.finite_difference import Polyline
-from rodjax.discretization.form import NEUTRAL, Form, Point
+from rodjax.discretization.form import Form, Point
 from rodjax.discretization.form_results import clip_moments_of, positions_between_nodes, resultants_of
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
@@ -53,7 +53,7 @@ from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensi
 from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
-from rodjax.solving.sliding import slide
+from rodjax.solving.sliding import change_with_axial_forces, sliding_at
 from rodjax.solving.stability import examined
 from rodjax.solving.status import Outcome, Status, is_converged, with_strain
 from rodjax.units import Units
@@ -461,11 +461,7 @@ def _errors_of(equilibrium: Equilibrium, axis: Float[Array, "3"]) -> Errors:
     if errors.axial is None:
         return errors
     # The rod slides until the axial forces of the continuum vanish, and all of it moves with that.
-    now = slide(form.scene, state.shape, point)
-    further = -jnp.linalg.solve(now.rates, errors.axial)
-    nodes, forces, moments, curvature = (
-        jnp.tensordot(further, rate, 1) for rate in (now.nodes, now.forces, now.moments, now.curvature)
-    )
+    nodes, forces, moments, curvature = change_with_axial_forces(form.scene, state.shape, point, -errors.axial)
     more = Sizes(longest(forces), longest(moments), jnp.max(jnp.abs(curvature))).relative_to(errors.scale)
     return errors._replace(
         nodes=errors.nodes + nodes,
@@ -487,14 +483,13 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     if equilibrium.discretization == "continuum":
         return nothing
     form, point = form_and_point(equilibrium)
+    if slides(equilibrium.scene):
+        form, point = sliding_at(form.scene, equilibrium.state.shape, point)
     here = form.linearized(point)
     _, critical, neutral = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
         return eqx.tree_at(lambda nothing: nothing.critical, nothing, critical)
     negative = factor(form.regular(here.system), is_regularized=True).negative
-    if slides(equilibrium.scene):
-        stiffness = slide(form.scene, equilibrium.state.shape, point).stiffness
-        negative += jnp.sum(jnp.linalg.eigvalsh(stiffness) < -NEUTRAL)
     return _Examination(critical, negative, jnp.any(neutral.turn.rotation != 0))
 
 

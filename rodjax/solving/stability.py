@@ -1,6 +1,7 @@
 """How firmly an equilibrium stands: whether its softest motion has any stiffness left."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,9 +13,10 @@ from rodjax.discretization.forms import form_of
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.motion import Motion, Neutral, neutral_motions
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import AnyFactors, factor, factor_and_solve
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, slid
 
 # Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
 SHIFT_ROUNDINGS = 100.0
@@ -37,9 +39,10 @@ def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None =
     """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
 
     The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
-    carried there.
+    carried there. Of a `SlidingPoint` the arclengths are its own, and no change of the scene's.
     """
-    form = form_of(scene, shape)
+    is_sliding = isinstance(point, SlidingPoint)
+    form: Any = SlidingForm.of(slid(scene, point.places), shape) if is_sliding else form_of(scene, shape)
     begin = form.holding(point)
     if motion is None:
         return form, begin

@@ -1,0 +1,411 @@
+"""A rod that slides through clips: the arclengths at which it passes them are unknowns beside those of its form.
+
+At given arclengths s a scene has a form (`forms.form_of`) on a mesh whose nodes at the clips go along with them. Asked
+for is that no sliding clip pulls along the rod, R . t = 0: one more row for each, and one more column, the derivatives
+of all other rows by s, of which the nodes that move are a part (`linalg.bordered`). The energy falls by as much as
+a clip pulls, dW/ds = -R . t (1 + e), but for the error of the mesh: so row and column are nearly the same, and the
+negative eigenvalues of the complement add to those at given arclengths.
+
+A step is judged by the energy, less what its slope by s is beyond -R . t at the point where the step begins: so what
+is found is free of axial forces to the last digit, on any mesh. Where a clip holds the tangent, this is
+all but the error of the mesh: the moment jumps there, and what slides would take its work (Bigoni et al. 2015,
+"Eshelby-like forces acting on elastic structures").
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.discretization.cells import varying
+from rodjax.discretization.edges import EdgeTangents
+from rodjax.discretization.finite_difference import Polyline
+from rodjax.discretization.form import NEUTRAL, Form, Linearization
+from rodjax.discretization.forms import form_of, form_on
+from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.nodes import LEAST_ELEMENT
+from rodjax.discretization.shape import Shape
+from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
+from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
+from rodjax.model.along import Along
+from rodjax.model.scene import Scene, slid, sliding_places
+
+# The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
+# pass, as it then has a node of its own no more.
+LARGEST_STEP = 0.3
+NEAR_LOADS = 0.9
+# The axial force that rounding of arclengths leaves where the rod is nearly taut, in units of EA.
+PLACE_ROUNDINGS = 64
+# A rod that is not yet in equilibrium in its clips, up to this residual [EI/L^2], comes to it first.
+SETTLED = 0.1
+# A step along the rod [L] by which axial forces lead away from a largest energy.
+LEAST_SLIDE = 1e-7
+# Elements beside a clip that have become longer or shorter by this factor are made anew.
+STRETCHED = 1.25
+# Nodes that lie apart by less [L] are the same.
+SAME_NODE = 1e-9
+
+
+class SlidingPoint(eqx.Module):
+    """The unknowns of the form at these arclengths; `slides`: whether these change with the next step; `excess`: the
+    slope of the energy by them beyond -R . t where the last step began.
+    """
+
+    inner: Any
+    places: Float[Array, "j"]
+    slides: Bool[Array, ""]
+    excess: Float[Array, "j"]
+
+    @staticmethod
+    def settled_at(point: Any, places: Float[Array, "j"]) -> "SlidingPoint":
+        """An equilibrium of a rod that slides."""
+        return SlidingPoint(point, places, jnp.array(True), jnp.zeros_like(places))
+
+    @property
+    def tangents(self) -> Float[Array, "3 m"]:
+        return self.inner.tangents
+
+    @property
+    def end_force(self) -> Float[Array, "3 parts"]:
+        return self.inner.end_force
+
+    @property
+    def total_twist(self) -> Float[Array, ""]:
+        return self.inner.total_twist
+
+    @property
+    def nodal(self) -> Nodal | None:
+        return self.inner.nodal
+
+
+class SlidingChange(NamedTuple):
+    """Of a step; `others`: as of the form at given arclengths."""
+
+    places: Float[Array, "j"]
+    others: Any
+
+
+class SlidingLinearization(Linearization):
+    """With the arclengths, whether they change, and the slope of the energy by them beyond -R . t."""
+
+    places: Float[Array, "j"] = eqx.field(kw_only=True)
+    slides: Bool[Array, ""] = eqx.field(kw_only=True)
+    excess: Float[Array, "j"] = eqx.field(kw_only=True)
+
+    @property
+    def at_places(self) -> Linearization:
+        """That of the form at given arclengths."""
+        assert isinstance(self.system, BorderedSystem)
+        closure = self.closure[len(self.places) :]
+        parts = (self.bases, self.gradient, closure, self.system.inner, self.energy, self.residual)
+        return Linearization(*parts, self.gaps, self.ways)
+
+
+class SlidingForm(Form):
+    """A nondimensional scene as a function of a `SlidingPoint`. The multipliers begin with the arclengths.
+
+    `made`: the scene of which forms are made, on meshes that are the one of `shape` where the clips are as in `made`;
+    `scene`: with other loads, of which a search may have a part. `first`: the form there, in its plane if it has one.
+    `descends`: whether steps go down from a largest energy by the arclengths, not to it.
+    """
+
+    scene: Scene
+    made: Scene
+    shape: Shape
+    first: Form
+    descends: bool = eqx.field(static=True, default=False)
+
+    @staticmethod
+    def of(scene: Scene, shape: Shape) -> "SlidingForm":
+        """The clips of the scene where they are to begin with."""
+        return SlidingForm(scene=scene, made=scene, shape=shape, first=form_of(scene, shape))  # pyright: ignore
+
+    def at(self, places: Float[Array, "j"]) -> Form:
+        """The form at these arclengths."""
+        scene, field = slid(self.made, places), self.field
+        s = field.s + jnp.interp(field.s, *self._fixed(places))
+        s = s.at[field.clip_nodes].set(jnp.stack([clip.at for clip in scene.clips]))
+        if isinstance(field, EdgeTangents):
+            field = EdgeTangents(jnp.diff(s), s, field.clip_nodes)
+        else:
+            field = dataclasses.replace(field, s=s)
+        form = form_on(scene, field).in_plane_of(self.first)
+        return dataclasses.replace(form, scene=slid(self.scene, places))
+
+    def _fixed(self, places: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+        """Arclengths that have nodes, in turn, and how far those go along."""
+        at, change = self._clips, self._spread(places - self._begin)
+        ends = jnp.array([0.0, 1.0], at.dtype)
+        loads, beside = self._loads
+        # A load so near to a clip that it shares its node goes along.
+        near = self._is_near(loads, at[beside])
+        of_loads = jnp.where(near, change[beside], 0.0)
+        fixed = jnp.concatenate([ends, at, jnp.where(near, at[beside], loads)])
+        order = jnp.argsort(fixed)
+        return fixed[order], jnp.concatenate([jnp.zeros_like(ends), change, of_loads])[order]
+
+    @property
+    def _clips(self) -> Float[Array, "clips"]:
+        return jnp.stack([clip.at for clip in self.made.clips])
+
+    @property
+    def _begin(self) -> Float[Array, "j"]:
+        places = sliding_places(self.made)
+        assert places is not None
+        return places
+
+    def _spread(self, of_sliding: Float[Array, "j"]) -> Float[Array, "clips"]:
+        """Zero for clips that do not slide."""
+        return jnp.zeros(len(self.made.clips), of_sliding.dtype).at[self._numbers].set(of_sliding)
+
+    @property
+    def _numbers(self) -> np.ndarray:
+        return np.array([k for k, clip in enumerate(self.made.clips) if clip.sliding])
+
+    @property
+    def _loads(self) -> tuple[Float[Array, "k"], Int[Array, "k"]]:
+        """Other arclengths with nodes, and the nearest clip to each."""
+        places = [] if isinstance(self.shape, Polyline) else [load.at for load in self.made.point_forces]
+        places = [jnp.atleast_1d(place) for place in (*places, *varying(self.made))]
+        loads = jnp.concatenate([jnp.zeros(0, self._clips.dtype), *places])
+        return loads, jnp.argmin(jnp.abs(loads[:, None] - self._clips[None]), axis=1)
+
+    def _is_near(self, loads: Float[Array, "k"], clips: Float[Array, "k"]) -> Bool[Array, "k"]:
+        return jnp.abs(loads - clips) * (len(self.first.field.s) - 1) < LEAST_ELEMENT
+
+    # --- where the mesh is made anew ---------------------------------------------------------------------------------
+
+    def is_blocked(self, point: SlidingPoint) -> Bool[Array, ""] | None:
+        """Whether a clip has come to a load, beyond which the mesh is another one."""
+        loads, beside = self._loads
+        if not len(loads):
+            return None
+        now = self._clips + self._spread(point.places - self._begin)
+        return jnp.any(self._is_near(loads, now[beside]) & ~self._is_near(loads, self._clips[beside]))
+
+    def is_misplaced(self, point: SlidingPoint) -> Bool[Array, ""]:
+        """Whether the mesh is not, or should not be, the one that belongs to these arclengths."""
+        form = self.at(point.places)
+        ends = jnp.array([0.0, 1.0], point.places.dtype)
+        now = self._clips + self._spread(point.places - self._begin)
+        before, after = (jnp.diff(jnp.concatenate([ends[:1], at, ends[1:]])) for at in (self._clips, now))
+        is_stretched = jnp.any(jnp.maximum(before / after, after / before) > STRETCHED)
+        anew = form_of(slid(self.made, point.places), self.shape.reached(form, point.inner))
+        return is_stretched | jnp.any(jnp.abs(anew.field.s - form.field.s) > SAME_NODE)
+
+    # --- what is of the form at given arclengths ---------------------------------------------------------------------
+
+    @property
+    def field(self) -> Any:
+        return self.first.field
+
+    @property
+    def layout(self) -> Any:  # pyright: ignore
+        return self.first.layout
+
+    @property
+    def has_potential(self) -> bool:
+        return dataclasses.replace(self.first, scene=self.scene).has_potential
+
+    def bases_at(self, point: SlidingPoint) -> Float[Array, "3 b m"]:
+        return self.first.bases_at(point.inner)
+
+    def turn(self, point: SlidingPoint, bases: Float[Array, "3 b m"], axis: Float[Array, "3"]) -> Float[Array, "b m"]:
+        return self.first.turn(point.inner, bases, axis)
+
+    def spin(self, bases: Float[Array, "3 b m"]) -> Float[Array, "b m"] | None:
+        return self.first.spin(bases)
+
+    def holding(self, point: SlidingPoint) -> SlidingPoint:
+        return dataclasses.replace(point, inner=self.at(point.places).holding(point.inner))
+
+    def settled(self, point: SlidingPoint) -> SlidingPoint:
+        return dataclasses.replace(point, inner=self.at(point.places).settled(point.inner))
+
+    def in_plane(
+        self, point: SlidingPoint, normal: Float[Array, "3"], axes: Float[Array, "3 2"]
+    ) -> tuple["SlidingForm", SlidingPoint]:
+        first, inner = self.first.in_plane(point.inner, normal, axes)
+        return dataclasses.replace(self, first=first), dataclasses.replace(point, inner=inner)
+
+    def in_plane_of(self, other: Form) -> "SlidingForm":
+        return dataclasses.replace(self, first=self.first.in_plane_of(other))
+
+    def out_of_plane(self, normal: Float[Array, "3"]) -> "SlidingForm":
+        return dataclasses.replace(self, first=self.first.out_of_plane(normal))
+
+    def edges(self, point: SlidingPoint) -> Float[Array, "segments 3"]:
+        return self.at(point.places).edges(point.inner)
+
+    def elastic_energy(self, point: SlidingPoint) -> Float[Array, ""]:
+        return self.at(point.places).elastic_energy(point.inner)
+
+    def load_energy(self, point: SlidingPoint) -> Float[Array, ""]:
+        return self.at(point.places).load_energy(point.inner)
+
+    def tangents_in_clips(self, point: SlidingPoint) -> Float[Array, "3 clips"]:
+        return self.at(point.places).tangents_in_clips(point.inner)
+
+    def multipliers_turned(
+        self, point: SlidingPoint, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
+    ) -> Float[Array, "k"]:
+        j = len(point.places)
+        of_inner = self.at(point.places).multipliers_turned(point.inner, axis, multipliers[j:])
+        return jnp.concatenate([multipliers[:j], of_inner])
+
+    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        return self.first.is_closed(closure[len(self._numbers) :], tolerance)
+
+    def rounding_floor(self, point: SlidingPoint) -> Float[Array, ""]:
+        return self.at(point.places).rounding_floor(point.inner)
+
+    # --- steps -------------------------------------------------------------------------------------------------------
+
+    def others(self, multipliers: Float[Array, "k"]) -> SlidingChange:
+        j = len(self._numbers)
+        return SlidingChange(multipliers[:j], self.first.others(multipliers[j:]))
+
+    def no_others(self, point: SlidingPoint) -> SlidingChange:
+        return SlidingChange(jnp.zeros_like(point.places), self.first.no_others(point.inner))
+
+    def moved(
+        self,
+        point: SlidingPoint,
+        bases: Float[Array, "3 b m"],
+        rotation: Float[Array, "b m"],
+        force_change: Float[Array, "3 parts"],
+        others: Any = None,
+    ) -> SlidingPoint:
+        inner = self.at(point.places).moved(point.inner, bases, rotation, force_change, others.others)
+        return dataclasses.replace(point, inner=inner, places=point.places + others.places)
+
+    def longest_step(self, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
+        change = self._spread(others.places)
+        ends = jnp.array([0.0, 1.0], change.dtype)
+        clips = jnp.concatenate([ends[:1], self._clips + self._spread(point.places - self._begin), ends[1:]])
+        gaps = LARGEST_STEP * jnp.minimum(jnp.diff(clips)[:-1], jnp.diff(clips)[1:])
+        loads, beside = self._loads
+        if len(loads):
+            ways = (loads[None] - clips[1:-1, None]) * jnp.sign(change)[:, None]
+            is_passed = (ways <= 0) | self._is_near(loads, self._clips[beside])[None]
+            ways = jnp.where(is_passed, jnp.inf, NEAR_LOADS * ways)
+            gaps = jnp.minimum(gaps, jnp.min(ways, axis=1))
+        return jnp.min(gaps / jnp.maximum(jnp.abs(change), 1e-300))
+
+    def accepts(self, point: SlidingPoint, trial: SlidingPoint, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
+        return self.at(point.places).accepts(point.inner, trial.inner, is_better)
+
+    def accepted(self, point: SlidingPoint, here: Any) -> SlidingPoint:
+        inner = self.at(point.places).accepted(point.inner, here.at_places)
+        return SlidingPoint(inner, point.places, here.slides, here.excess)
+
+    # --- derivatives -------------------------------------------------------------------------------------------------
+
+    def _rows(self, inner: Any, places: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+        """The gradient and the closure at an inner point, L, and -R . t."""
+        form = self.at(places)
+        gradient, closure = form.unbalanced(inner)
+        force = form.layout.components(inner.end_force)
+        energy = form.elastic_energy(inner) + form.load_energy(inner) + jnp.sum(force * form.closure(closure))
+        return gradient, closure, energy, -form.axial_forces(inner)
+
+    def unbalanced(self, point: SlidingPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        gradient, closure, _, axial = self._rows(point.inner, point.places)
+        return gradient, jnp.concatenate([axial, closure])
+
+    def linearized(self, point: SlidingPoint) -> SlidingLinearization:
+        form, inner, places = self.at(point.places), point.inner, point.places
+        here = form.linearized(inner)
+
+        def by_place(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+            return jax.jvp(lambda places: self._rows(inner, places), (places,), (direction,))[1]
+
+        gradient, closure, energy, corner = jax.vmap(by_place)(jnp.eye(len(places), dtype=places.dtype))
+
+        def axial(rotation: Float[Array, "b m"], multipliers: Float[Array, "k"]) -> Float[Array, "j"]:
+            force_change, others = form.layout.forces(form.closure(multipliers)), form.others(multipliers)
+            return -form.axial_forces(form.moved(inner, here.bases, rotation, force_change, others))
+
+        nothing = jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure)
+        pulls, pulled = jax.vjp(axial, *nothing)
+        rows = jax.vmap(pulled)(jnp.eye(len(places), dtype=places.dtype))
+        system = BorderedSystem(here.system, Vectors(gradient, closure), Vectors(*rows), corner.T)
+        rounding = PLACE_ROUNDINGS * jnp.finfo(pulls.dtype).eps * _axial_stiffness(self.made)
+        largest = jnp.max(jnp.abs(pulls))
+        return SlidingLinearization(
+            here.bases,
+            here.gradient,
+            jnp.concatenate([pulls, here.closure]),
+            system,
+            here.energy,
+            jnp.where((largest > here.residual) & (largest > rounding), largest, here.residual),
+            here.gaps,
+            here.ways,
+            places=places,
+            slides=point.slides | (here.residual <= SETTLED),
+            excess=energy - pulls,
+        )
+
+    def regular(self, system: AnySystem) -> AnySystem:
+        return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
+
+    def coupled(self, point: SlidingPoint, system: AnySystem) -> AnySystem:
+        assert isinstance(system, BorderedSystem)
+        return dataclasses.replace(system, inner=self.at(point.places).coupled(point.inner, system.inner))
+
+    def objective(self, here: Any, point: SlidingPoint) -> Float[Array, ""]:
+        of_inner = self.at(here.places).objective(here.at_places, point.inner)
+        return of_inner - jnp.sum(point.excess * (here.places - point.places))
+
+    def half_square(self, here: Any) -> Float[Array, ""]:
+        axial = here.closure[: len(here.places)]
+        of_inner = self.at(here.places).half_square(here.at_places)
+        return of_inner + jnp.where(here.slides, jnp.sum(axial**2) / 2, 0.0)
+
+    def sought(
+        self, here: Any, point: SlidingPoint, system: AnySystem, push: Float[Array, "b m"]
+    ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
+        assert isinstance(system, BorderedSystem)
+        descends = self.descends and self.has_potential
+        system = dataclasses.replace(system.held_unless(here.slides), descends=descends)
+        j = len(point.places)
+        axial = jnp.where(here.slides, here.closure[:j], 0.0)
+        if self.scene.obstacles:
+            # Which contacts are closed is sought at given arclengths; those go along with the ones that were.
+            is_minimum, x, y = self.at(point.places).sought(here.at_places, point.inner, system.inner, push)
+            factors = factor(system)
+            assert isinstance(factors, BorderedFactors)
+            x, y = factors.joined(x, y, -axial)
+        else:
+            closure = jnp.concatenate([axial, here.closure[j:]])
+            factors, x, y = factor_and_solve(system, push - here.gradient, -closure, is_regularized=True)
+            assert isinstance(factors, BorderedFactors)
+            is_minimum = factors.inner.is_minimum
+        # What pulls along the rod leads away from a largest energy, and no shift is needed.
+        is_steady = factors.is_steady | (jnp.max(jnp.abs(y[:j])) > LEAST_SLIDE if descends else False)
+        return is_minimum & is_steady, x, y
+
+    def under_force(
+        self,
+        point: SlidingPoint,
+        here: Any,
+        rotation: Float[Array, "b m"],
+        change: Float[Array, "3 parts"],
+        others: SlidingChange,
+    ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
+        form, columns = self.at(point.places), here.system.columns
+        found = form.under_force(point.inner, here.at_places, rotation, change, others.others)
+        closure, closure_rate, more, along = found
+        by_place = jax.vmap(form.closure)(columns.y)
+        slope = here.closure[: len(point.places)] + by_place @ form.layout.components(change)
+        return closure, closure_rate + others.places @ by_place, more, along + jnp.sum(slope * others.places)
+
+
+def _axial_stiffness(scene: Scene) -> Float[Array, ""]:
+    """The largest along the rod."""
+    EA = scene.rod.stiffnesses[-1]
+    return jnp.max(EA.samples) if isinstance(EA, Along) else EA

@@ -19,7 +19,7 @@ from rodjax.discretization.form import Point
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
-from rodjax.model.scene import Scene, nondimensional, slid, sliding_places
+from rodjax.model.scene import Scene, has_contacts, nondimensional, slid, sliding_places
 from rodjax.programs.linear import linear
 from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to, examined
@@ -76,7 +76,7 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        nodal = point.nodal if scene.obstacles else None
+        nodal = point.nodal if has_contacts(scene) else None
         pressures, friction = (None, None) if nodal is None else (nodal.pressures, nodal.friction)
         state = SolverState(
             shape, point.end_force, units, places, before=before, pressures=pressures, friction=friction

@@ -49,7 +49,7 @@ from rodjax.mechanics.passage import Before, Passage, passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional, slid, slides
+from rodjax.model.scene import Scene, has_contacts, has_node_places, has_potential, nondimensional, slid, slides
 from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
@@ -248,7 +248,7 @@ class Equilibrium(eqx.Module):
 
     @property
     def contact_forces(self) -> Float[Array, "... n+1 3"]:
-        if not self.scene.obstacles:
+        if not has_contacts(self.scene):
             return jnp.zeros_like(self.nodes)
         return _node_forces(self)[1]
 

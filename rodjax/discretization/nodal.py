@@ -36,10 +36,18 @@ from rodjax.discretization import potentials
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential, within
 from rodjax.discretization.inner_contacts import Middles
-from rodjax.discretization.layout import SpanForces
+from rodjax.discretization.layout import CellForces, SpanForces
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import NodeEnergy, OnElements
-from rodjax.discretization.self_contact import Curve, SelfContacts, comes_through, on_elements, self_contacts
+from rodjax.discretization.self_contact import (
+    Curve,
+    Exerted,
+    SelfContacts,
+    comes_through,
+    exerted,
+    on_elements,
+    self_contacts,
+)
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
@@ -57,6 +65,9 @@ SOFTNESS = 1e-5
 # And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
 # one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
 LEAST_SOFTNESS = 5e4
+# Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
+# would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
+FAR_SOFTNESS = 1e-6
 # In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
 # would say the same, and who bears it would be undetermined: so nodes do.
 THINNER = 1e-5
@@ -188,7 +199,10 @@ class NodalForm(Form):
             smooth, inner = np.array(self.smooth), self.inner_rows
             deepest = jnp.maximum(depths[smooth], depths[inner])
             depths = depths.at[smooth].set(deepest).at[inner].set(deepest)
-        return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
+        least = jnp.full(len(depths), LEAST_RELAXED, depths.dtype)
+        if self.scene.self_contact:
+            least = least.at[-1].multiply(self.far_unit)
+        return jnp.where(depths > least, depths / 2, 0.0)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
         assert here.gaps is not None
@@ -292,8 +306,7 @@ class NodalForm(Form):
     def contacts_on_elements(self, point: Any) -> OnElements:
         if not self.scene.self_contact:
             return self._middles_on_elements(point)
-        pressures = point.nodal.pressures[-1]
-        on_places, on_tangents = on_elements(self.curve(point), pressures, self.self_contacts(point, pressures))
+        on_places, on_tangents = on_elements(self.curve(point), self.far_unit * point.nodal.pressures[-1])
         contacts = OnElements(-on_places, -on_tangents, jnp.zeros_like(on_places))
         return OnElements(*map(jnp.add, contacts, self._middles_on_elements(point))) if self.smooth else contacts
 
@@ -450,13 +463,24 @@ class NodalForm(Form):
 
     def self_contacts(self, point: Any, pressures: Float[Array, "n+1"]) -> SelfContacts:
         """Of a rod with these forces between its elements."""
-        return self_contacts(self.curve(point), pressures, pressure_rows(self.scene) - 1)
+        return self_contacts(self.curve(point), pressures, self.far_unit, pressure_rows(self.scene) - 1)
+
+    def self_exerted(self, point: Any) -> Exerted:
+        """Where elements are nearest to the rod beyond them, and the forces there."""
+        return exerted(self.curve(point), self.far_unit * point.nodal.pressures[-1])
+
+    @property
+    def far_unit(self) -> Float[Array, ""]:
+        """In which pressures between elements count, so that all contacts have one softness in numbers."""
+        return jnp.sqrt(self.softness / FAR_SOFTNESS)
 
     def curve(self, point: Any) -> Curve:
         s = self.field.s
         free = jnp.where(self.is_held, 0.0, 1.0).astype(s.dtype)
         radius = self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
-        return Curve(s, point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, radius)
+        assert isinstance(self.layout, CellForces)
+        normal = self.layout.normal  # of the plane of the rod
+        return Curve(s, point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, radius, normal)
 
     def _inner(
         self, point: Any, pressures: Float[Array, "q n"]

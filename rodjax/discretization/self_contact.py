@@ -22,7 +22,7 @@ from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
 
 # By this part of its radius the rod counts as thinner at the ends of an element than in its middle.
-EDGE = 1e-3
+EDGE = 1e-6
 # Places in each element from which the nearest ones are sought, and steps of that search.
 SAMPLES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
 STEPS = 12
@@ -36,7 +36,8 @@ NOTHING_BEYOND = 1.0
 
 class Curve(NamedTuple):
     """A rod's centerline on a mesh, and what moves it: axes about which the tangents of the nodes turn, 0 in `free` at
-    nodes whose place is given; its radius in the middle of elements.
+    nodes whose place is given; its radius in the middle of elements. `normal`: of the plane in which it stays, `None`
+    in space.
     """
 
     s: Float[Array, "n+1"]
@@ -45,6 +46,7 @@ class Curve(NamedTuple):
     axes: Float[Array, "3 b n+1"]
     free: Float[Array, "n+1"]
     radius: Float[Array, "n"]
+    normal: Float[Array, "3"] | None = None
 
 
 class Nearest(NamedTuple):
@@ -117,18 +119,24 @@ def nearest(curve: Curve) -> Nearest:
     return Nearest(a, element, b, other, stays, exists)
 
 
-def self_contacts(curve: Curve, pressures: Float[Array, "n+1"], row: int) -> SelfContacts:
-    """At a point with these pressures; `row`: as of `FarRows`."""
+def self_contacts(curve: Curve, pressures: Float[Array, "n+1"], unit: Float[Array, ""], row: int) -> SelfContacts:
+    """At a point with these pressures, which are forces in the `unit` given, as gaps are lengths in its inverse; `row`:
+    as of `FarRows`.
+    """
     found = nearest(curve)
     n = len(found.s)
-    gaps = jnp.where(found.exists, _gaps(curve, found)[0], NOTHING_BEYOND)
+    gaps = jnp.where(found.exists, _gaps(curve, found)[0], NOTHING_BEYOND) * unit
     # Those that push go on doing so.
     order = jnp.argsort(jnp.where(pressures[:-1] > 0, -1.0, jax.lax.stop_gradient(gaps)))
     chosen = order[: min(n, MOST_CONTACTS)]
-    rows, by_rotations = _rows(curve, Nearest(*(leaf[..., chosen] for leaf in found)), pressures[chosen], row)
+    found = Nearest(*(leaf[..., chosen] for leaf in found))
+    vectors, nodes, by_rotations = _rows(curve, found, unit * pressures[chosen])
+    vectors = vectors.at[0].multiply(unit)
+    count = curve.axes.shape[1]
+    rows = FarRows(vectors[:, :count], vectors[:, count:], nodes, chosen, row)
     is_chosen = jnp.zeros(n, bool).at[chosen].set(True)
-    gaps = jnp.where(is_chosen, gaps, NOTHING_BEYOND)
-    return SelfContacts(jnp.append(gaps, NOTHING_BEYOND), rows, by_rotations)
+    nothing = NOTHING_BEYOND * unit
+    return SelfContacts(jnp.append(jnp.where(is_chosen, gaps, nothing), nothing), rows, by_rotations)
 
 
 def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
@@ -154,20 +162,38 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     return is_pierced | jnp.any(is_far & (products < reach * jnp.sqrt(squares)))
 
 
-def on_elements(curve: Curve, pressures: Float[Array, "n+1"], contacts: SelfContacts) -> tuple[Array, Array]:
-    """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both."""
-    rows = contacts.rows
-    found = nearest(curve)
-    found = Nearest(*(leaf[..., rows.elements] for leaf in found))
-    _, a, b = _gaps(curve, found)
-    sides = _at(curve, found.element, a), _at(curve, found.other, b)
-    way = sides[0].x - sides[1].x
+class Exerted(NamedTuple):
+    """Of each element: the places s and s' where it is nearest to the rod beyond it, the gap, infinite where there is
+    nothing beyond, and the force there on the rod at s.
+    """
+
+    s: Float[Array, "n"]
+    beyond: Float[Array, "n"]
+    gaps: Float[Array, "n"]
+    forces: Float[Array, "3 n"]
+
+
+def exerted(curve: Curve, pressures: Float[Array, "n+1"]) -> Exerted:
+    return _exerted(curve, pressures, nearest(curve))
+
+
+def _exerted(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
+    gaps, a, b = _gaps(curve, found)
+    way = _at(curve, found.element, a).x - _at(curve, found.other, b).x
     distance = jnp.sqrt(jnp.where(found.exists, dot(way, way), 1.0))
-    force = jnp.where(found.exists, pressures[rows.elements], 0.0) * way / distance[None]
-    on_places = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), force.dtype)
-    for side, element, sign in zip(sides, (found.element, found.other), (1, -1), strict=True):
-        on_places = on_places.at[..., element].add(sign * force[:, None] * side.of_places[0][None])
-        on_tangents = on_tangents.at[..., element].add(sign * force[:, None] * side.of_tangents[0][None])
+    forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * way / distance[None]
+    return Exerted(a, b, jnp.where(found.exists, gaps, jnp.inf), forces)
+
+
+def on_elements(curve: Curve, pressures: Float[Array, "n+1"]) -> tuple[Array, Array]:
+    """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both."""
+    found = nearest(curve)
+    a, b, _, forces = _exerted(curve, pressures, found)
+    on_places = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
+    for s, element, sign in ((a, found.element, 1), (b, found.other, -1)):
+        side = _at(curve, element, s)
+        on_places = on_places.at[..., element].add(sign * forces[:, None] * side.of_places[0][None])
+        on_tangents = on_tangents.at[..., element].add(sign * forces[:, None] * side.of_tangents[0][None])
     return on_places, on_tangents
 
 
@@ -189,8 +215,11 @@ def _gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array,
 
 
 def _rows(
-    curve: Curve, found: Nearest, pressures: Float[Array, "p"], row: int
-) -> tuple[FarRows, Float[Array, "b b n+1"]]:
+    curve: Curve, found: Nearest, pressures: Float[Array, "p"]
+) -> tuple[Float[Array, "5 b+3 4 p"], Int[Array, "4 p"], Float[Array, "b b n+1"]]:
+    """The gradient of each gap and the vectors of its curvature, by the rotations and places of its nodes; these; and
+    what of the curvature is by the rotations of one node.
+    """
     _, a, b = _gaps(curve, found)
     here, there = _at(curve, found.element, a), _at(curve, found.other, b)
     nodes = jnp.stack([found.element, found.element + 1, found.other, found.other + 1])
@@ -207,6 +236,8 @@ def _rows(
 
     def along(v: Float[Array, "3 p"], derivative: int = 0) -> Array:
         """The rate of v . way, or of v . the slopes on both sides, by rotations and places of the nodes."""
+        if curve.normal is not None:
+            v = v - curve.normal[:, None] * (curve.normal @ v)[None]
         by_rotation = jnp.einsum("cp,cbkp->bkp", v, turned) * on_tangents[derivative][None]
         return jnp.concatenate([by_rotation, v[:, None] * on_places[derivative][None]])
 
@@ -240,15 +271,13 @@ def _rows(
         ]
     )
     vectors = jnp.where(found.exists, vectors, 0.0)
-    count = axes.shape[1]
-    rows = FarRows(vectors[:, :count], vectors[:, count:], nodes, found.element, row)
     # Half of both orders in which a tangent t turns under the force v: w (v.t) + v (w.t) less 2 t (w.v).
     force = pressures[None, None] * normal[:, None] * on_tangents[0][None]  # [3, 4, p]
     pulled, leaned = (jnp.einsum("cbkp,ckp->bkp", axes, v) for v in (force, tangents))
     mixed = (pulled[:, None] * leaned[None] + leaned[:, None] * pulled[None]) / 2
     turn = mixed - dot(force, tangents)[None, None] * jnp.einsum("cbkp,cakp->bakp", axes, axes)
-    nothing = jnp.zeros((count, count, len(curve.s)), d.dtype)
-    return rows, nothing.at[:, :, nodes].add(-turn)
+    nothing = jnp.zeros((*turn.shape[:2], len(curve.s)), d.dtype)
+    return vectors, nodes, nothing.at[:, :, nodes].add(-turn)
 
 
 def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:

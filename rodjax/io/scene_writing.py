@@ -53,7 +53,8 @@ def scene_text(scene: Scene, segments: int | None = None) -> str:
         if isinstance(getattr(scene, name), Movable):
             kind = type(getattr(scene, name)).__name__
             raise ValueError(f"scene.{name} must be a Clamp, Swivel, Pin or Free to be written, got a {kind}")
-    lines = ["[rod]", *_written_rod(scene.rod)]
+    lines = ["self_contact = true", ""] if scene.self_contact else []
+    lines += ["[rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{name}]", f'support = "{type(end).__name__.lower()}"']
         lines += _written(end, ("position", "force", "moment", "frame" if isinstance(end, Clamp) else "tangent"))

@@ -29,6 +29,8 @@ from rodjax.linalg.far_rows import FarRows
 
 # Solutions with soft contacts, after the first one.
 HARDENINGS = 5
+# In these, contacts between elements have this part of their softness.
+HARD = 1e-4
 
 
 class InnerRows(eqx.Module):
@@ -334,6 +336,7 @@ class ChainFactors(eqx.Module):
     above: Float[Array, "n c c"]
     border: "_Border"
     border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
+    bordered: Float[Array, "k k"]
     complement: Float[Array, "k k"]
     negative: Int[Array, ""]
 
@@ -350,13 +353,24 @@ class ChainFactors(eqx.Module):
             return self.solve_softly(f, c)
         hard = dataclasses.replace(self.contacts, softness=jnp.zeros_like(self.contacts.softness))
         hard = dataclasses.replace(self.whole, contacts=hard)
+        complement = self._hard_complement()
 
         def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
             left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
-            return jax.tree.map(jnp.add, found, self._solved_once(*left)), None
+            return jax.tree.map(jnp.add, found, self._solved_once(*left, complement)), None
 
-        found, _ = jax.lax.scan(nearer, self._solved_once(f, c), None, length=HARDENINGS)
+        found, _ = jax.lax.scan(nearer, self._solved_once(f, c, complement), None, length=HARDENINGS)
         return found
+
+    def _hard_complement(self) -> Float[Array, "k k"]:
+        """With contacts between elements that are all but rigid: a border is no softer for that."""
+        far, k = self.contacts.far, len(self.whole.compliance)
+        if far is None:
+            return self.complement
+        at = np.arange(k, k + len(far.elements))
+        is_closed = self.contacts.is_closed[far.row, far.elements]
+        harder = jnp.where(is_closed, (1 - HARD) * self.contacts.softness, 0.0)
+        return jnp.linalg.inv(self.bordered.at[at, at].add(harder))
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -364,14 +378,14 @@ class ChainFactors(eqx.Module):
         """With the softness of the contacts. Those within elements couple their nodes so stiffly that elimination loses
         half of the digits; what is left is asked for again.
         """
-        found = self._solved_once(f, c)
+        found = self._solved_once(f, c, self.complement)
         if self.contacts.inner is None:
             return found
         left = jax.tree.map(jnp.subtract, (f, c), self.whole.times(*found))
-        return jax.tree.map(jnp.add, found, self._solved_once(*left))
+        return jax.tree.map(jnp.add, found, self._solved_once(*left, self.complement))
 
     def _solved_once(
-        self, f: Float[Array, "b m"], c: Float[Array, "j"]
+        self, f: Float[Array, "b m"], c: Float[Array, "j"], complement: Float[Array, "k k"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
@@ -388,7 +402,7 @@ class ChainFactors(eqx.Module):
         x, displacements, forces = self._without_border(f[:, None], nodes[None], gaps[None])
         x, displacements, forces = x[:, 0], displacements[0], forces[0]
         by_border, u_by_border, force_by_border = self.border_solution
-        multipliers = self.complement @ (first - self.border.times(x[:, None], displacements[None])[:, 0])
+        multipliers = complement @ (first - self.border.times(x[:, None], displacements[None])[:, 0])
         x -= jnp.einsum("ikm,k->im", by_border, multipliers)
         displacements -= jnp.tensordot(multipliers, u_by_border, 1)
         forces -= jnp.tensordot(multipliers, force_by_border, 1)
@@ -517,7 +531,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
     no_complement = jnp.zeros((k, k), dtype)
     chain = contacts, whole, system, middles, inverses, below, above
-    factors = ChainFactors(*chain, border, blank, no_complement, negative)
+    factors = ChainFactors(*chain, border, blank, no_complement, no_complement, negative)
     if not k:
         return factors
     by_place = nothing[0] if border.by_place is None else border.by_place
@@ -525,7 +539,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     matrix = -border.compliance - border.times(*solution[:2])
     if is_symmetric:
         negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - border.positive
-    return ChainFactors(*chain, border, solution, jnp.linalg.inv(matrix), negative)
+    return ChainFactors(*chain, border, solution, matrix, jnp.linalg.inv(matrix), negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:

@@ -77,7 +77,7 @@ class Scene(eqx.Module):
     obstacles: tuple[Obstacle, ...]
     potentials: tuple[Potential, ...]
     point_couples: tuple[PointCouple, ...]
-    self_contact: bool = eqx.field(static=True)
+    self_contact: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,

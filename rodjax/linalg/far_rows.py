@@ -28,7 +28,7 @@ class FarRows(eqx.Module):
 
     def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
         """Of the gaps, as the rod turns and nodes move."""
-        return jnp.zeros(len(u), u.dtype).at[self.elements].set(self._along(0, x, u))
+        return jnp.zeros(len(u), u.dtype).at[self.elements].set(self._along(0, x, u), unique_indices=True)
 
     def turned(self, pressures: Float[Array, "n+1"]) -> Float[Array, "b m"]:
         """The moments of pressures on the points of the rod."""

@@ -11,6 +11,7 @@ from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
+from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.solving.result import form_and_point
 
@@ -255,6 +256,32 @@ def with_inner_contacts(system: ChainSystem) -> ChainSystem:
     return dataclasses.replace(system, contacts=contacts).with_elements(jnp.asarray(blocks))
 
 
+def with_far_contacts(system: ChainSystem) -> ChainSystem:
+    """And with three contacts between elements, two of which touch, whose curvature couples these."""
+    rng = np.random.default_rng(4)
+    elements = system.across.shape[-1]
+    first, second = np.array([0, 1, 1]), np.array([2, 3, elements - 1])
+    nodes = np.stack([first, first + 1, second, second + 1])
+    places = rng.normal(size=(5, 3, 4, 3)) * np.where(system.held, 0.0, 1.0)[nodes]
+    scale = np.array([1.0, 0.3, 0.3, 0.3, 0.3])[:, None, None, None]
+    far = FarRows(
+        jnp.asarray(rng.normal(size=(5, 2, 4, 3)) * scale),
+        jnp.asarray(places * scale),
+        jnp.asarray(nodes),
+        jnp.asarray([2, 0, 1]),
+        2,
+    )
+    contacts = system.contacts
+    is_closed = np.isin(np.arange(elements + 1), (0, 2))[None]
+    contacts = ContactRows(
+        jnp.pad(contacts.normals, ((0, 1), (0, 0), (0, 0))),
+        contacts.softness,
+        jnp.concatenate([contacts.is_closed, jnp.asarray(is_closed)]),
+        far=far,
+    )
+    return dataclasses.replace(system, contacts=contacts)
+
+
 def random_loads(elements: int) -> LoadRows:
     rng = np.random.default_rng(7)
     shapes = ((2, 3, 2, 3, elements), (3, 2, 3, elements), (2, 3, 2, 3, elements))
@@ -264,12 +291,12 @@ def random_loads(elements: int) -> LoadRows:
 @pytest.mark.parametrize("elements", [4, 7])
 @pytest.mark.parametrize("is_backward", [False, True])
 @pytest.mark.parametrize("loads", [None, random_loads])
-@pytest.mark.parametrize("has_inner", [False, True])
-def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads, has_inner):
-    """Also with loads that have no potential, without symmetry, and with contacts within elements."""
+@pytest.mark.parametrize("others", [None, with_inner_contacts, with_far_contacts])
+def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads, others):
+    """Also with loads that have no potential, without symmetry, and with contacts within and between elements."""
     system = dataclasses.replace(random_chain(elements), is_backward=is_backward, loads=loads and loads(elements))
-    if has_inner:
-        system = with_inner_contacts(system)
+    if others is not None:
+        system = others(system)
     pressures = system.contacts.is_closed.size
     m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 

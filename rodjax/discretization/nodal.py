@@ -37,9 +37,18 @@ from rodjax.discretization import potentials
 from rodjax.discretization.form import FLOOR_SAFETY, Form, Linearization
 from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential, within
 from rodjax.discretization.inner_contacts import Middles
-from rodjax.discretization.layout import SpanForces
+from rodjax.discretization.layout import CellForces, SpanForces
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import NodeEnergy, OnElements
+from rodjax.discretization.self_contact import (
+    Curve,
+    Exerted,
+    SelfContacts,
+    comes_through,
+    exerted,
+    on_elements,
+    self_contacts,
+)
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
@@ -48,6 +57,7 @@ from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.mechanics.passage import PLACES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.obstacles import InUnits, Obstacle, least
+from rodjax.model.scene import Scene, has_contacts
 from rodjax.model.supports import Clamp, Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
@@ -56,6 +66,9 @@ SOFTNESS = 1e-5
 # And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
 # one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
 LEAST_SOFTNESS = 5e4
+# Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
+# would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
+FAR_SOFTNESS = 1e-6
 # In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
 # would say the same, and who bears it would be undetermined: so nodes do.
 THINNER = 1e-5
@@ -84,26 +97,31 @@ LIES_ON = 1e-9
 TOUCHES = 1e-2
 
 
-class InnerStiffness(NamedTuple):
-    """What contacts within elements add: moments out of balance at the points, and second derivatives by the rotation
-    and the place of the first node of each element, then of the last one.
-    """
-
-    gradient: Float[Array, "b m"]
-    blocks: Float[Array, "2b+6 2b+6 n"]
-
-
 class Contacts(NamedTuple):
     """At a point: gaps at nodes, below them those within elements; their gradients with those of slips below, and the
     second derivatives of what L has of gaps by the places of nodes; with friction the ways of nodes since the last
-    equilibrium; of contacts within elements what else they add, `None` without such.
+    equilibrium. Of contacts within and between elements, `None` without such: the moments of their pressures, out of
+    balance at the points; of the former the second derivatives by the rotation and the place of the first node of each
+    element, then of the last one; of the latter those by the rotations of each node.
     """
 
     gaps: Float[Array, "k n+1"]
     rows: ContactRows
     stiffness: Float[Array, "n+1 3 3"]
     ways: Float[Array, "n+1 3"] | None
-    inner: InnerStiffness | None
+    gradient: Float[Array, "b m"] | None
+    inner: Float[Array, "2b+6 2b+6 n"] | None
+    by_rotations: Float[Array, "b b n+1"] | None
+
+    def added_to(self, gradient: Float[Array, "b m"]) -> Float[Array, "b m"]:
+        return gradient if self.gradient is None else gradient + self.gradient
+
+    def stiffened(self, system: ChainSystem) -> ChainSystem:
+        """With the second derivatives that the system of the elements leaves out."""
+        if self.by_rotations is not None:
+            diagonal = system.diagonal.at[..., ::2].add(self.by_rotations)
+            system = dataclasses.replace(system, diagonal=diagonal)
+        return system if self.inner is None else system.with_elements(self.inner)
 
 
 class NodalForm(Form):
@@ -160,7 +178,7 @@ class NodalForm(Form):
         return super().is_closed(self.closure(closure), tolerance)
 
     def others(self, multipliers: Float[Array, "k"]) -> NodalChange:
-        nodes, rows = len(self.field.s), pressure_rows(self.scene.obstacles) + 3 * len(self.rough)
+        nodes, rows = len(self.field.s), pressure_rows(self.scene) + 3 * len(self.rough)
         pressures, displacements = jnp.split(
             multipliers[-3 * (2 * nodes - 1) - rows * nodes : -3 * (nodes - 1)], [rows * nodes]
         )
@@ -189,10 +207,13 @@ class NodalForm(Form):
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
         depths = -jnp.min(gaps, axis=1, initial=jnp.inf)
         if self.smooth:
-            smooth, count = np.array(self.smooth), len(self.scene.obstacles)
-            deepest = jnp.maximum(depths[smooth], depths[count:])
-            depths = jnp.concatenate([depths[:count].at[smooth].set(deepest), deepest])
-        return jnp.where(depths > LEAST_RELAXED, depths / 2, 0.0)
+            smooth, inner = np.array(self.smooth), self.inner_rows
+            deepest = jnp.maximum(depths[smooth], depths[inner])
+            depths = depths.at[smooth].set(deepest).at[inner].set(deepest)
+        least = jnp.full(len(depths), LEAST_RELAXED, depths.dtype)
+        if self.scene.self_contact:
+            least = least.at[-1].multiply(self.far_unit)
+        return jnp.where(depths > least, depths / 2, 0.0)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
         assert here.gaps is not None
@@ -217,7 +238,7 @@ class NodalForm(Form):
         friction: Friction | None,
     ) -> Any:
         """Pressures that are not known, not numbers, are those of the forces through the elements."""
-        nothing = jnp.zeros((pressure_rows(self.scene.obstacles), len(nodes)), nodes.dtype)
+        nothing = jnp.zeros((pressure_rows(self.scene), len(nodes)), nodes.dtype)
         if self.rough and friction is None:
             friction = Friction.from_rest(len(self.rough), nodes)
         nodal = self.nodal_held(Nodal(nodes, nothing, nothing[:, 0], friction if self.rough else None))
@@ -225,7 +246,7 @@ class NodalForm(Form):
         point = dataclasses.replace(point, nodal=nodal)
         if point.end_force.shape[1] != len(nodes) - 1:
             point = dataclasses.replace(point, end_force=self._in_elements(point))
-        if not self.scene.obstacles:
+        if not has_contacts(self.scene):
             return point
         gaps, normals = self.gaps_and_normals(nodal.places)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
@@ -237,6 +258,9 @@ class NodalForm(Form):
         pressures = jnp.where(jnp.isnan(known), pushing, known)
         _, inner_gaps, _ = self.within_elements(point)
         gaps = jnp.concatenate([gaps, inner_gaps])
+        if self.scene.self_contact:
+            far = self.self_contacts(point, pressures[-1])
+            gaps = jnp.concatenate([gaps, far.gaps[None]])
         nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=self.led_out(gaps))
         return dataclasses.replace(point, nodal=nodal)
 
@@ -269,25 +293,37 @@ class NodalForm(Form):
         return potentials.at_nodes(self.scene, self.field.s, *self._node_lines(point), self.node_axes(point))
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
-        """With the contacts in their middles, whose forces count as if spread along them."""
+        """With the contacts within them, whose forces count as if spread along them."""
         fields = None
         if self.scene.potentials:
             fields = potentials.on_elements(self.scene, self.field.s, *self._node_lines(point))
-        if not self.smooth:
+        if not self.has_inner_contacts:
             return fields
         contacts = self.contacts_on_elements(point)
         return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
 
     def shares(self, point: Any) -> Float[Array, "n+1 3"]:
-        """What contacts within elements apply to the rod, half at each node."""
-        if not self.smooth:
+        """What contacts within elements apply to the rod, by parts at both nodes."""
+        if not self.has_inner_contacts:
             return jnp.zeros_like(point.nodal.places)
         halves = -self.contacts_on_elements(point).by_place
         return (jnp.pad(halves[:, 0], ((0, 0), (0, 1))) + jnp.pad(halves[:, 1], ((0, 0), (1, 0)))).T
 
+    @property
+    def has_inner_contacts(self) -> bool:
+        """Whether the rod may touch something between its nodes."""
+        return bool(self.smooth) or self.scene.self_contact
+
     def contacts_on_elements(self, point: Any) -> OnElements:
+        if not self.scene.self_contact:
+            return self._middles_on_elements(point)
+        on_places, on_tangents = on_elements(self.curve(point), self.far_unit * point.nodal.pressures[-1])
+        contacts = OnElements(-on_places, -on_tangents, jnp.zeros_like(on_places))
+        return OnElements(*map(jnp.add, contacts, self._middles_on_elements(point))) if self.smooth else contacts
+
+    def _middles_on_elements(self, point: Any) -> OnElements:
         middles, _, normals = self.within_elements(point)
-        forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[len(self.scene.obstacles) :, :-1], normals)
+        forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[self.inner_rows, :-1], normals)
         halves = -jnp.stack([forces, forces], axis=1) / 2
         by_tangent = jnp.einsum("cn,cdn->dn", forces, middles.by_difference)
         by_tangent = jnp.stack([-by_tangent, by_tangent], axis=1)
@@ -305,9 +341,9 @@ class NodalForm(Form):
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         start, end = super().end_forces(point)
-        if not self.scene.potentials and not self.smooth:
+        if not self.scene.potentials and not self.has_inner_contacts:
             return start, end
-        loads = self.shares(point) if self.smooth else jnp.zeros((), start.dtype)
+        loads = self.shares(point)
         if self.scene.potentials:
             loads = loads - potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
         # Of those that are held; a given force is one.
@@ -398,6 +434,11 @@ class NodalForm(Form):
         return middles, jnp.pad(gaps, ((0, 0), (0, 1)), constant_values=1.0), normals[smooth]
 
     @property
+    def inner_rows(self) -> slice:
+        """Of all rows of pressures, those within elements."""
+        return slice(len(self.scene.obstacles), len(self.scene.obstacles) + len(self.smooth))
+
+    @property
     def rough(self) -> tuple[int, ...]:
         """The numbers of the obstacles with friction."""
         return tuple(k for k, obstacle in enumerate(self.scene.obstacles) if _friction(obstacle) is not None)
@@ -424,22 +465,53 @@ class NodalForm(Form):
         normals *= is_free[None]
         curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures[: len(gaps)])
         inner, inner_rows, across = None, None, self._across(normals) if nodal.friction is not None else None
+        by_rotations, far_rows = None, None
         if self.smooth:
-            inner_gaps, inner_rows, inner = self._inner(point, nodal.pressures[len(gaps) :, :-1])
+            inner_gaps, inner_rows, inner = self._inner(point, nodal.pressures[self.inner_rows, :-1])
             gaps = jnp.concatenate([gaps, inner_gaps])
-            normals = jnp.concatenate([normals, jnp.zeros((len(inner_gaps), *normals.shape[1:]), normals.dtype)])
+        if self.scene.self_contact:
+            found = self.self_contacts(point, nodal.pressures[-1])
+            far_rows, by_rotations = found.rows, found.by_rotations
+            gaps = jnp.concatenate([gaps, found.gaps[None]])
+        normals = jnp.pad(normals, ((0, len(gaps) - len(normals)), (0, 0), (0, 0)))
         is_closed, ways = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]), None
         if nodal.friction is not None and across is not None:
             ways = self.travelled(nodal.places, nodal.friction)
             sticks = self.sticks(nodal, normals, ways)
             is_closed = jnp.concatenate([is_closed, jnp.repeat(sticks, 3, axis=0)])
             normals = jnp.concatenate([normals, across])
-        rows = ContactRows(normals, self.softness, is_closed, inner=inner_rows)
-        return Contacts(gaps, rows, curving, ways, inner)
+        rows = ContactRows(normals, self.softness, is_closed, inner=inner_rows, far=far_rows)
+        gradient = None
+        if inner is not None or far_rows is not None:
+            # What pressures do to the rotations.
+            nothing = jnp.zeros((self.node_axes(point).shape[1], 2 * len(self.field.s) - 1), gaps.dtype)
+            gradient = -rows.turned(nodal.contact_forces, nothing)
+        return Contacts(gaps, rows, curving, ways, gradient, inner, by_rotations)
+
+    def self_contacts(self, point: Any, pressures: Float[Array, "n+1"]) -> SelfContacts:
+        """Of a rod with these forces between its elements."""
+        return self_contacts(self.curve(point), pressures, self.far_unit, pressure_rows(self.scene) - 1)
+
+    def self_exerted(self, point: Any) -> Exerted:
+        """Where elements are nearest to the rod beyond them, and the forces there."""
+        return exerted(self.curve(point), self.far_unit * point.nodal.pressures[-1])
+
+    @property
+    def far_unit(self) -> Float[Array, ""]:
+        """In which pressures between elements count, so that all contacts have one softness in numbers."""
+        return jnp.sqrt(self.softness / FAR_SOFTNESS)
+
+    def curve(self, point: Any) -> Curve:
+        s = self.field.s
+        free = jnp.where(self.is_at_support, 0.0, 1.0).astype(s.dtype)
+        radius = self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+        assert isinstance(self.layout, CellForces)
+        normal = self.layout.normal  # of the plane of the rod
+        return Curve(s, point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, radius, normal)
 
     def _inner(
         self, point: Any, pressures: Float[Array, "q n"]
-    ) -> tuple[Float[Array, "q n+1"], InnerRows, InnerStiffness]:
+    ) -> tuple[Float[Array, "q n+1"], InnerRows, Float[Array, "2b+6 2b+6 n"]]:
         """Gaps in the middles of the elements, their gradients, and what pressures there add to L."""
         middles, gaps, normals = self.within_elements(point)
         rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
@@ -449,8 +521,7 @@ class NodalForm(Form):
         by_moves = middles.rates.reshape(3, 2 * (b + 3), -1)
         blocks = jnp.einsum("cin,ncd,djn->ijn", by_moves, curved, by_moves)
         blocks -= middles.second(jnp.einsum("qn,qnc->cn", pressures, normals))
-        gradient = -rows.turned(jnp.pad(pressures, ((0, 0), (0, 1))))
-        return gaps, rows, InnerStiffness(gradient, blocks)
+        return gaps, rows, blocks
 
     def _across(self, normals: Float[Array, "k n+1 3"]) -> Float[Array, "3f n+1 3"]:
         """The gradients of slips, the rows of projections on tangent planes."""
@@ -607,7 +678,7 @@ class NodalForm(Form):
         pushes = contacts.normals.at[rough].add(dragging * free[None])
         rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.places.shape) * free[None]
         normals = jnp.concatenate([contacts.normals[:k], rows])
-        rows = ContactRows(normals, contacts.softness, contacts.is_closed, pushes, contacts.inner)
+        rows = dataclasses.replace(contacts, normals=normals, pushes=pushes)
         stiffness = system.stiffness - free[..., None] * jnp.einsum("dfnc->ncd", forces)
         return dataclasses.replace(system, contacts=rows, stiffness=stiffness)
 
@@ -639,7 +710,7 @@ class NodalForm(Form):
         assert isinstance(system, ChainSystem)
         assert here.gaps is not None
         nodal = point.nodal
-        if not self.scene.obstacles:
+        if not has_contacts(self.scene):
             return super().sought(here, point, system, push)
         moments, c = self.without_contacts(here, nodal.contact_forces)
         contacts = self.model(point, here.gaps, here.ways)
@@ -705,7 +776,7 @@ class NodalForm(Form):
         pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.softness)
         rows = here.system.contacts
         rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
-        if rows.inner is not None:
+        if rows.inner is not None or rows.far is not None:
             # The gradient by rotations has the pressures as they are.
             at_rest = rows.rates(rotation, jnp.zeros_like(others.displacements))
             rate += jnp.sum(point.nodal.contact_forces * at_rest)
@@ -718,6 +789,8 @@ class NodalForm(Form):
         """Only where nodes, and places between them, go straight from one to the other without getting too deep into an
         obstacle: one that is not convex, or thinner than nodes are apart, no tangent plane keeps out.
         """
+        if self.scene.self_contact:
+            is_better &= ~comes_through(self.curve(point), self.curve(trial))
         if not self.scene.obstacles:
             return is_better
         before, after = self._looked_at(point), self._looked_at(trial)
@@ -791,7 +864,7 @@ class NodalForm(Form):
 
     def rounding_floor(self, point: Any) -> Float[Array, ""]:
         floor = super().rounding_floor(point)  # pyright: ignore
-        if not self.scene.obstacles:
+        if not has_contacts(self.scene):
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
 
@@ -801,9 +874,10 @@ def larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(a > b, a, b)
 
 
-def pressure_rows(obstacles: tuple[Obstacle, ...]) -> int:
-    """Of all obstacles at nodes, and of those without friction within elements."""
-    return len(obstacles) + sum(_friction(obstacle) is None for obstacle in obstacles)
+def pressure_rows(scene: Scene) -> int:
+    """Of all obstacles at nodes, of those without friction within elements, and one between elements."""
+    smooth = sum(_friction(obstacle) is None for obstacle in scene.obstacles)
+    return len(scene.obstacles) + smooth + scene.self_contact
 
 
 def _friction(obstacle: Obstacle) -> Any:

@@ -81,8 +81,7 @@ class NodalTangents(NodalForm, MixedForm):
             diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
             stiffness += fields.by_places
             energy += jnp.sum(fields.energy)
-        if contacts.inner is not None:
-            gradient += contacts.inner.gradient
+        gradient = contacts.added_to(gradient)
         if softness is None:
             border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
@@ -109,7 +108,7 @@ class NodalTangents(NodalForm, MixedForm):
             bases=bases,
             gradient=gradient,
             closure=jnp.concatenate(closure),
-            system=system if contacts.inner is None else system.with_elements(contacts.inner.blocks),
+            system=contacts.stiffened(system),
             energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
             residual=larger(amiss, residual),
             gaps=contacts.gaps,
@@ -251,8 +250,7 @@ class NodalFrames(NodalForm, FrameForm):
             diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
         assert across is not None, "elements, not joints"
         contacts = self.contacts(point)
-        if contacts.inner is not None:
-            gradient += contacts.inner.gradient
+        gradient = contacts.added_to(gradient)
         assert point.nodal is not None
         rows, balance, amiss = self.unbalanced_contacts(point, contacts)
         dtype = gradient.dtype
@@ -278,7 +276,7 @@ class NodalFrames(NodalForm, FrameForm):
             bases=self.bases_at(point),
             gradient=gradient,
             closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
-            system=system if contacts.inner is None else system.with_elements(contacts.inner.blocks),
+            system=contacts.stiffened(system),
             energy=energy if fields is None else energy + jnp.sum(fields.energy),
             residual=larger(amiss, self._residual(held.projected(gradient) if self.ends_move else gradient)),
             gaps=contacts.gaps,
@@ -297,8 +295,7 @@ class NodalFrames(NodalForm, FrameForm):
         if fields is not None:
             gradient = gradient.at[:, ::2].add(fields.by_rotation)
         contacts = self.contacts(point)
-        if contacts.inner is not None:
-            gradient += contacts.inner.gradient
+        gradient = contacts.added_to(gradient)
         rows, balance, _ = self.unbalanced_contacts(point, contacts)
         gaps = self.gap_of_elements(point, self.edges(point))
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])

@@ -48,6 +48,8 @@ FORMAT = 13
 OLDEST_FORMAT = 7
 # Of the equilibrium of a harness, which rodjax of format 13 cannot read.
 HARNESS_FORMAT = 15
+# Of a rod that touches itself.
+SELF_CONTACT_FORMAT = 16
 
 # What files of harnesses lack until format 14, which had no obstacles.
 _OF_CONTACTS = ("contact_forces", "end_pressures")
@@ -89,7 +91,10 @@ FIELDS = {
     "state/places": ("1", "arclengths at which the rod passes its sliding clips, as parts of the length"),
     "state/clip_moments": ("1", "moments of the clips on the rod in the continuum, in the solver's units"),
     "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
-    "state/pressures": ("1", "with obstacles: force of each on each node, in the solver's units"),
+    "state/pressures": (
+        "1",
+        "forces of each obstacle on nodes and middles of elements, between elements and the rod beyond; solver's units",
+    ),
     "state/friction/forces": ("1", "tangential forces of obstacles with friction on each node, in the solver's units"),
     "state/friction/reference": ("m", "nodes in the equilibrium before, from which slips are counted; NaN from rest"),
     "state/units/origin": ("m", "origin of the solver's coordinates"),
@@ -250,9 +255,16 @@ def file_content(equilibrium: Equilibrium | HarnessEquilibrium) -> bytes:
             _write_harness(group, equilibrium)
         else:
             _write(group, equilibrium)
-        group.attrs.update({"format": HARNESS_FORMAT if is_harness else FORMAT, "version": __version__})
+        group.attrs.update({"format": _format_of(equilibrium), "version": __version__})
     seal(image)
     return image.getvalue()
+
+
+def _format_of(equilibrium: Equilibrium | HarnessEquilibrium) -> int:
+    """The oldest that can hold it."""
+    if isinstance(equilibrium, HarnessEquilibrium):
+        return HARNESS_FORMAT
+    return SELF_CONTACT_FORMAT if equilibrium.scene.self_contact else FORMAT
 
 
 def _check_scene(scene: Scene, name: str) -> None:
@@ -335,7 +347,7 @@ def _check_format(group: h5py.Group, path: Path) -> None:
     written = group.attrs.get("format")
     if not isinstance(written, np.integer):
         raise ValueError(f"{path} lacks the attribute format of /rodjax: load reads files that rodjax.save wrote")
-    newest = HARNESS_FORMAT if group.attrs.get("kind") == HarnessEquilibrium.__name__ else FORMAT
+    newest = SELF_CONTACT_FORMAT
     if written > newest:
         raise ValueError(
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "

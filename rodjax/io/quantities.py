@@ -217,7 +217,7 @@ def flag(table: dict[str, Any], where: str, key: str) -> bool:
     """Whether the key of a table is true; it is false where it is not given."""
     value = table.get(key, False)
     if not isinstance(value, bool):
-        raise SceneFileError(f"{where}.{key} must be true or false, got {shown(value)}")
+        raise SceneFileError(f"{f'{where}.{key}' if where else key} must be true or false, got {shown(value)}")
     return value
 
 

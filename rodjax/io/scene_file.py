@@ -64,6 +64,8 @@ of a number, or a list of numbers, and any unit of the right dimension; what has
     # normal = [0, 0, 1]
     # friction = 0.3               # optional: Coulomb's coefficient; it acts along a path
 
+    # self_contact = true          # optional, before the first table: the rod touches itself
+
     [solve]                        # optional
     rtol = 1e-3                    # error of the shape by the length, for which the mesh is chosen; or segments = 50
     discretization = "hermite"     # or "finite_difference"
@@ -211,6 +213,7 @@ _SCENE_KEYS = {
     "distributed": "loads: distributed",
     "clips": "clips",
     "obstacles": "obstacles",
+    "self_contact": "self_contact",
     "rod": "rod",
     "the start and clips": "clips: the start and clips",
     "the ends": "start.position, end.position: the ends",
@@ -219,7 +222,7 @@ _SCENE_KEYS = {
 
 _SPIN_NEEDS_D2 = "{0}.d2 or {0}.frame is needed for {0}.spin, which turns it from there"
 # Those that a file must have, and may have.
-SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles", "solve", "path")
+SCENE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles", "self_contact", "solve", "path")
 # What is read of so many tables a reader keeps at most, about 10 MB.
 MAX_KEPT = 10_000
 
@@ -341,6 +344,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
     loads, point_forces, distributed, point_couples = part(_loads, content.get("loads", {}))
     clips = part(_clips, content.get("clips", []))
     obstacles = part(_obstacles, content.get("obstacles", []))
+    self_contact = flag(content, "", "self_contact")
     values["loads"] = dict(loads)
     solve = check_keys(content.get("solve", {}), "solve", (), ("segments", "rtol", "discretization", "strain_limit"))
     discretization = cast(
@@ -376,7 +380,7 @@ def _scene_file(reader: SceneReader, content: dict[str, Any]) -> SceneFile:
             for name, kind in kinds.items()
         )
         try:
-            others = distributed, clips, obstacles, (), point_couples
+            others = distributed, clips, obstacles, (), point_couples, self_contact
             return Scene(rod, start, end, gravity, point_forces, turns, *others)
         except (TypeError, ValueError) as error:
             begin = next(begin for begin in _SCENE_KEYS if str(error).startswith(begin))

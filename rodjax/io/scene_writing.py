@@ -74,7 +74,8 @@ def _written_scene(scene: Scene, where: str, before: str) -> list[str]:
             f"{where}.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
             "its rest_centerline; save writes them with a result"
         )
-    lines = [f"[{before}rod]", *_written_rod(scene.rod)]
+    lines = ["self_contact = true", ""] if scene.self_contact else []
+    lines += [f"[{before}rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{before}{name}]", *_written_support(end)]
     lines += _written(scene, ("turns",))

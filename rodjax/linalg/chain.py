@@ -25,9 +25,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
+from rodjax.linalg.far_rows import FarRows
 
 # Solutions with soft contacts, after the first one.
 HARDENINGS = 5
+# In these, contacts between elements have this part of their softness.
+HARD = 1e-4
 
 
 class InnerRows(eqx.Module):
@@ -82,7 +85,7 @@ class ContactRows(eqx.Module):
     """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held. `softness`: of the
     pressures; `is_closed`: where there is one. `pushes`: along what a pressure pushes, where that is not N, as where it
     brings friction with it, without symmetry then. `inner`: of the rows that belong to elements, whose N are zero;
-    `None` without such.
+    `far`: of the row between elements; `None` without such.
     """
 
     normals: Float[Array, "k n+1 3"]
@@ -90,23 +93,30 @@ class ContactRows(eqx.Module):
     is_closed: Bool[Array, "k n+1"]
     pushes: Float[Array, "k n+1 3"] | None = None
     inner: InnerRows | None = None
+    far: FarRows | None = None
 
     def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "k n+1"]:
         """Of the gaps, as the rod turns and nodes move."""
         rates = jnp.einsum("knc,nc->kn", self.normals, u)
-        return rates if self.inner is None else rates.at[self.inner.rows].set(self.inner.rates(x, u))
+        if self.inner is not None:
+            rates = rates.at[self.inner.rows].set(self.inner.rates(x, u))
+        return rates if self.far is None else rates.at[self.far.row].set(self.far.rates(x, u))
 
     def pushed(self, pressures: Float[Array, "k n+1"]) -> Float[Array, "n+1 3"]:
         """The forces of pressures on the nodes."""
         pushed = jnp.einsum("knc,kn->nc", self._pushes, pressures)
-        return pushed if self.inner is None else pushed + self.inner.pushed(pressures[self.inner.rows])
+        if self.inner is not None:
+            pushed += self.inner.pushed(pressures[self.inner.rows])
+        return pushed if self.far is None else pushed + self.far.pushed(pressures[self.far.row])
 
     def turned(self, pressures: Float[Array, "k n+1"], moments: Float[Array, "b m"]) -> Float[Array, "b m"]:
         """Moments on the rod with those of pressures."""
-        return moments if self.inner is None else moments + self.inner.turned(pressures[self.inner.rows])
+        if self.inner is not None:
+            moments = moments + self.inner.turned(pressures[self.inner.rows])
+        return moments if self.far is None else moments + self.far.turned(pressures[self.far.row])
 
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
-        """The system with what closed contacts add to its stiffness."""
+        """The system with what closed contacts add to its stiffness, but for those between elements."""
         weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
         stiffness = jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
         system = dataclasses.replace(system, stiffness=system.stiffness + stiffness)
@@ -236,8 +246,12 @@ class ChainSystem(eqx.Module):
         is_closed = self.contacts.is_closed
         pushed = jnp.einsum("nij,nj->ni", self.stiffness, moved)
         pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
-        if self.contacts.inner is not None:
-            f -= self.contacts.inner.turned(jnp.where(is_closed, pressures, 0.0)[self.contacts.inner.rows])
+        if self.contacts.inner is not None or self.contacts.far is not None:
+            f -= self.contacts.turned(jnp.where(is_closed, pressures, 0.0), jnp.zeros_like(f))
+        if self.contacts.far is not None:
+            moments, forces = self.contacts.far.curved(x, moved)
+            f += moments
+            pushed += forces
         none = jnp.zeros_like(force[:1])
         balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
         if self.loads is not None:
@@ -306,6 +320,40 @@ class _Middles(eqx.Module):
         return self.left @ of_middles
 
 
+class _Border(eqx.Module):
+    """What all of a chain has in common: the border of its system, then the columns of contacts between elements.
+
+    `by_place`: `None` where there are none of the latter; `positive`: of the columns, those of positive compliance.
+    """
+
+    by_rotation: Float[Array, "b k m"]
+    by_place: Float[Array, "k n+1 3"] | None
+    compliance: Float[Array, "k k"]
+    positive: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(system: ChainSystem, contacts: ContactRows) -> "_Border":
+        """Of a system that may be mirrored, with contacts that are not."""
+        far = contacts.far
+        if far is None:
+            return _Border(system.border, None, system.compliance, len(system.compliance))
+        columns = far.columns(contacts.is_closed[far.row], contacts.softness, system.diagonal.shape[-1])
+        by_rotation, by_place, compliances = columns
+        if system.is_backward:
+            by_rotation, by_place = by_rotation[..., ::-1], by_place[:, ::-1]
+        k = len(system.compliance)
+        compliance = jnp.zeros((k + len(compliances),) * 2, compliances.dtype)
+        compliance = compliance.at[:k, :k].set(system.compliance).at[k:, k:].set(jnp.diag(compliances))
+        by_place = jnp.concatenate([jnp.zeros((k, *by_place.shape[1:]), by_place.dtype), by_place])
+        by_rotation = jnp.concatenate([system.border, by_rotation], axis=1)
+        return _Border(by_rotation, by_place, compliance, k + far.positive)
+
+    def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "k r"]:
+        """Transposed, times columns."""
+        product = jnp.einsum("ikm,irm->kr", self.by_rotation, x)
+        return product if self.by_place is None else product + jnp.einsum("knc,rnc->kr", self.by_place, u)
+
+
 class ChainFactors(eqx.Module):
     """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`, 0 without symmetry.
 
@@ -320,7 +368,9 @@ class ChainFactors(eqx.Module):
     inverses: Float[Array, "n+1 c c"]
     below: Float[Array, "n c c"]
     above: Float[Array, "n c c"]
+    border: "_Border"
     border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
+    bordered: Float[Array, "k k"]
     complement: Float[Array, "k k"]
     negative: Int[Array, ""]
 
@@ -337,13 +387,24 @@ class ChainFactors(eqx.Module):
             return self.solve_softly(f, c)
         hard = dataclasses.replace(self.contacts, softness=jnp.zeros_like(self.contacts.softness))
         hard = dataclasses.replace(self.whole, contacts=hard)
+        complement = self._hard_complement()
 
         def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
             left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
-            return jax.tree.map(jnp.add, found, self._solved_once(*left)), None
+            return jax.tree.map(jnp.add, found, self._solved_once(*left, complement)), None
 
-        found, _ = jax.lax.scan(nearer, self._solved_once(f, c), None, length=HARDENINGS)
+        found, _ = jax.lax.scan(nearer, self._solved_once(f, c, complement), None, length=HARDENINGS)
         return found
+
+    def _hard_complement(self) -> Float[Array, "k k"]:
+        """With contacts between elements that are all but rigid: a border is no softer for that."""
+        far, k = self.contacts.far, len(self.whole.compliance)
+        if far is None:
+            return self.complement
+        at = np.arange(k, k + len(far.elements))
+        is_closed = self.contacts.is_closed[far.row, far.elements]
+        harder = jnp.where(is_closed, (1 - HARD) * self.contacts.softness, 0.0)
+        return jnp.linalg.inv(self.bordered.at[at, at].add(harder))
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -351,18 +412,23 @@ class ChainFactors(eqx.Module):
         """With the softness of the contacts. Those within elements couple their nodes so stiffly that elimination loses
         half of the digits; what is left is asked for again.
         """
-        found = self._solved_once(f, c)
+        found = self._solved_once(f, c, self.complement)
         if self.contacts.inner is None:
             return found
         left = jax.tree.map(jnp.subtract, (f, c), self.whole.times(*found))
-        return jax.tree.map(jnp.add, found, self._solved_once(*left))
+        return jax.tree.map(jnp.add, found, self._solved_once(*left, self.complement))
 
     def _solved_once(
-        self, f: Float[Array, "b m"], c: Float[Array, "j"]
+        self, f: Float[Array, "b m"], c: Float[Array, "j"], complement: Float[Array, "k k"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         system, contacts = self.system, self.contacts
         first, given, nodes, gaps = system.parted(c)
         pulling = -jnp.where(contacts.is_closed, given / contacts.softness, 0.0)
+        if contacts.far is not None:
+            # These are columns of the border.
+            pulling = pulling.at[contacts.far.row].set(0.0)
+            of_far = jnp.where(contacts.is_closed, -given, 0.0)[contacts.far.row, contacts.far.elements]
+            first = jnp.pad(jnp.concatenate([first, of_far]), (0, 4 * len(of_far)))
         nodes += contacts.pushed(pulling)
         f = contacts.turned(pulling, f)
         if system.is_backward:
@@ -370,7 +436,7 @@ class ChainFactors(eqx.Module):
         x, displacements, forces = self._without_border(f[:, None], nodes[None], gaps[None])
         x, displacements, forces = x[:, 0], displacements[0], forces[0]
         by_border, u_by_border, force_by_border = self.border_solution
-        multipliers = self.complement @ (first - jnp.einsum("ikm,im->k", system.border, x))
+        multipliers = complement @ (first - self.border.times(x[:, None], displacements[None])[:, 0])
         x -= jnp.einsum("ikm,k->im", by_border, multipliers)
         displacements -= jnp.tensordot(multipliers, u_by_border, 1)
         forces -= jnp.tensordot(multipliers, force_by_border, 1)
@@ -378,6 +444,14 @@ class ChainFactors(eqx.Module):
             x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
         rates = contacts.rates(x, displacements)
         pressures = jnp.where(contacts.is_closed, -(given + rates) / contacts.softness, -given)
+        if contacts.far is not None:
+            far, k = contacts.far, len(system.compliance)
+            here = contacts.is_closed[far.row, far.elements]
+            found = jnp.where(here, -multipliers[k : k + len(here)], -given[far.row, far.elements])
+            pressures = (
+                pressures.at[far.row].set(-given[far.row]).at[far.row, far.elements].set(found, unique_indices=True)
+            )
+            multipliers = multipliers[:k]
         parts = (multipliers, pressures, displacements, forces)
         return x, jnp.concatenate([part.reshape(-1) for part in parts])
 
@@ -487,20 +561,21 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
         # Each force is a multiplier, and so is that of the element before the first node.
         signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
         negative += jnp.sum(signs < 0) - 3 * (n + 1)
-    k = len(system.compliance)
+    border = _Border.of(system, contacts)
+    k = len(border.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    factors = ChainFactors(
-        contacts, whole, system, middles, inverses, below, above, blank, jnp.zeros((k, k), dtype), negative
-    )
+    no_complement = jnp.zeros((k, k), dtype)
+    chain = contacts, whole, system, middles, inverses, below, above
+    factors = ChainFactors(*chain, border, blank, no_complement, no_complement, negative)
     if not k:
         return factors
-    solution = factors._without_border(system.border, *nothing)
-    matrix = -system.compliance - jnp.einsum("ikm,ijm->kj", system.border, solution[0])
+    by_place = nothing[0] if border.by_place is None else border.by_place
+    solution = factors._without_border(border.by_rotation, by_place, nothing[1])
+    matrix = -border.compliance - border.times(*solution[:2])
     if is_symmetric:
-        negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - k
-    complement = jnp.linalg.inv(matrix)
-    return ChainFactors(contacts, whole, system, middles, inverses, below, above, solution, complement, negative)
+        negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - border.positive
+    return ChainFactors(*chain, border, solution, matrix, jnp.linalg.inv(matrix), negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:

@@ -132,6 +132,8 @@ def check_movable(scene: Scene, name: str) -> None:
     """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
     if has_friction(scene):
         raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
+    if scene.self_contact:
+        raise ValueError(f"{name}.self_contact must be False where ends of the rod have unknown poses")
     if slides(scene):
         raise ValueError(f"{name}.clips must not slide where ends of the rod have unknown poses")
     if not has_potential(scene):

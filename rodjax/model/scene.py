@@ -55,6 +55,10 @@ class Scene(eqx.Module):
         away from, `rodjax.clearance` needs none in the scene. Double precision only.
     - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
     - `point_couples`: `PointCouple`s along the rod.
+    - `self_contact`: whether the rod, which has a radius, touches itself without friction, where each element is
+        nearest to the rod beyond it: at places that follow the shape, at most 48 at a time. Elements and double
+        precision only. A step of the search leads no part of the rod through another; a start whose parts overlap is
+        led out. Where the rod stays away from itself that only costs time.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies
     beyond the rod, where clips do not follow one another along it, or where neighbouring supports are further apart
@@ -72,6 +76,7 @@ class Scene(eqx.Module):
     obstacles: tuple[Obstacle, ...]
     potentials: tuple[Potential, ...]
     point_couples: tuple[PointCouple, ...]
+    self_contact: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,
@@ -86,6 +91,7 @@ class Scene(eqx.Module):
         obstacles: Sequence[Obstacle] = (),
         potentials: Sequence[Potential] = (),
         point_couples: Sequence[PointCouple] = (),
+        self_contact: bool = False,
     ):
         instance(rod, "rod", Rod)
         instance(start, "start", Support)
@@ -112,10 +118,12 @@ class Scene(eqx.Module):
         parts = _of_one_precision((rod, start, end, gravity, point_forces, turns, *along))
         self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
         self.distributed, self.clips, self.obstacles, self.potentials, self.point_couples = rest
+        instance(self_contact, "self_contact", bool)
+        self.self_contact = self_contact
         for k, potential in enumerate(self.potentials):
             check_potential(potential, f"potentials[{k}]")
         _check_supports(self)
-        _check_obstacles(self)
+        _check_contacts(self)
         _check_numbers(self)
 
     def __str__(self) -> str:
@@ -153,14 +161,17 @@ def _check_supports(scene: Scene) -> None:
         )
 
 
-def _check_obstacles(scene: Scene) -> None:
-    if not scene.obstacles:
+def _check_contacts(scene: Scene) -> None:
+    if not has_contacts(scene):
         return
+    there_are, name, without = "there are obstacles", "obstacles", "()"
+    if not scene.obstacles:
+        there_are, name, without = "it may touch itself", "self_contact", "False"
     if scene.rod.radius is None:
-        raise ValueError("rod must have a radius where there are obstacles, got None; rodjax.Rod takes one")
+        raise ValueError(f"rod must have a radius where {there_are}, got None; rodjax.Rod takes one")
     if scene.rod.length.dtype != jnp.float64:
         raise ValueError(
-            "obstacles must be () in single precision, in which contacts have no digits: "
+            f"{name} must be {without} in single precision, in which contacts have no digits: "
             "jax.config.update('jax_enable_x64', True) before making the scene"
         )
 
@@ -377,7 +388,7 @@ def needs_frames(scene: Scene) -> bool:
         return True
     if scene.clips and any(clip.frame is not None for clip in scene.clips):
         return True
-    return bool(scene.obstacles or scene.potentials) and dead_end_moment(scene) is not None
+    return bool(has_contacts(scene) or scene.potentials) and dead_end_moment(scene) is not None
 
 
 def with_plain_rod(scene: Scene) -> Scene:
@@ -406,10 +417,15 @@ def loads_at_nodes(scene: Scene) -> list[PointForce | PointCouple]:
 
 def has_node_places(scene: Scene) -> bool:
     """Whether forces along the rod depend on where it is or how it turns, so that the positions of the nodes, and a
-    force in each element, are unknowns: beside obstacles, in fields of forces, and of rods by frames under loads
-    without a potential.
+    force in each element, are unknowns: where the rod may touch obstacles or itself, in fields of forces, and of rods
+    by frames under loads without a potential.
     """
-    return bool(scene.obstacles or scene.potentials) or (needs_frames(scene) and not has_potential(scene))
+    return bool(has_contacts(scene) or scene.potentials) or (needs_frames(scene) and not has_potential(scene))
+
+
+def has_contacts(scene: Scene) -> bool:
+    """Whether the rod may touch obstacles or itself."""
+    return bool(scene.obstacles) or scene.self_contact
 
 
 def has_friction(scene: Scene) -> bool:
@@ -455,5 +471,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         [InUnits(obstacle, units.origin, units.length) for obstacle in scene.obstacles],
         [potential.in_units(units) for potential in scene.potentials],
         [couple.in_units(units) for couple in scene.point_couples],
+        scene.self_contact,
     )
     return scaled, units

@@ -98,7 +98,9 @@ def scene_text(scene: "Scene") -> str:
         value = getattr(scene, name)
         if name in ("rod", "start", "end") or value is None or value is False:
             continue
-        if isinstance(value, tuple):
+        if value is True:
+            lines.append(name)
+        elif isinstance(value, tuple):
             lines += [f"{name}[{k}]: {part_text(entry)}" for k, entry in enumerate(value)]
         else:
             lines.append(f"{name}: {value_text(value, UNITS.get(name, ''))}")

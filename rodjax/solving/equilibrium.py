@@ -36,6 +36,7 @@ from rodjax.model.plane import check_planar, is_planar, plane
 from rodjax.model.scene import (
     Scene,
     dead_end_moment,
+    has_contacts,
     has_friction,
     has_node_places,
     has_potential,
@@ -325,9 +326,9 @@ def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
 
 def _pressures(scene: Scene, options: Options, state: SolverState | None = None) -> Float[Array, "k n+1"] | None:
     """Those of a state, on its mesh, or no numbers where they are not known."""
-    if not scene.obstacles:
+    if not has_contacts(scene):
         return None
-    shape = (pressure_rows(scene.obstacles), options.segments + 1)
+    shape = (pressure_rows(scene), options.segments + 1)
     if state is not None and state.pressures is not None and state.pressures.shape == shape:
         return state.pressures
     return jnp.full(shape, jnp.nan, scene.rod.length.dtype)
@@ -410,6 +411,8 @@ def checked_options(
         )
     if scene.obstacles and discretization == "finite_difference":
         raise ValueError("discretization must be 'hermite' for a scene with obstacles")
+    if scene.self_contact and discretization == "finite_difference":
+        raise ValueError("discretization must be 'hermite' for a scene with self_contact")
     if scene.potentials and discretization == "finite_difference":
         raise ValueError("discretization must be 'hermite' for a scene with potentials")
     if dead_end_moment(scene) is not None and isinstance(solver, NonlinearCG):
@@ -430,7 +433,7 @@ def checked_options(
         segments = max(guess.s.shape[-1] - 1, least)
     elif rtol is not None and is_known(scene, guess):
         wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
-        if scene.obstacles:
+        if has_contacts(scene):
             wanted = max(wanted, CONTACT_SEGMENTS)
         segments = first_size(rtol, discretization, max(wanted, least))
     else:
@@ -511,7 +514,7 @@ def first_state(scene: Scene, guess: Guess | Equilibrium | None, options: Option
         state = guess.state
         first = last_twist(guess)
         if jax.tree.structure(first.last) == jax.tree.structure(last_of(scene)):
-            if not scene.obstacles and state.clip_moments is None:
+            if not has_contacts(scene) and state.clip_moments is None:
                 return state, first
             before = _before(scene, guess)
             pressures = _pressures(scene, options, state)
@@ -663,7 +666,7 @@ def _begins_plain(scene: Scene, options: Options) -> bool:
     """Whether a rod by frames begins in the equilibrium of the plain one: where turns are stated, with which a rod may
     take one of several shapes, so that EI and (EI, EI) take the same.
     """
-    others = scene.distributed or scene.clips or scene.obstacles
+    others = scene.distributed or scene.clips or has_contacts(scene)
     return scene.turns is not None and scene.rod.rest_shape is None and not others and not options.planar
 
 
@@ -734,7 +737,7 @@ class Search(eqx.Module):
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
         places = sliding_places(self.form.scene)
         pressures, friction = (
-            (point.nodal.pressures, point.nodal.friction) if self.form.scene.obstacles else (None, None)
+            (point.nodal.pressures, point.nodal.friction) if has_contacts(self.form.scene) else (None, None)
         )
         state = SolverState(shape, point.end_force, self.units, places, pressures=pressures, friction=friction)
         return Found(state, point, outcome, stable)

@@ -18,7 +18,7 @@ from rodjax.discretization.form import Point
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
-from rodjax.model.scene import Scene, nondimensional
+from rodjax.model.scene import Scene, has_contacts, nondimensional
 from rodjax.programs.linear import linear
 from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to, examined
@@ -75,7 +75,7 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
 
     def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
-        nodal = point.nodal if scene.obstacles else None
+        nodal = point.nodal if has_contacts(scene) else None
         pressures, friction = (None, None) if nodal is None else (nodal.pressures, nodal.friction)
         state = SolverState(
             shape, point.end_force, units, places, before=before, pressures=pressures, friction=friction

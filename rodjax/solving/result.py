@@ -49,7 +49,7 @@ from rodjax.mechanics.passage import Before, Passage, passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional, slid, slides
+from rodjax.model.scene import Scene, has_contacts, has_node_places, has_potential, nondimensional, slid, slides
 from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
@@ -140,6 +140,20 @@ class SolverState(eqx.Module):
         return dataclasses.replace(point, nodal=Nodal(self.shape.nodes, self.pressures, relaxed, self.friction))
 
 
+class SelfContacts(eqx.Module):
+    """Where each of n elements of a rod is nearest to the rod beyond it, and what one part applies to the other there.
+
+    - `s`, `beyond` [..., n] arclengths of both places, m
+    - `gaps` [..., n] m between the surfaces there, infinite where an element has nothing beyond it but neighbours
+    - `forces` [..., n, 3] N: on the rod at `s`, and their reverse at `beyond`; zero where the parts do not touch
+    """
+
+    s: Float[Array, "... n"]
+    beyond: Float[Array, "... n"]
+    gaps: Float[Array, "... n"]
+    forces: Float[Array, "... n 3"]
+
+
 class Equilibrium(eqx.Module):
     """The equilibrium of a scene, or several of them along a leading axis `...` of every field.
 
@@ -161,13 +175,14 @@ class Equilibrium(eqx.Module):
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
       when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain are those just
       beyond a node where they jump, at a clip, a load or another section, and tension the mean of both sides
-    - `contact_forces` [..., n+1, 3] N: what obstacles apply to the rod at each node, and half of what they apply in the
-      middle of each element beside it; `obstacle_forces` [..., obstacles,
+    - `contact_forces` [..., n+1, 3] N: what obstacles, and the rod itself, apply to the rod at each node, and its part
+      of what they apply in each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
       not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
       friction; `gaps` [..., obstacles, n+1] m: from the surface of the rod at each node to each obstacle, negative
       within it. Computed when asked for
+    - `self_contacts`: of a scene with `self_contact` the `SelfContacts` of the rod. Computed when asked for
     - `converged` [...] bool; `status` [...] code, in words by `rodjax.describe`: `OVERSTRETCHED` for an equilibrium
       whose largest |axial_strain| is above the `strain_limit` of the solve
     - `stable` [...] bool: converged, and the energy has no negative curvature there; with loads that have no potential
@@ -253,7 +268,7 @@ class Equilibrium(eqx.Module):
 
     @property
     def contact_forces(self) -> Float[Array, "... n+1 3"]:
-        if not self.scene.obstacles:
+        if not has_contacts(self.scene):
             return jnp.zeros_like(self.nodes)
         return _node_forces(self)[1]
 
@@ -272,6 +287,10 @@ class Equilibrium(eqx.Module):
     @property
     def gaps(self) -> Float[Array, "... obstacles n+1"]:
         return _contacts(self).gaps
+
+    @property
+    def self_contacts(self) -> "SelfContacts":
+        return _self_contacts(self)
 
     @property
     def clip_moments(self) -> Float[Array, "... clips 3"]:
@@ -547,6 +566,24 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
 
+def _self_contacts(equilibrium: Equilibrium) -> SelfContacts:
+    if equilibrium.scene.self_contact:
+        return _self_contacts_of(equilibrium)
+    nothing = jnp.zeros((*equilibrium.s.shape[:-1], 0), equilibrium.s.dtype)
+    return SelfContacts(nothing, nothing, nothing, jnp.zeros((*nothing.shape, 3), nothing.dtype))
+
+
+@over_leading_axes
+def _self_contacts_of(equilibrium: Equilibrium) -> SelfContacts:
+    form, point = form_and_point(equilibrium)
+    assert isinstance(form, NodalForm)
+    units = equilibrium.state.units
+    found = form.self_exerted(point)
+    return SelfContacts(
+        found.s * units.length, found.beyond * units.length, found.gaps * units.length, found.forces.T * units.force
+    )
+
+
 @compiled
 def _slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
     """phi' of a rod with shear."""
@@ -698,9 +735,13 @@ def _largest_strain(equilibrium: Equilibrium) -> str:
 
 
 def _contacts_told(equilibrium: Equilibrium) -> list[str]:
-    """Of one equilibrium, which obstacles push on the rod, how much and where."""
+    """Of one equilibrium, which obstacles push on the rod, and where it pushes on itself, how much and where."""
     told = []
-    if not equilibrium.scene.obstacles or not bool(equilibrium.converged):
+    if not bool(equilibrium.converged):
+        return told
+    if equilibrium.scene.self_contact:
+        told += _self_contacts_told(equilibrium)
+    if not equilibrium.scene.obstacles:
         return told
     s, contacts = np.asarray(equilibrium.s), jax.tree.map(np.asarray, _contacts(equilibrium))
     for k, forces in enumerate(contacts.forces - contacts.friction):
@@ -712,6 +753,21 @@ def _contacts_told(equilibrium: Equilibrium) -> list[str]:
             pushes = f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}"
             told.append(pushes + _friction_told(equilibrium, contacts, k))
     return told
+
+
+def _self_contacts_told(equilibrium: Equilibrium) -> list[str]:
+    found = jax.tree.map(np.asarray, equilibrium.self_contacts)
+    forces = np.linalg.norm(found.forces, axis=-1)
+    touching = np.flatnonzero(forces > 0)
+    if not touching.size:
+        return ["does not touch itself"]
+    s, beyond = found.s[touching], found.beyond[touching]
+    most = touching[np.argmax(forces[touching])]
+    where = f"s = {s.min():.4g} to {s.max():.4g} m and s = {beyond.min():.4g} to {beyond.max():.4g} m"
+    if touching.size == 1:
+        where = f"s = {s[0]:.4g} m and s = {beyond[0]:.4g} m"
+    places = "place" if touching.size == 1 else "places"
+    return [f"touches itself at {touching.size} {places}, {where}, the largest force {forces[most]:.4g} N"]
 
 
 def _friction_told(equilibrium: Equilibrium, contacts: _Contacts, k: int) -> str:

@@ -1,0 +1,361 @@
+"""Contact of a rod with itself: where each element comes nearest to the rod beyond it.
+
+The centerline is the cubic through the places and tangents of the nodes. Of each element the contact point is that
+place s of it, and that place s' further along the rod, where
+
+    g = |x(s) - x(s')| + edge ((s - middle)/(h/2))^2 - r(s) - r(s')
+
+is least; the gap g is a function of the four nodes beside these places. The small second term keeps the place in the
+middle where two parts of the rod lie along one another. First derivatives of g are those at fixed places; the second
+ones count that the places move. Neighbours along the rod are no contact: less than half a turn around the rod's own
+radius away, or of the next element.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.geometry.vectors import cross, dot
+from rodjax.linalg.far_rows import FarRows
+
+# By this part of its radius the rod counts as thinner at the ends of an element than in its middle.
+EDGE = 1e-6
+# Places in each element from which the nearest ones are sought, and steps of that search.
+SAMPLES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
+STEPS = 12
+# Of the elements, those nearest to the rod beyond them may touch it: at most so many.
+MOST_CONTACTS = 48
+# A step leads no element nearer to what it is nearest to than this part of the distance at which they touch.
+DEEPEST = 0.5
+# Gap of an element with nothing beyond it [L].
+NOTHING_BEYOND = 1.0
+
+
+class Curve(NamedTuple):
+    """A rod's centerline on a mesh, and what moves it: axes about which the tangents of the nodes turn, 0 in `free` at
+    nodes whose place is given; its radius in the middle of elements. `normal`: of the plane in which it stays, `None`
+    in space.
+    """
+
+    s: Float[Array, "n+1"]
+    places: Float[Array, "n+1 3"]
+    tangents: Float[Array, "3 n+1"]
+    axes: Float[Array, "3 b n+1"]
+    free: Float[Array, "n+1"]
+    radius: Float[Array, "n"]
+    normal: Float[Array, "3"] | None = None
+
+
+class Nearest(NamedTuple):
+    """Places s of k elements and s' beyond them that are nearest to one another, the elements there; where s or s'
+    stays, at the end of what is allowed; and whether there is such a place.
+    """
+
+    s: Float[Array, "k"]
+    element: Int[Array, "k"]
+    beyond: Float[Array, "k"]
+    other: Int[Array, "k"]
+    stays: Bool[Array, "2 k"]
+    exists: Bool[Array, "k"]
+
+
+class _Side(NamedTuple):
+    """A place of the curve: position, its first two derivatives by arclength, and the weights in the position and the
+    first derivative of both nodes' places and tangents.
+    """
+
+    x: Float[Array, "3 k"]
+    slope: Float[Array, "3 k"]
+    curvature: Float[Array, "3 k"]
+    of_places: Float[Array, "2 2 k"]  # [derivative, node]
+    of_tangents: Float[Array, "2 2 k"]
+
+
+class SelfContacts(NamedTuple):
+    """Gaps of the elements, a last number that stands for nothing; their rows; second derivatives of what L has of them
+    by the rotations of each node alone.
+    """
+
+    gaps: Float[Array, "n+1"]
+    rows: FarRows
+    by_rotations: Float[Array, "b b n+1"]
+
+
+def nearest(curve: Curve) -> Nearest:
+    """Of each element; without derivatives."""
+    curve = jax.lax.stop_gradient(curve)
+    s, n = curve.s, len(curve.s) - 1
+    h, element = jnp.diff(s), jnp.arange(n)
+    least, most = _range(curve)
+    begin, of_element = _samples(s)
+    ways = [c[:, None] - c[None] for c in _at(curve, of_element, begin).x]
+    squares = functools.reduce(jnp.add, map(jnp.square, ways))
+    allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
+    squares = jnp.where(allowed, squares, jnp.inf).reshape(n, -1)
+    best = jnp.argmin(squares, axis=1)
+    exists = jnp.isfinite(jnp.min(squares, axis=1))
+    here, there = best // len(begin), best % len(begin)
+    first = begin.reshape(n, -1)[element, here], begin[there]
+
+    def nearer(_, places: tuple[Array, Array]) -> tuple[Array, Array]:
+        a, b = places
+        other = _element_at(s, b)
+        _, (of_a, of_b), (aa, ab, bb) = _distance(curve, element, other, a, b)
+        bb = jnp.where(bb > 0, bb, 1.0)
+        slope, growth = of_a - ab * of_b / bb, aa - ab**2 / bb
+        step = jnp.where(growth > 0, -slope / jnp.where(growth > 0, growth, 1.0), -jnp.sign(slope) * h)
+        step = jnp.clip(a + jnp.clip(step, -h / 4, h / 4), s[:-1], s[1:]) - a
+        along = jnp.clip(-(of_b + ab * step) / bb, -h[other] / 2, h[other] / 2)
+        return a + step, jnp.clip(b + along, least, most)
+
+    a, b = jax.lax.fori_loop(0, STEPS, nearer, first)
+    other = _element_at(s, b)
+    _, _, (aa, ab, bb) = _distance(curve, element, other, a, b)
+    is_flat = aa * bb <= ab**2
+    stays = jnp.stack([(a <= s[:-1]) | (a >= s[1:]) | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
+    return Nearest(a, element, b, other, stays, exists)
+
+
+def self_contacts(curve: Curve, pressures: Float[Array, "n+1"], unit: Float[Array, ""], row: int) -> SelfContacts:
+    """At a point with these pressures, which are forces in the `unit` given, as gaps are lengths in its inverse; `row`:
+    as of `FarRows`.
+    """
+    found = nearest(curve)
+    n = len(found.s)
+    gaps = jnp.where(found.exists, _gaps(curve, found)[0], NOTHING_BEYOND) * unit
+    # Those that push go on doing so.
+    order = jnp.argsort(jnp.where(pressures[:-1] > 0, -1.0, jax.lax.stop_gradient(gaps)))
+    chosen = order[: min(n, MOST_CONTACTS)]
+    found = Nearest(*(leaf[..., chosen] for leaf in found))
+    vectors, nodes, by_rotations = _rows(curve, found, unit * pressures[chosen])
+    vectors = vectors.at[0].multiply(unit)
+    count = curve.axes.shape[1]
+    rows = FarRows(vectors[:, :count], vectors[:, count:], nodes, chosen, row)
+    is_chosen = jnp.zeros(n, bool).at[chosen].set(True)
+    nothing = NOTHING_BEYOND * unit
+    return SelfContacts(jnp.append(jnp.where(is_chosen, gaps, nothing), nothing), rows, by_rotations)
+
+
+def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
+    """Whether a step may lead one part of the rod through another: all places go straight from one curve to the other.
+
+    The places of two elements that are nearest to one another keep half of the distance at which they touch, along the
+    line between them. All other parts are seen as places that represent the rod as far as halfway to the next ones:
+    along the line between two of these the distance stays larger than what they represent.
+    """
+    found = nearest(before)
+    ways = [_at(curve, found.element, found.s).x - _at(curve, found.other, found.beyond).x for curve in (before, after)]
+    distance = jnp.sqrt(dot(ways[0], ways[0]))
+    along = dot(*ways) / jnp.where(distance > 0, distance, 1.0)
+    touching = before.radius[found.element] + before.radius[found.other]
+    is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, touching)))
+    begin, of_element = _samples(before.s)
+    least, most = _range(before)
+    allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
+    reach = jnp.max(jnp.diff(before.s)) / len(SAMPLES)
+    old, new = ([c[:, None] - c[None] for c in _at(curve, of_element, begin).x] for curve in (before, after))
+    squares, products = (functools.reduce(jnp.add, map(jnp.multiply, old, way)) for way in (old, new))
+    is_far = allowed & (squares > 4 * reach**2)
+    return is_pierced | jnp.any(is_far & (products < reach * jnp.sqrt(squares)))
+
+
+class Exerted(NamedTuple):
+    """Of each element: the places s and s' where it is nearest to the rod beyond it, the gap, infinite where there is
+    nothing beyond, and the force there on the rod at s.
+    """
+
+    s: Float[Array, "n"]
+    beyond: Float[Array, "n"]
+    gaps: Float[Array, "n"]
+    forces: Float[Array, "3 n"]
+
+
+def exerted(curve: Curve, pressures: Float[Array, "n+1"]) -> Exerted:
+    return _exerted(curve, pressures, nearest(curve))
+
+
+def _exerted(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
+    gaps, a, b = _gaps(curve, found)
+    way = _at(curve, found.element, a).x - _at(curve, found.other, b).x
+    distance = jnp.sqrt(jnp.where(found.exists, dot(way, way), 1.0))
+    forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * way / distance[None]
+    return Exerted(a, b, jnp.where(found.exists, gaps, jnp.inf), forces)
+
+
+def on_elements(curve: Curve, pressures: Float[Array, "n+1"]) -> tuple[Array, Array]:
+    """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both."""
+    found = nearest(curve)
+    a, b, _, forces = _exerted(curve, pressures, found)
+    on_places = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
+    for s, element, sign in ((a, found.element, 1), (b, found.other, -1)):
+        side = _at(curve, element, s)
+        on_places = on_places.at[..., element].add(sign * forces[:, None] * side.of_places[0][None])
+        on_tangents = on_tangents.at[..., element].add(sign * forces[:, None] * side.of_tangents[0][None])
+    return on_places, on_tangents
+
+
+def _gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array, "k"], Float[Array, "k"]]:
+    """And the places, as they move with the curve: by two steps of Newton's method, which have the first three
+    derivatives.
+    """
+    a, b = found.s, found.beyond
+    a_stays, b_stays = found.stays
+    for _ in range(2):
+        _, (of_a, of_b), (aa, ab, bb) = _distance(curve, found.element, found.other, a, b)
+        of_a, of_b = jnp.where(a_stays, 0.0, of_a), jnp.where(b_stays, 0.0, of_b)
+        aa, bb = jnp.where(a_stays, 1.0, aa), jnp.where(b_stays, 1.0, bb)
+        ab = jnp.where(a_stays | b_stays, 0.0, ab)
+        determinant = aa * bb - ab**2
+        a, b = a - (bb * of_a - ab * of_b) / determinant, b - (aa * of_b - ab * of_a) / determinant
+    distance, _, _ = _distance(curve, found.element, found.other, a, b)
+    return distance - curve.radius[found.element] - curve.radius[found.other], a, b
+
+
+def _rows(
+    curve: Curve, found: Nearest, pressures: Float[Array, "p"]
+) -> tuple[Float[Array, "5 b+3 4 p"], Int[Array, "4 p"], Float[Array, "b b n+1"]]:
+    """The gradient of each gap and the vectors of its curvature, by the rotations and places of its nodes; these; and
+    what of the curvature is by the rotations of one node.
+    """
+    _, a, b = _gaps(curve, found)
+    here, there = _at(curve, found.element, a), _at(curve, found.other, b)
+    nodes = jnp.stack([found.element, found.element + 1, found.other, found.other + 1])
+    way = here.x - there.x
+    # Of what has nothing beyond it any number will do.
+    d = jnp.sqrt(jnp.where(found.exists, dot(way, way), 1.0))
+    normal = jnp.where(found.exists, way, 0.0) / d[None]
+    tangents, axes = curve.tangents[:, nodes], curve.axes[:, :, nodes]  # [3, 4, p], [3, b, 4, p]
+    turned = cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape))
+    signs = jnp.array([1.0, 1.0, -1.0, -1.0], d.dtype)[:, None]
+    is_free = signs * curve.free[nodes]
+    on_places = jnp.concatenate([here.of_places, there.of_places], axis=1) * is_free[None]  # [derivative, node, p]
+    on_tangents = jnp.concatenate([here.of_tangents, there.of_tangents], axis=1) * signs[None]
+
+    def along(v: Float[Array, "3 p"], derivative: int = 0) -> Array:
+        """The rate of v . way, or of v . the slopes on both sides, by rotations and places of the nodes."""
+        if curve.normal is not None:
+            v = v - curve.normal[:, None] * (curve.normal @ v)[None]
+        by_rotation = jnp.einsum("cp,cbkp->bkp", v, turned) * on_tangents[derivative][None]
+        return jnp.concatenate([by_rotation, v[:, None] * on_places[derivative][None]])
+
+    _, _, (aa, ab, bb) = _distance(curve, found.element, found.other, a, b)
+    is_own = jnp.array([1.0, 1.0, 0.0, 0.0], d.dtype)[None, :, None]
+
+    def across(v: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
+        return (v - dot(v, normal)[None] * normal) / d[None]
+
+    gap, slopes = along(normal), along(normal, 1)
+    by_a = along(across(here.slope)) + slopes * is_own
+    by_b = -along(across(there.slope)) + slopes * (1 - is_own)
+    # The curvature: of the distance at fixed places, across the normal, less what the places do as they move.
+    pushing = jnp.sqrt(jnp.maximum(pressures, 0.0))
+    side = _perpendicular(normal)
+    weight = (pushing / jnp.sqrt(d))[None, None]
+    a_stays, b_stays = found.stays
+    safe_bb = jnp.where(b_stays, 1.0, bb)
+    coupling = jnp.where(b_stays, 0.0, ab / safe_bb)
+    growth = aa - coupling * ab
+    a_stays |= growth <= 0
+    of_b = jnp.where(b_stays, 0.0, pushing / jnp.sqrt(safe_bb))
+    of_a = jnp.where(a_stays, 0.0, pushing / jnp.sqrt(jnp.where(a_stays, 1.0, growth)))
+    vectors = jnp.stack(
+        [
+            gap,
+            weight * along(side),
+            weight * along(cross(normal, side)),
+            of_b[None, None] * by_b,
+            of_a[None, None] * (by_a - coupling[None, None] * by_b),
+        ]
+    )
+    vectors = jnp.where(found.exists, vectors, 0.0)
+    # Half of both orders in which a tangent t turns under the force v: w (v.t) + v (w.t) less 2 t (w.v).
+    force = pressures[None, None] * normal[:, None] * on_tangents[0][None]  # [3, 4, p]
+    pulled, leaned = (jnp.einsum("cbkp,ckp->bkp", axes, v) for v in (force, tangents))
+    mixed = (pulled[:, None] * leaned[None] + leaned[:, None] * pulled[None]) / 2
+    turn = mixed - dot(force, tangents)[None, None] * jnp.einsum("cbkp,cakp->bakp", axes, axes)
+    nothing = jnp.zeros((*turn.shape[:2], len(curve.s)), d.dtype)
+    return vectors, nodes, nothing.at[:, :, nodes].add(-turn)
+
+
+def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
+    begin, end = curve.s[element], curve.s[element + 1]
+    h = end - begin
+    t = (s - begin) / h
+    u = 1 - t
+    zero = jnp.zeros_like(t)
+    of_places = jnp.stack(
+        [jnp.stack([(1 + 2 * t) * u**2, t**2 * (3 - 2 * t)]), jnp.stack([-6 * t * u / h, 6 * t * u / h])]
+    )
+    of_tangents = jnp.stack(
+        [jnp.stack([h * t * u**2, -h * t**2 * u]), jnp.stack([u * (1 - 3 * t), t * (3 * t - 2)]) + zero[None]]
+    )
+    second_of_places = jnp.stack([(12 * t - 6) / h**2, (6 - 12 * t) / h**2])
+    second_of_tangents = jnp.stack([(6 * t - 4) / h, (6 * t - 2) / h])
+    nodes = jnp.stack([element, element + 1])
+    places, tangents = curve.places.T[:, nodes], curve.tangents[:, nodes]
+
+    def weighted(of_places: Float[Array, "2 k"], of_tangents: Float[Array, "2 k"]) -> Float[Array, "3 k"]:
+        return jnp.sum(places * of_places[None] + tangents * of_tangents[None], axis=1)
+
+    return _Side(
+        weighted(of_places[0], of_tangents[0]),
+        weighted(of_places[1], of_tangents[1]),
+        weighted(second_of_places, second_of_tangents),
+        of_places,
+        of_tangents,
+    )
+
+
+def _distance(
+    curve: Curve, element: Int[Array, "k"], other: Int[Array, "k"], a: Float[Array, "k"], b: Float[Array, "k"]
+) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
+    """The distance and the term that keeps the place in the middle, and its derivatives by both places."""
+    here, there = _at(curve, element, a), _at(curve, other, b)
+    way = here.x - there.x
+    square = dot(way, way)
+    d = jnp.sqrt(jnp.where(square > 0, square, 1e-30))
+    normal = way / d[None]
+    h = curve.s[element + 1] - curve.s[element]
+    edge = 4 * EDGE * curve.radius[element] / h**2
+    aside = a - (curve.s[element] + curve.s[element + 1]) / 2
+    on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
+    aa = (dot(here.slope, here.slope) - on_here**2) / d + dot(normal, here.curvature) + 2 * edge
+    bb = (dot(there.slope, there.slope) - on_there**2) / d - dot(normal, there.curvature)
+    ab = -(dot(here.slope, there.slope) - on_here * on_there) / d
+    return d + edge * aside**2, (on_here + 2 * edge * aside, -on_there), (aa, ab, bb)
+
+
+def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]]:
+    """Places in each element, and the elements."""
+    parts = jnp.asarray(SAMPLES, s.dtype)
+    begin = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
+    return begin.reshape(-1), jnp.repeat(jnp.arange(len(s) - 1), len(SAMPLES))
+
+
+def _range(curve: Curve) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Between which arclengths the rod beyond an element is no neighbour of it.
+
+    What is nearer bends around its own radius at most; of a closed ring through its ends too.
+    """
+    s = curve.s
+    apart = jnp.pi * jnp.max(curve.radius)
+    ends = curve.places[0] - curve.places[-1]
+    is_ring = jnp.sum(ends**2) < 4 * jnp.max(curve.radius) ** 2
+    least = jnp.maximum(s[1:] + apart, jnp.append(s[2:], jnp.inf))
+    most = jnp.minimum(1 + s[:-1] - jnp.maximum(apart, jnp.diff(s)), 1.0)
+    return least, jnp.where(is_ring, most, 1.0)
+
+
+def _element_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Int[Array, "k"]:
+    return jnp.clip(jnp.searchsorted(s, places, side="right") - 1, 0, len(s) - 2).astype(int)
+
+
+def _perpendicular(normal: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
+    """A unit vector across each."""
+    least = jnp.argmin(jnp.abs(jax.lax.stop_gradient(normal)), axis=0)
+    axis = (jnp.arange(3)[:, None] == least[None]).astype(normal.dtype)
+    side = axis - dot(axis, normal)[None] * normal
+    return side / jnp.sqrt(dot(side, side))[None]

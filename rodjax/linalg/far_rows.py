@@ -1,0 +1,79 @@
+"""Contacts between elements that are far from one another along the rod, as rows and columns of a chain's border.
+
+Each of p contacts has the gradient of its gap by the rotations and places of four nodes, those of its two elements. Its
+curvature couples both elements too: it is kept as four more vectors v, the first two of which take v v^T from the
+stiffness, while the others add it (`SIGNS`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+# By what the outer product of each vector of the curvature enters the stiffness.
+SIGNS = np.array([-1.0, -1.0, 1.0, 1.0])
+
+
+class FarRows(eqx.Module):
+    """`by_rotation`, `by_place`: of each contact the gradient of the gap and the four vectors of its curvature, by
+    rotation and place of its nodes; `nodes`: their numbers; `elements`: where the contact stands in its row of n + 1
+    numbers, whose other numbers stand for nothing. `row`: the number of that row among those of all contacts.
+    """
+
+    by_rotation: Float[Array, "5 b 4 p"]
+    by_place: Float[Array, "5 3 4 p"]
+    nodes: Int[Array, "4 p"]
+    elements: Int[Array, "p"]
+    row: int = eqx.field(static=True)
+
+    def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
+        """Of the gaps, as the rod turns and nodes move."""
+        return jnp.zeros(len(u), u.dtype).at[self.elements].set(self._along(0, x, u), unique_indices=True)
+
+    def turned(self, pressures: Float[Array, "n+1"]) -> Float[Array, "b m"]:
+        """The moments of pressures on the points of the rod."""
+        return self._on_points(0, pressures[self.elements], 2 * len(pressures) - 1)
+
+    def pushed(self, pressures: Float[Array, "n+1"]) -> Float[Array, "n+1 3"]:
+        """The forces of pressures on the nodes."""
+        return self._on_nodes(0, pressures[self.elements], len(pressures))
+
+    def curved(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> tuple[Array, Array]:
+        """What the curvature does to the moments on the points, and to the forces on the nodes."""
+        moments, forces = jnp.zeros_like(x), jnp.zeros_like(u)
+        for k, sign in enumerate(SIGNS, 1):
+            along = sign * self._along(k, x, u)
+            moments += self._on_points(k, along, x.shape[1])
+            forces += self._on_nodes(k, along, len(u))
+        return moments, forces
+
+    def columns(
+        self, is_closed: Float[Array, "n+1"], softness: Float[Array, ""], points: int
+    ) -> tuple[Float[Array, "b 5p m"], Float[Array, "5p n+1 3"], Float[Array, "5p"]]:
+        """Of the border: by rotations, by places, and compliances."""
+        p, nodes = len(self.elements), len(is_closed)
+        is_there = (self.nodes[..., None] == np.arange(nodes)[None, None]).astype(softness.dtype)
+        here = is_closed[self.elements]
+        factors = jnp.concatenate([here.astype(softness.dtype)[None], jnp.ones((4, p), softness.dtype)])
+        by_node = jnp.einsum("rbkp,rp,kpn->brpn", self.by_rotation, factors, is_there)
+        by_point = jnp.zeros((*by_node.shape[:-1], points), softness.dtype).at[..., ::2].set(by_node)
+        by_place = jnp.einsum("rckp,rp,kpn->rpnc", self.by_place, factors, is_there)
+        # An open contact is a number by itself.
+        compliances = jnp.concatenate([jnp.where(here, softness, 1.0), jnp.repeat(jnp.asarray(SIGNS), p)])
+        return by_point.reshape(len(by_point), 5 * p, points), by_place.reshape(5 * p, nodes, 3), compliances
+
+    @property
+    def positive(self) -> int:
+        """The number of the columns whose compliance is positive."""
+        return len(self.elements) * (1 + int(np.sum(SIGNS > 0)))
+
+    def _along(self, k: int, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "p"]:
+        turns, moves = x[:, 2 * self.nodes], u.T[:, self.nodes]
+        return jnp.sum(self.by_rotation[k] * turns, axis=(0, 1)) + jnp.sum(self.by_place[k] * moves, axis=(0, 1))
+
+    def _on_points(self, k: int, along: Float[Array, "p"], points: int) -> Float[Array, "b m"]:
+        by_rotation = self.by_rotation[k] * along[None, None]
+        return jnp.zeros((len(by_rotation), points), along.dtype).at[:, 2 * self.nodes].add(by_rotation)
+
+    def _on_nodes(self, k: int, along: Float[Array, "p"], nodes: int) -> Float[Array, "n+1 3"]:
+        return jnp.zeros((3, nodes), along.dtype).at[:, self.nodes].add(self.by_place[k] * along[None, None]).T

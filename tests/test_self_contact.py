@@ -1,0 +1,221 @@
+"""Rods that touch themselves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy_programs import by_numpy
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
+
+import rodjax
+from rodjax.discretization import self_contact
+from rodjax.discretization.self_contact import Curve
+
+LENGTH, RADIUS = 1.0, 0.02
+# The ends of a hairpin: this far from its axis, with tangents that lean so much towards it [rad].
+ASIDE, LEAN = 0.06, 1.2
+
+
+def coil(elements: int) -> tuple[Curve, jax.Array]:
+    """A helix of one and a half turns, not quite a smooth one, and random rotation axes."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0.0, 3.2 * np.pi, elements + 1)
+    places = np.stack([0.1 * np.cos(angles), 0.1 * np.sin(angles), 0.005 * angles], axis=1)
+    places /= np.sum(np.linalg.norm(np.diff(places, axis=0), axis=1))
+    tangents = np.gradient(places, axis=0) + 0.02 / elements * rng.normal(size=places.shape)
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    axes, _ = np.linalg.qr(rng.normal(size=(elements + 1, 3, 3)))
+    s, free, radius = np.linspace(0.0, 1.0, elements + 1), np.ones(elements + 1), np.full(elements, 0.01)
+    axes = jnp.asarray(np.moveaxis(axes, 0, -1))
+    return Curve(
+        jnp.asarray(s), jnp.asarray(places), jnp.asarray(tangents.T), axes, *map(jnp.asarray, (free, radius))
+    ), axes
+
+
+def test_first_and_second_derivatives_of_gaps_are_those_of_jax():
+    """That the places move along the rod as the nodes do is part of the second ones."""
+    elements = 12
+    curve, axes = coil(elements)
+    found = self_contact.nearest(curve)
+    rng = np.random.default_rng(1)
+    pressures = jnp.asarray(np.where(found.exists, rng.uniform(0.5, 2.0, elements), 0.0))
+    unit = jnp.asarray(0.3)
+    moves = jnp.asarray(rng.normal(size=(elements + 1, 3)))
+    turns = jnp.asarray(rng.normal(size=(3, elements + 1)))
+
+    def gaps(places, rotation):
+        turn = jnp.einsum("cbn,bn->cn", axes, rotation)
+        across = jnp.cross(turn, curve.tangents, axis=0)
+        tangents = curve.tangents + across + jnp.cross(turn, across, axis=0) / 2
+        moved = curve._replace(places=curve.places + places, tangents=tangents)
+        return jnp.where(found.exists, self_contact._gaps(moved, found)[0], 0.0)
+
+    def by_jax(moves, turns):
+        nothing = jnp.zeros_like(moves), jnp.zeros_like(turns)
+        rates = jax.jvp(gaps, nothing, (moves, turns))[1]
+        gradient = jax.grad(lambda *given: -jnp.sum(pressures * gaps(*given)), argnums=(0, 1))
+        return rates, *jax.jvp(gradient, nothing, (moves, turns))[1]
+
+    def by_rows(moves, turns):
+        contacts = self_contact.self_contacts(curve, jnp.append(pressures / unit, 0.0), unit, 0)
+        x = jnp.zeros((3, 2 * elements + 1)).at[:, ::2].set(turns)
+        moments, forces = contacts.rows.curved(x, moves)
+        alone = jnp.einsum("ban,an->bn", contacts.by_rotations, turns)
+        return contacts.rows.rates(x, moves)[:-1] / unit, forces, moments[:, ::2] + alone
+
+    expected, got = by_numpy(by_jax)(moves, turns), by_numpy(by_rows)(moves, turns)
+    assert np.sum(found.exists) > 8
+    for ours, truth in zip(got, expected, strict=True):
+        # Roundings of numbers of the order 1e3.
+        np.testing.assert_allclose(np.where(np.isfinite(truth), ours, 0.0), truth, rtol=1e-9, atol=1e-9)
+
+
+# --- a hairpin whose legs are pressed together -----------------------------------------------------------------------
+
+
+def hairpin(EI=1.0, radius=RADIUS, aside=ASIDE, **options) -> rodjax.Scene:
+    """Inextensible but for 1e-6."""
+    into, out = (np.array([sign * np.cos(LEAN), -np.sin(LEAN), 0.0]) for sign in (1, -1))
+    ends = [
+        rodjax.Clamp(jnp.stack([jnp.zeros(()), jnp.asarray(y), jnp.zeros(())]), rodjax.frame(tangent, d2=(0, 0, 1)))
+        for y, tangent in ((aside, into), (-aside, out))
+    ]
+    return rodjax.Scene(rodjax.Rod(LENGTH, EI, 1.0, 1e6, radius=radius), *ends, **{"self_contact": True} | options)
+
+
+def guess() -> rodjax.Guess:
+    s = np.linspace(0.0, 1.0, 6)
+    half = np.array([[0.0, ASIDE], [0.1, 0.03], [0.2, 0.05], [0.3, 0.12], [0.4, 0.08], [0.44, 0.0]])
+    fine = np.stack([np.interp(np.linspace(0.0, 1.0, 41), s, x) for x in half.T], axis=1)
+    points = np.concatenate([fine, fine[-2::-1] * [1, -1]])
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    points = np.stack([np.interp(np.linspace(0.0, along[-1], 81), along, x) for x in points.T], axis=1)
+    return rodjax.Guess(np.pad(points, ((0, 0), (0, 1))))
+
+
+def elastica() -> tuple[float, float, float]:
+    """Force and place of the contact and the bending energy of half of the hairpin, by shooting: its leg touches the
+    axis at a distance of the radius, beyond that no force acts along the hairpin.
+    """
+
+    def rates(s, state, force):
+        _, _, angle, curvature, _ = state
+        return [np.cos(angle), np.sin(angle), curvature, -np.cos(angle) * force, curvature**2 / 2]
+
+    def along(state, force, length):
+        return solve_ivp(rates, [0.0, length], state, args=(force,), rtol=1e-11, atol=1e-12).y[:, -1]
+
+    def missed(unknown):
+        curvature, before, beyond, place = unknown
+        touching = along([0.0, ASIDE, -LEAN, curvature, 0.0], before, place)
+        middle = along(touching, beyond, LENGTH / 2 - place)
+        missed.energy = middle[4]
+        return [touching[1] - RADIUS, touching[2], middle[1], middle[2] + np.pi / 2]
+
+    found = fsolve(missed, [19.0, 171.0, 54.0, 0.088], xtol=1e-12)
+    assert np.max(np.abs(missed(found))) < 1e-9
+    return found[1] - found[2], found[3], 2 * missed.energy
+
+
+@pytest.fixture(scope="module")
+def pressed() -> rodjax.Equilibrium:
+    """In its plane; in space the legs slide past one another."""
+    return rodjax.solve(hairpin(), segments=32, guess=guess(), planar=True)
+
+
+def test_legs_of_a_hairpin_press_on_one_another_as_an_elastica_has_it(pressed):
+    force, place, energy = elastica()
+    assert pressed.converged
+    assert not pressed.stable  # out of its plane
+    found = pressed.self_contacts
+    touching = np.flatnonzero(np.linalg.norm(found.forces, axis=1) > 0)
+    # Errors of 32 elements, of fourth order, of a leg on three of these.
+    np.testing.assert_allclose(np.sum(np.linalg.norm(found.forces, axis=1)), force, rtol=2e-3)
+    np.testing.assert_allclose(found.s[touching], place, atol=2e-3)
+    np.testing.assert_allclose(found.beyond[touching], LENGTH - found.s[touching], atol=1e-8)
+    np.testing.assert_allclose(pressed.elastic_energy, energy, rtol=1e-3)
+    np.testing.assert_allclose(found.gaps[touching], 0.0, atol=1e-9)  # 1e-8 EI/L^2 of a force left, over 60
+    # Along the rod the forces that it applies to itself are in balance, with its supports too.
+    np.testing.assert_allclose(np.sum(pressed.contact_forces, axis=0), 0.0, atol=1e-9 * force)
+    np.testing.assert_allclose(pressed.start_force, pressed.end_force, atol=1e-7)
+
+
+def test_a_rod_that_stays_away_from_itself_is_the_rod_without_contact():
+    scenes = [hairpin(aside=0.2, self_contact=touches) for touches in (True, False)]
+    with_contact, without = (rodjax.solve(scene, segments=32, guess=guess()) for scene in scenes)
+    # Both at a residual of 1e-8.
+    np.testing.assert_allclose(with_contact.nodes, without.nodes, atol=1e-8)
+    assert not np.any(with_contact.self_contacts.forces)
+    assert "does not touch itself" in rodjax.describe(with_contact)
+    assert without.self_contacts.forces.shape == (0, 3)
+
+
+def test_derivatives_are_those_of_tight_solves(pressed):
+    """By stiffness, radius and the place of the ends."""
+
+    def quantity(numbers, start=pressed):
+        scene = hairpin(EI=numbers[0], radius=numbers[1], aside=numbers[2])
+        solver = rodjax.Newton(tolerance=1e-11)
+        result = rodjax.solve(scene, segments=32, guess=start, planar=True, solver=solver)
+        return result.end_moment[2] + result.end_force[1] + result.nodes[10, 0]
+
+    numbers = jnp.array([1.0, RADIUS, ASIDE])
+    gradient = np.asarray(jax.grad(quantity)(numbers))
+    for k, step in enumerate((1e-4, 1e-6, 1e-6)):
+        change = jnp.zeros(3).at[k].set(step)
+        difference = float(quantity(numbers + change) - quantity(numbers - change)) / (2 * step)
+        # The error of differences: 1e-11 over the step, and its square.
+        np.testing.assert_allclose(gradient[k], difference, rtol=1e-5)
+
+
+def test_results_are_saved_and_told(pressed, tmp_path):
+    rodjax.save(pressed, tmp_path / "pressed.vtkhdf")
+    again = rodjax.load(tmp_path / "pressed.vtkhdf")
+    assert again.scene.self_contact
+    for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(pressed), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert "touches itself at" in rodjax.describe(pressed)
+    assert "self_contact" in str(pressed.scene).splitlines()[-1]
+    rodjax.write_scene(pressed.scene, tmp_path / "scene.toml")
+    assert rodjax.read_scene(tmp_path / "scene.toml").self_contact
+
+
+def test_what_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match="rod must have a radius where it may touch itself, got None"):
+        hairpin(radius=None)
+    with pytest.raises(TypeError, match="self_contact must be"):
+        hairpin(self_contact=1)
+    with pytest.raises(ValueError, match="discretization must be 'hermite' for a scene with self_contact"):
+        rodjax.solve(hairpin(), segments=8, discretization="finite_difference")
+
+
+@pytest.mark.slow
+def test_a_twisted_rod_that_snaps_touches_itself():
+    """Between clamps 0.7 apart, turned on until it snaps: without contact it comes through itself, by which its twist
+    falls by two turns less what the shape takes up; with contact the twist in frames and the writhe in its shape stay
+    those of the path.
+    """
+    radius = 0.01
+
+    def scene(angle, *, touches):
+        d2 = (0.0, np.cos(angle), np.sin(angle))
+        ends = (
+            rodjax.Clamp((0, 0, 0), rodjax.frame((1, 0, 0), d2=(0, 1, 0))),
+            rodjax.Clamp((0.7, 0, 0), rodjax.frame((1, 0, 0), d2=d2)),
+        )
+        return rodjax.Scene(rodjax.Rod(1.0, 1.0, 0.8, 1e4, radius=radius), *ends, self_contact=touches)
+
+    last = None
+    for angle in 0.7 * np.arange(28):
+        last = rodjax.solve(scene(angle, touches=False), segments=48, guess=last)
+    snapped = {
+        touches: rodjax.solve(scene(19.6, touches=touches), segments=48, guess=last) for touches in (True, False)
+    }
+    assert snapped[True].converged
+    assert snapped[True].stable
+    found = snapped[True].self_contacts
+    assert np.any(np.linalg.norm(found.forces, axis=1) > 1.0)
+    assert np.min(found.gaps) > -1e-8
+    assert snapped[True].total_twist > 10.0
+    assert snapped[False].total_twist < 6.0

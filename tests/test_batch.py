@@ -107,6 +107,17 @@ def test_chunks_do_not_show(monkeypatch):
             np.testing.assert_array_equal(ours, theirs)
 
 
+def test_what_fills_up_a_chunk_is_not_solved():
+    scenes = batch._stacked(random_scenes(5))
+
+    def solve(scene, guess):
+        return {"end": scene.end.position + guess, "length": scene.rod.length}
+
+    found = jax.jit(lambda count: batch._in_turn(solve, scenes, 1.0, count))(3)
+    np.testing.assert_array_equal(found["end"][:3], scenes.end.position[:3] + 1.0)
+    np.testing.assert_array_equal(found["length"], [1.0, 1.0, 1.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(("count", "size"), [(1, 16), (17, 128), (129, 256), (1024, 256), (4097, 1024)])
 def test_how_many_scenes_go_in_one_call(count, size):
     assert batch.chunk_size(count) == size

@@ -448,9 +448,8 @@ class ChainFactors(eqx.Module):
             far, k = contacts.far, len(system.compliance)
             here = contacts.is_closed[far.row, far.elements]
             found = jnp.where(here, -multipliers[k : k + len(here)], -given[far.row, far.elements])
-            pressures = (
-                pressures.at[far.row].set(-given[far.row]).at[far.row, far.elements].set(found, unique_indices=True)
-            )
+            pressures = pressures.at[far.row].set(-given[far.row])
+            pressures = pressures.at[far.row, far.elements].set(found, unique_indices=True)
             multipliers = multipliers[:k]
         parts = (multipliers, pressures, displacements, forces)
         return x, jnp.concatenate([part.reshape(-1) for part in parts])

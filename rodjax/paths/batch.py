@@ -272,10 +272,9 @@ def _solve_here(
     strain_limit: Float[Array, ""] | float,
     options: Options,
 ) -> Equilibrium:
-    in_axes = (0, 0 if _is_stack(guess) else None)
     if scenes.rod.length.ndim == 2:
         path = functools.partial(path_from, strain_limit=strain_limit, options=options)
-        return jax.vmap(path, in_axes)(scenes, guess)
+        return _in_turn(path, scenes, guess, counts[0])
 
     def state(scene: Scene, guess: Guess | Equilibrium | None) -> tuple[SolverState, FirstTwist]:
         return first_state(scene, guess, options)
@@ -286,14 +285,38 @@ def _solve_here(
     def result(scene: Scene, found: Found) -> Equilibrium:
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 
-    starts = jax.vmap(state, in_axes)(scenes, guess)
     if not isinstance(options.solver, Newton) or slides(scenes) or has_node_places(scenes):
-        return jax.vmap(lambda scene, start: result(scene, solve_from(scene, start[0], start[1], options)))(
-            scenes, starts
-        )
+
+        def whole(scene: Scene, guess: Guess | Equilibrium | None) -> Equilibrium:
+            return result(scene, solve_from(scene, *state(scene, guess), options))
+
+        return _in_turn(whole, scenes, guess, counts[0])
+    starts = jax.vmap(state, (0, 0 if _is_stack(guess) else None))(scenes, guess)
     searches = _mapped(search, scenes, starts)
     ends = _ends(searches, counts[0], options.solver, options.find)
     return _mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)
+
+
+def _in_turn(
+    solve: Callable[[Scene, Any], Equilibrium],
+    scenes: Scene,
+    guess: Guess | Equilibrium | None,
+    count: Int[Array, ""],
+) -> Equilibrium:
+    """The first `count` one after another: side by side all would wait for the slowest in each loop within a loop."""
+    is_each = _is_stack(guess)
+
+    def solved(k: Int[Array, ""]) -> Equilibrium:
+        scene, own = jax.tree.map(lambda leaf: leaf[k], (scenes, guess if is_each else None))
+        return solve(scene, own if is_each else guess)
+
+    def added(k: Int[Array, ""], results: Equilibrium) -> Equilibrium:
+        return jax.tree.map(lambda all, new: all.at[k].set(new), results, solved(k))
+
+    total = len(scenes.rod.length)
+    struct = jax.eval_shape(solved, jnp.zeros((), int))
+    results = jax.tree.map(lambda leaf: jnp.zeros((total, *leaf.shape), leaf.dtype), struct)
+    return jax.lax.fori_loop(0, count, added, results)
 
 
 def _mapped(function: Callable, *stacks: Any) -> Any:

@@ -391,7 +391,7 @@ class ChainFactors(eqx.Module):
 
         def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
             left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
-            return jax.tree.map(jnp.add, found, self._solved_once(*left, complement)), None
+            return jax.tree.map(jnp.add, found, self._solved_once(left[0], left[1], complement)), None
 
         found, _ = jax.lax.scan(nearer, self._solved_once(f, c, complement), None, length=HARDENINGS)
         return found
@@ -416,7 +416,7 @@ class ChainFactors(eqx.Module):
         if self.contacts.inner is None:
             return found
         left = jax.tree.map(jnp.subtract, (f, c), self.whole.times(*found))
-        return jax.tree.map(jnp.add, found, self._solved_once(*left, self.complement))
+        return jax.tree.map(jnp.add, found, self._solved_once(left[0], left[1], self.complement))
 
     def _solved_once(
         self, f: Float[Array, "b m"], c: Float[Array, "j"], complement: Float[Array, "k k"]

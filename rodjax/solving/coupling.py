@@ -169,6 +169,7 @@ def held(form: Form, released: Linearization) -> Linearization:
         first, contacts, balance, gaps = system.parted(released.closure)
         parts = [part.reshape(-1) for part in (first, contacts, balance * nodes[:, None], gaps)]
         return dataclasses.replace(released, system=system, closure=jnp.concatenate(parts))
+    assert isinstance(system, SaddlePointSystem), "rods whose ends move do not slide"
     identity = np.eye(len(system.diagonal), dtype=free.dtype)[..., None]
     blocks = free[None, None]
     across = system.across

@@ -1,5 +1,6 @@
-"""A straight rod between clamps 0.7 L apart is turned on until it snaps into contact with itself, and on from there: how
-many steps converge, in how many iterations, and where it touches.
+"""A straight rod between clamps 0.7 L apart is turned on until it snaps into contact with itself, and on from there.
+
+How many steps converge, in how many iterations, and at how many places the rod touches itself.
 
 The clamps are turned by 0.7 rad a step; before it snaps the rod is solved without contact.
 
@@ -56,7 +57,7 @@ def main() -> None:
         print(
             f"{STEP * step:10.1f}  {'yes' if result.converged else 'no':>9}  {int(result.iterations):10}"
             f"  {float(result.total_twist):11.3f}  {float(result.elastic_energy):14.3f}  {np.sum(forces > 0):8}"
-            f"  {float(np.min(found.gaps)) / RADIUS:21.1e}  {np.max(forces):13.1f}",
+            f"  {float(np.min(found.gaps)) / RADIUS:9.1e}  {np.max(forces):13.1f}",
             flush=True,
         )
     print(f"{converged} of {options.steps} converged")

@@ -133,7 +133,8 @@ def test_legs_of_a_hairpin_press_on_one_another_as_an_elastica_has_it(pressed):
     # Errors of 32 elements, of fourth order, of a leg on three of these.
     np.testing.assert_allclose(np.sum(np.linalg.norm(found.forces, axis=1)), force, rtol=2e-3)
     np.testing.assert_allclose(found.s[touching], place, atol=2e-3)
-    np.testing.assert_allclose(found.beyond[touching], LENGTH - found.s[touching], atol=1e-8)
+    # The radius seems to vary by 3e-4 of itself within elements, which draws the place along by 3e-6.
+    np.testing.assert_allclose(found.beyond[touching], LENGTH - found.s[touching], atol=1e-5)
     np.testing.assert_allclose(pressed.elastic_energy, energy, rtol=1e-3)
     np.testing.assert_allclose(found.gaps[touching], 0.0, atol=1e-9)  # 1e-8 EI/L^2 of a force left, over 60
     # Along the rod the forces that it applies to itself are in balance, with its supports too.

@@ -38,29 +38,28 @@ def before_it_snaps(elements: int) -> rodjax.Equilibrium:
     return result
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> list[rodjax.Equilibrium]:
+    """The equilibrium before it snaps, and those of the steps."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--elements", type=int, default=64)
     parser.add_argument("--steps", type=int, default=15)
-    options = parser.parse_args()
-    result = before_it_snaps(options.elements)
-    print(
-        "end turned  converged  iterations  total twist  elastic energy  contacts  smallest gap / radius  largest force"
-    )
-    print("     [rad]                              [rad]          [EI/L]                                   [EI/L^2]")
-    converged = 0
+    options = parser.parse_args(arguments)
+    results = [before_it_snaps(options.elements)]
+    print("end turned  converged  iterations  total twist  elastic energy  contacts  least gap  largest force")
+    print("     [rad]                              [rad]          [EI/L]             [radius]       [EI/L^2]")
     for step in range(BEFORE, BEFORE + options.steps):
-        result = rodjax.solve(scene(STEP * step), segments=options.elements, guess=result, strain_limit=None)
+        result = rodjax.solve(scene(STEP * step), segments=options.elements, guess=results[-1], strain_limit=None)
+        results.append(result)
         found = result.self_contacts
         forces = np.linalg.norm(found.forces, axis=1)
-        converged += bool(result.converged)
         print(
             f"{STEP * step:10.1f}  {'yes' if result.converged else 'no':>9}  {int(result.iterations):10}"
             f"  {float(result.total_twist):11.3f}  {float(result.elastic_energy):14.3f}  {np.sum(forces > 0):8}"
             f"  {float(np.min(found.gaps)) / RADIUS:9.1e}  {np.max(forces):13.1f}",
             flush=True,
         )
-    print(f"{converged} of {options.steps} converged")
+    print(f"{sum(bool(result.converged) for result in results[1:])} of {options.steps} converged")
+    return results
 
 
 if __name__ == "__main__":

@@ -459,3 +459,22 @@ def test_harness_times_stars_against_one_cable():
     assert (one.cables, two.cables, one.warm_ratio, one.first_ratio) == (1, 2, 1.0, 1.0)
     assert two.warm_ms == pytest.approx(two.warm_ratio * one.warm_ms)
     assert 1 <= two.iterations <= 3
+
+
+@pytest.mark.slow
+def test_self_contact(capsys):
+    """Without contact the rod comes through itself as it snaps, by which its twist falls by two turns less what the
+    shape takes up; with contact that cannot be.
+    """
+    experiment = script("self_contact")
+    before, snapped = experiment.main(["--elements", "48", "--steps", "1"])
+    assert snapped.converged
+    assert snapped.stable
+    found = snapped.self_contacts
+    assert np.any(np.linalg.norm(found.forces, axis=1) > 1.0)
+    assert np.min(found.gaps) > -1e-8  # 1e-8 EI/L^2 of a force left, over 60
+    assert before.total_twist > 15.0
+    assert snapped.total_twist > 10.0
+    through = rj.solve(experiment.scene(19.6, touches=False), segments=48, guess=before)
+    assert through.total_twist < 6.0
+    assert "1 of 1 converged" in capsys.readouterr().out

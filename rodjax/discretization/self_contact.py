@@ -3,10 +3,12 @@
 The centerline is the cubic through the places and tangents of the nodes. Of each element the contact point is that
 place s of it, and that place s' further along the rod, where
 
-    g = |x(s) - x(s')| + edge ((s - middle)/(h/2))^2 - r(s) - r(s')
+    g = |x(s) - x(s')| + edge sin^2(pi (s - s_3/4)/h) - r(s) - r(s')
 
-is least; the gap g is a function of the four nodes beside these places. The small second term keeps the place in the
-middle where two parts of the rod lie along one another. First derivatives of g are those at fixed places; the second
+is least; the gap g is a function of the four nodes beside these places. The small second term tells which place it is
+where two parts of the rod lie along one another: that at three quarters of the element. A contact by itself is drawn to
+one quarter, where the rod counts as thinnest. Neither is at a node, where a place goes from one element to the next;
+there the term is smooth. First derivatives of g are those at fixed places; the second
 ones count that the places move. Neighbours along the rod are no contact: less than half a turn around the rod's own
 radius away, or of the next element.
 """
@@ -21,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
 
-# By this part of its radius the rod counts as thinner at the ends of an element than in its middle.
-EDGE = 1e-6
+# By this part of its radius the rod counts as thinner at one quarter of an element than at three.
+EDGE = 3e-4
 # Places in each element from which the nearest ones are sought, and steps of that search.
 SAMPLES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
 STEPS = 12
@@ -319,13 +321,15 @@ def _distance(
     d = jnp.sqrt(jnp.where(square > 0, square, 1e-30))
     normal = way / d[None]
     h = curve.s[element + 1] - curve.s[element]
-    edge = 4 * EDGE * curve.radius[element] / h**2
-    aside = a - (curve.s[element] + curve.s[element + 1]) / 2
+    edge, rate = EDGE * curve.radius[element], 2 * jnp.pi / h
+    aside = rate * (a - curve.s[element] - 0.75 * h)
     on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
-    aa = (dot(here.slope, here.slope) - on_here**2) / d + dot(normal, here.curvature) + 2 * edge
+    aa = (dot(here.slope, here.slope) - on_here**2) / d + dot(normal, here.curvature)
+    aa += edge * rate**2 * jnp.cos(aside) / 2
     bb = (dot(there.slope, there.slope) - on_there**2) / d - dot(normal, there.curvature)
     ab = -(dot(here.slope, there.slope) - on_here * on_there) / d
-    return d + edge * aside**2, (on_here + 2 * edge * aside, -on_there), (aa, ab, bb)
+    slope = on_here + edge * rate * jnp.sin(aside) / 2
+    return d + edge * (1 - jnp.cos(aside)) / 2, (slope, -on_there), (aa, ab, bb)
 
 
 def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]]:

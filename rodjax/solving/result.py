@@ -196,7 +196,7 @@ class Equilibrium(eqx.Module):
       forces and moments of the rod, its ends and clips, relative to the largest force (at least EI/L^2) and the largest
       moment (at least 0.1 EI/L) in the rod, and in the curvature at a node, relative to the largest at any (at least
       0.1/L). Between the nodes the rod may be bent more than at them; `rodjax.most_curved` tells where it may be bent
-      most. `moment_error` counts that obstacles touch at nodes only
+      most. `moment_error` counts that obstacles touch at a few places only
     - `critical` [...] bool: a motion has no stiffness left, as at a fold or where equilibria branch, so derivatives
       are not numbers. A turn of the whole rod that leaves it in equilibrium does not count. Computed when asked for
     - `index` [...] int: the number of motions along which the energy falls, 0 at a minimum; -1 where it is not

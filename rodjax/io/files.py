@@ -347,7 +347,7 @@ def _check_format(group: h5py.Group, path: Path) -> None:
     written = group.attrs.get("format")
     if not isinstance(written, np.integer):
         raise ValueError(f"{path} lacks the attribute format of /rodjax: load reads files that rodjax.save wrote")
-    newest = SELF_CONTACT_FORMAT
+    newest = _newest_of(group)
     if written > newest:
         raise ValueError(
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}; "
@@ -358,6 +358,15 @@ def _check_format(group: h5py.Group, path: Path) -> None:
             f"{path} has format {written}, written by rodjax {group.attrs.get('version')}, which lacks fields of "
             f"format {OLDEST_FORMAT}: solve its scene again"
         )
+
+
+def _newest_of(group: h5py.Group) -> int:
+    """The format in which this rodjax writes what a file holds."""
+    if group.attrs.get("kind") == HarnessEquilibrium.__name__:
+        return HARNESS_FORMAT
+    scene = group.get("scene")
+    touches_itself = isinstance(scene, h5py.Group) and bool(scene.attrs.get("self_contact"))
+    return SELF_CONTACT_FORMAT if touches_itself else FORMAT
 
 
 def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:

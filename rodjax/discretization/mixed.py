@@ -170,13 +170,15 @@ class MixedForm(Form):
 
     def allowed_twist(self, point: MixedPoint) -> Float[Array, ""]:
         """The areas that an element sweeps are carried with weights that are no whole numbers: where it once turned by
-        more than pi, a third of a sphere, twice 2 pi/3, may stay in the total twist.
+        more than pi, a third of a sphere, twice 2 pi/3, may stay in the total twist. Where one still does, areas do not
+        tell: the mesh is then told to be too coarse.
         """
+        is_resolved = jnp.all(dot(point.tangents[:, 1:], point.tangents[:, :-1]) > 0)
         principal = self.field.principal_twist(self.scene, point.tangents)
         off = point.total_twist - nearest_twist(principal, point.total_twist, None)
         # By 4 pi/3 beyond whole turns it seems to be 2 pi/3 short of them.
         twist = nearest_twist(principal, point.total_twist + 2 * off, None)
-        return jnp.where(jnp.abs(off) > SLIP, twist, point.total_twist)
+        return jnp.where(is_resolved & (jnp.abs(off) > SLIP), twist, point.total_twist)
 
     @property
     def has_torsion(self) -> bool:

@@ -424,7 +424,11 @@ MISTAKES = [
         "rod.color is not allowed",
         "length, GJ, EA, EI, EI1, EI2, GA, GA1, GA2, mass_per_length, radius, rest_curvature_1",
     ),
-    (ROD + START + END + "[cable]\n", "cable is not allowed", "rod, start, end, loads, clips, obstacles, self_contact, solve, path"),
+    (
+        ROD + START + END + "[cable]\n",
+        "cable is not allowed",
+        "rod, start, end, loads, clips, obstacles, self_contact, solve, path",
+    ),
     (ROD + START + END + "path = 1\n", "end.path is not allowed", "position, frame, tangent, d2, spin"),
     ("path = 1\n" + ROD + START + END, "path must be a list of tables", "[[path]]"),
     ("path = [1]\n" + ROD + START + END, "path[0] must be a table", "got 1"),

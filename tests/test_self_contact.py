@@ -74,14 +74,15 @@ def test_first_and_second_derivatives_of_gaps_are_those_of_jax():
 # --- a hairpin whose legs are pressed together -----------------------------------------------------------------------
 
 
-def hairpin(EI=1.0, radius=RADIUS, aside=ASIDE, **options) -> rodjax.Scene:
-    """Inextensible but for 1e-6."""
+def hairpin(EI=1.0, radius=RADIUS, aside=ASIDE, rod=None, **options) -> rodjax.Scene:
+    """Inextensible but for 1e-6 of a force, where no rod is given."""
     into, out = (np.array([sign * np.cos(LEAN), -np.sin(LEAN), 0.0]) for sign in (1, -1))
     ends = [
         rodjax.Clamp(jnp.stack([jnp.zeros(()), jnp.asarray(y), jnp.zeros(())]), rodjax.frame(tangent, d2=(0, 0, 1)))
         for y, tangent in ((aside, into), (-aside, out))
     ]
-    return rodjax.Scene(rodjax.Rod(LENGTH, EI, 1.0, 1e6, radius=radius), *ends, **{"self_contact": True} | options)
+    rod = rodjax.Rod(LENGTH, EI, 1.0, 1e6, radius=radius) if rod is None else rod
+    return rodjax.Scene(rod, *ends, **{"self_contact": True} | options)
 
 
 def guess() -> rodjax.Guess:
@@ -152,6 +153,61 @@ def test_a_rod_that_stays_away_from_itself_is_the_rod_without_contact():
     assert without.self_contacts.forces.shape == (0, 3)
 
 
+def test_a_contact_that_passes_a_node_is_one_contact():
+    """In space, where the legs slide past one another: two elements would share it, and part in some 100 iterations."""
+    before = rodjax.solve(hairpin(aside=0.0585), segments=32, guess=guess())
+    after = rodjax.solve(hairpin(aside=0.0581), segments=32, guess=before)
+    touching = [np.linalg.norm(result.self_contacts.forces, axis=1) > 0 for result in (before, after)]
+    # On both sides of the node of the elements 1 and 2.
+    assert [list(np.flatnonzero(one)) for one in touching] == [[2], [1]]
+    assert after.converged
+    assert after.stable
+    assert after.iterations <= 10
+
+
+def test_parts_that_cross_at_first_are_led_apart():
+    """In one plane and through one another: the distance is zero, and has no direction of its own."""
+    angles = np.linspace(0.0, 2 * np.pi, 61)
+    loop = np.stack([0.1 * np.sin(angles), 0 * angles, 0.1 - 0.1 * np.cos(angles)], axis=1)
+    straight = np.linspace(0.18, 0.0, 20)[:-1, None] * np.array([[1.0, 0.0, 0.0]])
+    points = np.concatenate([loop[0] - straight, loop, loop[-1] + straight[::-1]])
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    points = np.stack([np.interp(np.linspace(0.0, along[-1], 101), along, x) for x in points.T], axis=1) / along[-1]
+    frame = rodjax.frame((1, 0, 0), d2=(0, 1, 0))
+    ends = rodjax.Clamp((-0.25, 0.02, 0), frame), rodjax.Clamp((0.25, -0.02, 0), frame)
+    scene = rodjax.Scene(rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=RADIUS), *ends, self_contact=True)
+    result = rodjax.solve(scene, segments=24, guess=rodjax.Guess(points))
+    assert result.converged
+    assert np.min(result.self_contacts.gaps) > -1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"rod": rodjax.Rod(LENGTH, (1.0, 1.5), 1.0, 1e4, radius=RADIUS)},
+        {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=RADIUS, rest_curvature=(0.0, 2.0))},
+        {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=rodjax.Steps([0.3], [0.02, 0.015]))},
+        {"clips": [rodjax.Clip(0.5, (0.42, 0.0, 0.0), sliding=True)]},
+        {"obstacles": [rodjax.Plane((0.0, 0.0, -0.025), (0.0, 0.0, 1.0))]},
+        {"potentials": [rodjax.Potential(lambda place, s: 5 * place[2] ** 2)]},
+        {"distributed": [rodjax.DistributedForce((0.0, 0.5, 0.0), follower=True)]},
+    ],
+    ids=["flat", "curved", "steps", "sliding", "floor", "field", "follower"],
+)
+def test_every_rod_and_load_composes_with_it(others):
+    result = rodjax.solve(hairpin(**others), segments=32, guess=guess())
+    assert result.converged
+    found = result.self_contacts
+    assert np.max(np.linalg.norm(found.forces, axis=1)) > 50.0
+    np.testing.assert_allclose(np.min(found.gaps), 0.0, atol=1e-9)  # 1e-8 EI/L^2 of a force left, over 60
+    applied = result.end_force - result.start_force + np.sum(result.contact_forces, axis=0)
+    applied = applied + np.sum(result.clip_forces, axis=0)
+    if "distributed" in others or "potentials" in others:
+        return  # whose forces are no field of a result
+    np.testing.assert_allclose(applied, 0.0, atol=1e-6)  # 1e-8 on each of 33 nodes
+
+
 def test_derivatives_are_those_of_tight_solves(pressed):
     """By stiffness, radius and the place of the ends."""
 
@@ -189,3 +245,13 @@ def test_what_makes_no_sense_is_refused():
         hairpin(self_contact=1)
     with pytest.raises(ValueError, match="discretization must be 'hermite' for a scene with self_contact"):
         rodjax.solve(hairpin(), segments=8, discretization="finite_difference")
+    with pytest.raises(ValueError, match="self_contact must be False in the continuum"):
+        rodjax.solve_continuum(hairpin())
+    with pytest.raises(ValueError, match="follow needs scenes without self_contact"):
+        rodjax.follow([hairpin(), hairpin(aside=0.05)])
+    with pytest.raises(ValueError, match="at_critical must be 'jump' for scenes with self_contact"):
+        rodjax.solve_path([hairpin(), hairpin(aside=0.05)], segments=8, at_critical="stop")
+    part = hairpin()
+    part = rodjax.Scene(part.rod, part.start, rodjax.Joint("j", rodjax.frame((1, 0, 0))), self_contact=True)
+    with pytest.raises(ValueError, match=r"cables\['a'\].self_contact must be False where ends of"):
+        rodjax.Harness({"a": part}, {"j": rodjax.Body(support=rodjax.Pin((0.5, 0, 0)))})

@@ -133,6 +133,8 @@ def solve_continuum(
         raise ValueError("clips must be () in the continuum for a rod, loads or clips that need frames along the rod")
     if scene.obstacles:
         raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
+    if scene.self_contact:
+        raise ValueError("self_contact must be False in the continuum: rodjax.solve takes it")
     if scene.potentials:
         raise ValueError("potentials must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.

@@ -8,9 +8,8 @@ place s of it, and that place s' further along the rod, where
 is least; the gap g is a function of the four nodes beside these places. The small second term tells which place it is
 where two parts of the rod lie along one another: that at three quarters of the element. A contact by itself is drawn to
 one quarter, where the rod counts as thinnest. Neither is at a node, where a place goes from one element to the next;
-there the term is smooth. First derivatives of g are those at fixed places; the second
-ones count that the places move. Neighbours along the rod are no contact: less than half a turn around the rod's own
-radius away, or of the next element.
+there the term is smooth. First derivatives of g are those at fixed places; the second ones count that the places move.
+Neighbours along the rod are no contact: less than half a turn around the rod's own radius away, or of the next element.
 """
 
 import functools
@@ -32,6 +31,10 @@ STEPS = 12
 MOST_CONTACTS = 48
 # A step leads no element nearer to what it is nearest to than this part of the distance at which they touch.
 DEEPEST = 0.5
+# Places of elements beside one another that are as near to their node as this part of an element are one.
+JUST_BEYOND = 0.05
+# Where two parts of the rod cross within this distance [L], they part at right angles to both.
+CROSSING = 1e-9
 # Gap of an element with nothing beyond it [L].
 NOTHING_BEYOND = 1.0
 
@@ -117,7 +120,14 @@ def nearest(curve: Curve) -> Nearest:
     other = _element_at(s, b)
     _, _, (aa, ab, bb) = _distance(curve, element, other, a, b)
     is_flat = aa * bb <= ab**2
-    stays = jnp.stack([(a <= s[:-1]) | (a >= s[1:]) | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
+    at_begin, at_end = a <= s[:-1], a >= s[1:]
+    stays = jnp.stack([at_begin | at_end | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
+    # Where the element beside it is nearest just beyond its end, that one touches alone: two would share what is one
+    # contact, and in a model of soft contacts part from one another in many steps.
+    is_inside = exists & ~stays[0]
+    by_next = at_end[:-1] & (is_inside & (a - s[:-1] < JUST_BEYOND * h))[1:]
+    by_last = at_begin[1:] & (is_inside & (s[1:] - a < JUST_BEYOND * h))[:-1]
+    exists &= ~(jnp.append(by_next, False) | jnp.append(False, by_last))
     return Nearest(a, element, b, other, stays, exists)
 
 
@@ -149,9 +159,10 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     along the line between two of these the distance stays larger than what they represent.
     """
     found = nearest(before)
-    ways = [_at(curve, found.element, found.s).x - _at(curve, found.other, found.beyond).x for curve in (before, after)]
-    distance = jnp.sqrt(dot(ways[0], ways[0]))
-    along = dot(*ways) / jnp.where(distance > 0, distance, 1.0)
+    here, there = _at(before, found.element, found.s), _at(before, found.other, found.beyond)
+    distance, normal = _between(here, there)
+    way = _at(after, found.element, found.s).x - _at(after, found.other, found.beyond).x
+    along = dot(normal, way)
     touching = before.radius[found.element] + before.radius[found.other]
     is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, touching)))
     begin, of_element = _samples(before.s)
@@ -181,9 +192,8 @@ def exerted(curve: Curve, pressures: Float[Array, "n+1"]) -> Exerted:
 
 def _exerted(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
     gaps, a, b = _gaps(curve, found)
-    way = _at(curve, found.element, a).x - _at(curve, found.other, b).x
-    distance = jnp.sqrt(jnp.where(found.exists, dot(way, way), 1.0))
-    forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * way / distance[None]
+    _, normal = _between(_at(curve, found.element, a), _at(curve, found.other, b))
+    forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * normal
     return Exerted(a, b, jnp.where(found.exists, gaps, jnp.inf), forces)
 
 
@@ -225,10 +235,7 @@ def _rows(
     _, a, b = _gaps(curve, found)
     here, there = _at(curve, found.element, a), _at(curve, found.other, b)
     nodes = jnp.stack([found.element, found.element + 1, found.other, found.other + 1])
-    way = here.x - there.x
-    # Of what has nothing beyond it any number will do.
-    d = jnp.sqrt(jnp.where(found.exists, dot(way, way), 1.0))
-    normal = jnp.where(found.exists, way, 0.0) / d[None]
+    d, normal = _between(here, there)
     tangents, axes = curve.tangents[:, nodes], curve.axes[:, :, nodes]  # [3, 4, p], [3, b, 4, p]
     turned = cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape))
     signs = jnp.array([1.0, 1.0, -1.0, -1.0], d.dtype)[:, None]
@@ -311,15 +318,25 @@ def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
     )
 
 
+def _between(here: _Side, there: _Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
+    """The distance of two places, and the direction in which it grows."""
+    way = here.x - there.x
+    across = cross(here.slope, there.slope)
+    size = dot(across, across)
+    across = jnp.where(size > CROSSING**2, across, _perpendicular(here.slope))
+    across /= jnp.sqrt(dot(across, across))[None]
+    is_crossing = dot(way, way) <= CROSSING**2
+    way = jnp.where(is_crossing, CROSSING * jax.lax.stop_gradient(across), way)
+    distance = jnp.sqrt(dot(way, way))
+    return distance, way / distance[None]
+
+
 def _distance(
     curve: Curve, element: Int[Array, "k"], other: Int[Array, "k"], a: Float[Array, "k"], b: Float[Array, "k"]
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
     """The distance and the term that keeps the place in the middle, and its derivatives by both places."""
     here, there = _at(curve, element, a), _at(curve, other, b)
-    way = here.x - there.x
-    square = dot(way, way)
-    d = jnp.sqrt(jnp.where(square > 0, square, 1e-30))
-    normal = way / d[None]
+    d, normal = _between(here, there)
     h = curve.s[element + 1] - curve.s[element]
     edge, rate = EDGE * curve.radius[element], 2 * jnp.pi / h
     aside = rate * (a - curve.s[element] - 0.75 * h)

@@ -32,7 +32,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
 from rodjax.model.along import Along
-from rodjax.model.scene import Scene, slid, sliding_places
+from rodjax.model.scene import Scene, has_contacts, slid, sliding_places
 
 # The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
 # pass, as it then has a node of its own no more.
@@ -374,7 +374,7 @@ class SlidingForm(Form):
         system = dataclasses.replace(system.held_unless(here.slides), descends=descends)
         j = len(point.places)
         axial = jnp.where(here.slides, here.closure[:j], 0.0)
-        if self.scene.obstacles:
+        if has_contacts(self.scene):
             # Which contacts are closed is sought at given arclengths; those go along with the ones that were.
             is_minimum, x, y = self.at(point.places).sought(here.at_places, point.inner, system.inner, push)
             factors = factor(system)

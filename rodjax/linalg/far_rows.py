@@ -8,7 +8,7 @@ stiffness, while the others add it (`SIGNS`).
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 # By what the outer product of each vector of the curvature enters the stiffness.
 SIGNS = np.array([-1.0, -1.0, 1.0, 1.0])
@@ -48,7 +48,7 @@ class FarRows(eqx.Module):
         return moments, forces
 
     def columns(
-        self, is_closed: Float[Array, "n+1"], softness: Float[Array, ""], points: int
+        self, is_closed: Bool[Array, "n+1"], softness: Float[Array, ""], points: int
     ) -> tuple[Float[Array, "b 5p m"], Float[Array, "5p n+1 3"], Float[Array, "5p"]]:
         """Of the border: by rotations, by places, and compliances."""
         p, nodes = len(self.elements), len(is_closed)

@@ -299,6 +299,8 @@ def _checked(scenes: Any, name: str) -> Scene:
         raise ValueError(f"{name} needs scenes without sliding clips")
     if stacked.obstacles:
         raise ValueError(f"{name} needs scenes without obstacles")
+    if stacked.self_contact:
+        raise ValueError(f"{name} needs scenes without self_contact")
     if stacked.potentials:
         raise ValueError(f"{name} needs scenes without potentials")
     return stacked

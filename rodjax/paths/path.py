@@ -155,6 +155,8 @@ def _check_stop(scenes: Scene) -> None:
         raise ValueError("at_critical must be 'jump' for scenes with sliding clips")
     if scenes.obstacles:
         raise ValueError("at_critical must be 'jump' for scenes with obstacles")
+    if scenes.self_contact:
+        raise ValueError("at_critical must be 'jump' for scenes with self_contact")
     if scenes.potentials:
         raise ValueError("at_critical must be 'jump' for scenes with potentials")
 

@@ -315,6 +315,7 @@ def _rod_scene(scene: Scene, controls: Controls) -> Scene:
         obstacles,
         scene.potentials,
         scene.point_couples,
+        scene.self_contact,
     )
 
 

@@ -22,12 +22,12 @@ BEFORE = 28
 def scene(angle: float, *, touches: bool = True) -> rodjax.Scene:
     """In units of EI and L."""
     d2 = (0.0, np.cos(angle), np.sin(angle))
-    ends = [
+    start, end = (
         rodjax.Clamp((x, 0.0, 0.0), rodjax.frame((1.0, 0.0, 0.0), d2=axis))
         for x, axis in ((0.0, (0, 1, 0)), (SPAN, d2))
-    ]
+    )
     rod = rodjax.Rod(1.0, 1.0, STIFFNESS_RATIO, 1e4, radius=RADIUS)
-    return rodjax.Scene(rod, *ends, self_contact=touches)
+    return rodjax.Scene(rod, start, end, self_contact=touches)
 
 
 def before_it_snaps(elements: int) -> rodjax.Equilibrium:

@@ -21,9 +21,8 @@ from rodjax.discretization.cells import REFERENCE, Cells, Strains
 from rodjax.discretization.rest_ways import RestWays, part
 from rodjax.geometry.rotations import columns, rotated
 from rodjax.geometry.vectors import cross, diagonal, dot, skew
-from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.blocks import product, short_sum, transpose_product
 from rodjax.mechanics.energy import Sections
-from rodjax.programs.staging import staged
 
 
 class CellStates(NamedTuple):
@@ -42,6 +41,11 @@ class CellStates(NamedTuple):
         tension, and with shear those along d1 and d2.
         """
         return slice(2 if self.sections.GA is None else 0, 3)
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether each strain and each acting force adds to the density on its own."""
+        return self.sections.law is None and (self.rest_ways is None or self.rest_ways.along is None)
 
     @property
     def turning(self) -> Float[Array, "3 n"] | None:
@@ -105,97 +109,175 @@ def _at_points(cells: CellStates, here: Coordinates, strains: Strains) -> Float[
     return jnp.concatenate([values, here.own_forces[cells.acting]])
 
 
+class Stiffness(NamedTuple):
+    """Second derivatives of the density at the strain points by the strains, by the acting forces, and by both:
+    matrices, or their diagonals where these are all; `mixed` is `None` where it is zero.
+    """
+
+    strains: Float[Array, "3 3 p n"] | Float[Array, "3 p n"]
+    forces: Float[Array, "f f p n"] | Float[Array, "f p n"]
+    mixed: Float[Array, "3 f p n"] | None
+
+
+class Turning(NamedTuple):
+    """The derivatives of the coordinates of each other frame by its own rotations, and by those of the reference."""
+
+    own: Float[Array, "q c 3 n"]
+    reference: Float[Array, "q c 3 n"]
+
+
+# Second derivatives by the rotations of two frames of each cell.
+Blocks = list[list[Float[Array, "3 3 n"]]]
+
+
 def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     """By the rotations alone."""
     here = Coordinates.of(cells)
     strains = cells.field.strains(here.seen[cells.field.coordinates])
     stresses = jax.grad(lambda values: jnp.sum(density(cells, values)))(_at_points(cells, here, strains))
-    return _by_rotations(
-        cells, here, stresses, _strain_rows(cells, here, strains.jacobian, _coordinate_rows(cells.field, here))
-    )
+    slopes, turning = _slopes(strains.jacobian, stresses[:3]), _turning(cells.field, here)
+    return _by_rotations(cells, here, slopes, stresses[3:], turning)
 
 
 def derivatives(cells: CellStates) -> CellDerivatives:
     here = Coordinates.of(cells)
     strains = cells.field.strains(here.seen[cells.field.coordinates])
-    values = _at_points(cells, here, strains)
-    stresses, by_all = jax.linearize(jax.grad(lambda values: jnp.sum(density(cells, values))), values)
-    # Each of them changed at all points at once.
-    directions = jnp.eye(len(values), dtype=values.dtype)[:, :, None, None] * jnp.ones_like(values)[None]
-    stiffness = jax.vmap(by_all)(directions)
+    values, jacobian = _at_points(cells, here, strains), strains.jacobian
+    stresses, stiffness = _stresses(cells, values)
+    moments, by_forces = stresses[:3], stresses[3:]
+    slopes, turning = _slopes(jacobian, moments), _turning(cells.field, here)
+    # How the acting forces change as their frames turn, and with the force through the cell: [f, component, point].
+    turned, forcing = skew(here.own_forces)[cells.acting], jnp.swapaxes(here.directors[:, cells.acting], 0, 1)
+    by_forcing = _times(stiffness.forces, forcing)
 
-    p, n = values.shape[1:]
-    turning = _coordinate_rows(cells.field, here)
-    jacobian = strains.jacobian
-    of_strains = _strain_rows(cells, here, jacobian, turning)
-    # Rows: strains and acting forces at the points; columns: rotations of the frames, then the force.
-    size = len(values)
-    acting = jnp.moveaxis(here.directors[:, cells.acting], 0, 2)
-    forcing = jnp.concatenate([jnp.zeros((3, p, 3, n), values.dtype), acting])
-    rows = jnp.concatenate([of_strains, forcing], axis=2)
-    changed = short_sum(stiffness[:, :, :, None] * rows[:, None], axis=0)
-    quadratic = _products(rows.reshape(size * p, -1, n), changed.reshape(size * p, -1, n))
-    curving = strains.curving(stresses[:3]).reshape(len(turning), len(turning), n)
-    changed = short_sum(curving[:, :, None] * turning[None], axis=1)
-    second = quadratic[: 3 * p, : 3 * p] + _products(turning, changed)
-    slopes = short_sum((stresses[:3, :, None, None] * jacobian).reshape(3 * p, -1, p - 1, n), axis=0)
-    second = second.reshape(p, 3, p, 3, n) + _curving(cells, here, slopes, stresses[3:])
-    by_force = jnp.moveaxis(quadratic[: 3 * p, 3 * p :].reshape(p, 3, 3, n), 0, 2) + _tilting(cells, here, stresses[3:])
-    way = -short_sum((stresses[3:, :, None] * acting).reshape(-1, 3, n), axis=0)
+    blocks = _curving(cells, here, slopes, by_forces)
+    of_turned = transpose_product(turned, _times(stiffness.forces, turned))
+    for k in range(len(blocks)):
+        blocks[k][k] += of_turned[:, :, k]
+    _add_by_coordinates(blocks, _quadratic(jacobian, stiffness.strains) + strains.curving(moments), turning)
+    by_force = transpose_product(turned, by_forcing) + _tilting(cells, here, by_forces)
+    if stiffness.mixed is not None:
+        mixed = _mixed(jacobian, stiffness.mixed, turning)
+        _add_mixed(blocks, mixed, turned)
+        by_force += jnp.stack([short_sum(product(rows, forcing), axis=2) for rows in mixed], axis=2)
+
+    way = -short_sum(dot(by_forces[:, None], forcing), axis=1)
     value = jnp.sum(density(cells, values), axis=0)
     if cells.turning is not None:
         rest = rotated(cells.quaternions[:, REFERENCE], cells.turning)
         way += rest
         value -= dot(cells.forces[:, REFERENCE], rest)
-    first = _by_rotations(cells, here, stresses, of_strains)
-    return CellDerivatives(value, first, second, way, by_force, -quadratic[3 * p :, 3 * p :])
+    first = _by_rotations(cells, here, slopes, by_forces, turning)
+    second = jnp.stack([jnp.stack(row, axis=1) for row in blocks])
+    compliance = -short_sum(transpose_product(forcing, by_forcing), axis=2)
+    return CellDerivatives(value, first, second, way, by_force, compliance)
 
 
-def _coordinate_rows(field: Cells, here: Coordinates) -> Float[Array, "v 3p n"]:
-    """The derivatives of the coordinates, of one other frame after the other, by the rotations, frame by frame."""
-    _, p, n = here.own_forces.shape
-    nothing = jnp.zeros((4, 3, n), here.seen.dtype)
-    rows = []
-    for k, other in enumerate(j for j in range(p) if j != REFERENCE):
-        w, r = here.seen[0, k], here.seen[1:, k]
-        straight, across = diagonal(w), skew(r)
-        blocks = [nothing] * p
-        blocks[other] = jnp.concatenate([-r[None], straight + across]) / 2
-        blocks[REFERENCE] = jnp.concatenate([r[None], across - straight]) / 2
-        rows.append(jnp.concatenate(blocks, axis=1)[field.coordinates])
-    return jnp.concatenate(rows)
+def _stresses(cells: CellStates, values: Float[Array, "v p n"]) -> tuple[Float[Array, "v p n"], Stiffness]:
+    """The derivatives of the density by the strains and the acting forces, and the second ones."""
+
+    def stresses(values: Float[Array, "v p n"]) -> Float[Array, "v p n"]:
+        return jax.grad(lambda values: jnp.sum(density(cells, values)))(values)
+
+    if cells.is_separable:
+        first, second = jax.jvp(stresses, (values,), (jnp.ones_like(values),))
+        return first, Stiffness(second[:3], second[3:], None)
+    first, by_all = jax.linearize(stresses, values)
+    # Each of them changed at all points at once.
+    directions = jnp.eye(len(values), dtype=values.dtype)[:, :, None, None] * jnp.ones_like(values)[None]
+    second = jax.vmap(by_all)(directions)
+    return first, Stiffness(second[:3, :3], second[3:, 3:], second[:3, 3:])
 
 
-def _strain_rows(
-    cells: CellStates, here: Coordinates, jacobian: Float[Array, "3 p c q n"], turning: Float[Array, "v 3p n"]
-) -> Float[Array, "v p 3p n"]:
-    """The derivatives of strains and acting forces at the points by the rotations, from those of the coordinates."""
-    _, p, n = here.own_forces.shape
-    by_coordinates = jnp.swapaxes(jacobian, 2, 3).reshape(3, p, len(turning), n)
-    of_strains = short_sum(by_coordinates[:, :, :, None] * turning[None, None], axis=2)
-    forces = here.own_forces
-    if cells.sections.GA is None:
-        by_own = jnp.stack([-forces[1], forces[0], jnp.zeros_like(forces[0])], axis=1)[None]  # [c, k, a]: t x m
-    else:
-        by_own = jnp.swapaxes(skew(forces), 1, 2)
-    own = jnp.eye(p, dtype=forces.dtype)[None, :, :, None, None] * by_own[:, :, None]
-    return jnp.concatenate([of_strains, own.reshape(-1, p, 3 * p, n)])
+def _times(matrix: Array, columns: Float[Array, "r j p n"]) -> Float[Array, "r j p n"]:
+    """A symmetric matrix at each point, or its diagonal, times columns."""
+    return matrix[:, None] * columns if matrix.ndim < columns.ndim else product(matrix, columns)
+
+
+def _slopes(jacobian: Float[Array, "3 p c q n"], moments: Float[Array, "3 p n"]) -> Float[Array, "c q n"]:
+    """The derivatives of the value by the coordinates."""
+    products = moments[:, :, None, None] * jacobian
+    return short_sum(products.reshape(-1, *products.shape[2:]), axis=0)
+
+
+def _turning(field: Cells, here: Coordinates) -> Turning:
+    w, r = here.seen[0], here.seen[1:]
+    straight, across = diagonal(w), skew(r)
+    own = jnp.concatenate([-r[None], straight + across]) / 2
+    reference = jnp.concatenate([r[None], across - straight]) / 2
+    return Turning(*(jnp.moveaxis(rows[field.coordinates], 2, 0) for rows in (own, reference)))
 
 
 def _by_rotations(
-    cells: CellStates, here: Coordinates, stresses: Float[Array, "v p n"], rows: Float[Array, "v p 3p n"]
+    cells: CellStates,
+    here: Coordinates,
+    slopes: Float[Array, "c q n"],
+    by_forces: Float[Array, "f p n"],
+    turning: Turning,
 ) -> Float[Array, "3 p n"]:
-    _, p, n = stresses.shape
-    first = short_sum((stresses[:, :, None] * rows).reshape(-1, 3 * p, n), axis=0)
-    first = jnp.moveaxis(first.reshape(p, 3, n), 0, 1)
-    if cells.turning is None:
-        return first
-    return first.at[:, REFERENCE].add(-cross(cells.turning, here.own_forces[:, REFERENCE]))
+    """The first derivatives by the rotations, from those by the coordinates and the acting forces."""
+    by_coordinates = jnp.moveaxis(slopes, 1, 0)[:, :, None]
+    rows = list(short_sum(by_coordinates * turning.own, axis=1))
+    reference = short_sum(short_sum(by_coordinates * turning.reference, axis=1), axis=0)
+    if cells.turning is not None:
+        reference -= cross(cells.turning, here.own_forces[:, REFERENCE])
+    rows.insert(REFERENCE, reference)
+    return jnp.stack(rows, axis=1) + dot(by_forces[:, None], skew(here.own_forces)[cells.acting])
+
+
+def _quadratic(
+    jacobian: Float[Array, "3 p c q n"], stiffness: Float[Array, "3 3 p n"] | Float[Array, "3 p n"]
+) -> Float[Array, "q c q c n"]:
+    """The second derivatives by the coordinates, of strains that are linear in them."""
+    _, p, c, q, n = jacobian.shape
+    rows = jnp.swapaxes(jacobian, 2, 3).reshape(3, p, q * c, n)
+    changed = jnp.swapaxes(_times(stiffness, jnp.swapaxes(rows, 1, 2)), 1, 2)
+    rows, changed = (x.reshape(3 * p, q * c, n) for x in (rows, changed))
+    return short_sum(rows[:, :, None] * changed[:, None], axis=0).reshape(q, c, q, c, n)
+
+
+def _add_by_coordinates(blocks: Blocks, by_coordinates: Float[Array, "q c q c n"], turning: Turning) -> None:
+    """The second derivatives by the rotations, from those by the coordinates."""
+    q, c, _, _, n = by_coordinates.shape
+    own, reference = turning
+    rows = by_coordinates.reshape(q * c, q, c, n)
+    by_own = short_sum(rows[:, :, :, None] * own[None], axis=2)
+    by_reference = short_sum(rows.reshape(q * c, q * c, 1, n) * reference.reshape(1, q * c, 3, n), axis=1)
+    by_both = jnp.concatenate([by_own.reshape(q, c, 3 * q, n), by_reference.reshape(q, c, 3, n)], axis=2)
+    of_own = short_sum(own[:, :, :, None] * by_both[:, :, None], axis=1)  # of each frame by all, the reference last
+    blocks[REFERENCE][REFERENCE] += short_sum(reference.reshape(q * c, 3, 1, n) * by_reference[:, None], axis=0)
+    others = [k for k in range(len(blocks)) if k != REFERENCE]
+    for rows, first in zip(of_own, others, strict=True):
+        for f, second in enumerate(others):
+            blocks[first][second] += rows[:, 3 * f : 3 * f + 3]
+        blocks[first][REFERENCE] += rows[:, 3 * q :]
+        blocks[REFERENCE][first] += jnp.swapaxes(rows[:, 3 * q :], 0, 1)
+
+
+def _mixed(
+    jacobian: Float[Array, "3 p c q n"], stiffness: Float[Array, "3 f p n"], turning: Turning
+) -> list[Float[Array, "3 f p n"]]:
+    """The second derivatives by the rotations of each frame and the acting forces."""
+    by_coordinates = short_sum(jacobian[:, None] * stiffness[:, :, :, None, None], axis=0)
+    by_coordinates = jnp.moveaxis(by_coordinates, (3, 2), (0, 1))[:, :, None]  # [e, i, -, f, point]
+    own, reference = (short_sum(rows[:, :, :, None, None] * by_coordinates, axis=1) for rows in turning)
+    mixed = list(own)
+    mixed.insert(REFERENCE, short_sum(reference, axis=0))
+    return mixed
+
+
+def _add_mixed(blocks: Blocks, mixed: list[Float[Array, "3 f p n"]], turned: Float[Array, "f 3 p n"]) -> None:
+    """The second derivatives by the rotations, from those by them and the acting forces."""
+    for i, rows in enumerate(mixed):
+        for k in range(len(mixed)):
+            block = product(rows[:, :, k], turned[:, :, k])
+            blocks[i][k] += block
+            blocks[k][i] += jnp.swapaxes(block, 0, 1)
 
 
 def _curving(
     cells: CellStates, here: Coordinates, slopes: Float[Array, "c q n"], by_forces: Float[Array, "f p n"]
-) -> Float[Array, "p 3 p 3 n"]:
+) -> Blocks:
     """The second derivatives of coordinates and acting forces by the rotations, times those of the value by them."""
     _, p, n = here.own_forces.shape
     blocks = [[jnp.zeros((3, 3, n), slopes.dtype)] * p for _ in range(p)]
@@ -220,7 +302,7 @@ def _curving(
         blocks[REFERENCE][REFERENCE] += pure[:, :, k]
         blocks[REFERENCE][other] = mixed[:, :, k]
         blocks[other][REFERENCE] = jnp.swapaxes(mixed[:, :, k], 0, 1)
-    return jnp.stack([jnp.stack(row, axis=1) for row in blocks])
+    return blocks
 
 
 def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "f p n"]) -> Float[Array, "3 3 p n"]:
@@ -240,12 +322,6 @@ def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "f p n"]
 def _turned_vector(directors: Float[Array, "3 3 *k"], vector: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:
     """[a, c]: component c of e_a x vector, which is given in the axes of the directors."""
     return jnp.swapaxes(short_sum(directors[:, :, None] * -skew(vector)[None], axis=1), 0, 1)
-
-
-def _products(rows: Float[Array, "r c n"], changed: Float[Array, "r c n"]) -> Float[Array, "c c n"]:
-    """Sums over the rows of products of columns."""
-    rows, changed = staged(rows, changed)
-    return short_sum(rows[:, :, None] * changed[:, None], axis=0)
 
 
 def _of_turned(force: Float[Array, "3 *k"], vector: Float[Array, "3 *k"]) -> Float[Array, "3 3 *k"]:

@@ -10,6 +10,7 @@ from jax.test_util import check_grads
 from numpy_programs import by_numpy
 
 import rodjax as rj
+from rodjax.linalg.blocks import negative_count
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
@@ -326,3 +327,21 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
     # A pressure is one negative eigenvalue, whether its contact is closed or open.
     assert int(factors.negative) == np.sum(np.linalg.eigvalsh(matrix) < 0) - 1 - pressures - 3 * elements
     assert int(factors.negative) > 0
+
+
+@pytest.mark.parametrize("size", [1, 2, 9])
+def test_negative_eigenvalues_are_counted(size):
+    """Of matrices whose eigenvalues are known, over 16 orders, a singular one and one of zeros among them."""
+    generator = np.random.default_rng(size)
+    values = generator.choice([-1.0, 1.0], (40, size)) * 10.0 ** generator.uniform(-4, 12, (40, size))
+    bases = np.linalg.qr(generator.normal(size=(40, size, size)))[0]
+    diagonal = np.eye(size) * values[:, :, None]
+    # Roundings are 1e-16 of the largest eigenvalue: smaller ones are kept apart from it by a diagonal matrix.
+    mixed = np.where(
+        (np.abs(values).min(1) > 1e-12 * np.abs(values).max(1))[:, None, None],
+        bases @ diagonal @ bases.swapaxes(1, 2),
+        diagonal,
+    )
+    mixed = np.concatenate([(mixed + mixed.swapaxes(1, 2)) / 2, np.zeros((1, size, size))])
+    assert int(jax.jit(negative_count)(jnp.asarray(mixed))) == np.sum(values < 0)
+    assert int(negative_count(jnp.asarray(np.diag(np.r_[0.0, -np.ones(size - 1)])[None]))) == size - 1

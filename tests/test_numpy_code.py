@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 
 import rodjax as rj
+from rodjax.linalg.blocks import negative_count
 from rodjax.programs import answers, compilation, numpy_operations
 from rodjax.programs.answers import ANSWERS, one_answer
 from rodjax.programs.compilation import compiled
@@ -117,6 +118,7 @@ OPERATIONS = {
         jnp.linalg.cholesky(STACK),
         jnp.linalg.cholesky(-POSITIVE),
         jnp.linalg.eigvalsh(STACK),
+        negative_count(STACK - jnp.mean(STACK)),
         jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(POSITIVE), True), x),
         *[
             lax.linalg.triangular_solve(POSITIVE, x if left else x.T, left_side=left, lower=lower, transpose_a=flip)

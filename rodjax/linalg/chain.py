@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.blocks import inverse_of_blocks
+from rodjax.linalg.blocks import inverse_of_blocks, negative_count
 from rodjax.linalg.far_rows import FarRows
 
 # Solutions with soft contacts, after the first one.
@@ -366,8 +366,8 @@ class ChainFactors(eqx.Module):
     system: ChainSystem
     middles: _Middles
     inverses: Float[Array, "n+1 c c"]
-    below: Float[Array, "n c c"]
-    above: Float[Array, "n c c"]
+    before: Float[Array, "n c c"]  # of all nodes but the first: the inverse times the block that couples the one before
+    after: Float[Array, "n c c"]
     border: "_Border"
     border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
     bordered: Float[Array, "k k"]
@@ -468,21 +468,19 @@ class ChainFactors(eqx.Module):
             of_places -= _on_nodes(moved[:, 2 * b + 3 : 2 * b + 6], moved[:, 2 * b + 6 :])
         right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_places], axis=1)
 
-        def forward(before: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            inverse, below, right = given
-            here = inverse @ (right - below @ before)
+        right = jnp.einsum("npq,nqr->npr", self.inverses, right)
+
+        def less(here: Array, matrix: Array, beside: Array) -> Array:
+            # In one loop with the difference, where a product of matrices is a call.
+            return here - jnp.sum(matrix[:, :, None] * beside[None], axis=1)
+
+        def forward(before: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+            here = less(given[1], given[0], before)
             return here, here
 
-        def backward(after: Array, given: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            inverse, above, here = given
-            here -= inverse @ (above @ after)
-            return here, here
-
-        first = self.inverses[0] @ right[0]
-        _, reached = jax.lax.scan(forward, first, (self.inverses[1:], self.below, right[1:]))
-        last = reached[-1]
-        reached = jnp.concatenate([first[None], reached[:-1]])
-        _, solved = jax.lax.scan(backward, last, (self.inverses[:-1], self.above, reached), reverse=True)
+        last, reached = jax.lax.scan(forward, right[0], (self.before, right[1:]))
+        reached = jnp.concatenate([right[:1], reached[:-1]])
+        _, solved = jax.lax.scan(forward, last, (self.after, reached), reverse=True)
         z = jnp.concatenate([solved, last[None]])
         around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
@@ -558,14 +556,15 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     is_symmetric = system.loads is None and contacts.pushes is None
     if is_symmetric:
         # Each force is a multiplier, and so is that of the element before the first node.
-        signs = jnp.linalg.eigvalsh(jax.lax.stop_gradient(pivots))
-        negative += jnp.sum(signs < 0) - 3 * (n + 1)
+        negative += negative_count(jax.lax.stop_gradient(pivots)) - 3 * (n + 1)
     border = _Border.of(system, contacts)
     k = len(border.compliance)
     nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
     blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
     no_complement = jnp.zeros((k, k), dtype)
-    chain = contacts, whole, system, middles, inverses, below, above
+    before = jnp.einsum("npq,nqr->npr", inverses[1:], below)
+    after = jnp.einsum("npq,nqr->npr", inverses[:-1], above)
+    chain = contacts, whole, system, middles, inverses, before, after
     factors = ChainFactors(*chain, border, blank, no_complement, no_complement, negative)
     if not k:
         return factors
@@ -573,7 +572,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     solution = factors._without_border(border.by_rotation, by_place, nothing[1])
     matrix = -border.compliance - border.times(*solution[:2])
     if is_symmetric:
-        negative += jnp.sum(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) < 0) - border.positive
+        negative += negative_count(jax.lax.stop_gradient(matrix)[None]) - border.positive
     return ChainFactors(*chain, border, solution, matrix, jnp.linalg.inv(matrix), negative)
 
 

@@ -431,6 +431,7 @@ OTHERS: dict[str, Rule] = {
     "lu_pivots_to_permutation": _operation("permutation", "permutation_size"),
     "triangular_solve": _triangular_solve,
     "eigh": lambda body, equation, x: f"op.eigh({x}, {equation.params['lower']})",
+    "tridiagonal": lambda body, equation, x: f"op.tridiagonal({x})",
     "platform_index": _platform_index,
     "optimization_barrier": _same,
     "device_put": _same,

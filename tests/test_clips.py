@@ -533,10 +533,6 @@ def test_what_clips_do_not_go_with_is_said():
     ):
         with pytest.raises(ValueError, match=message):
             rj.solve(scene, **options)
-    slides = in_space(sliding=(True, False))
-    for refused in (lambda: rj.follow([slides, slides]), lambda: rj.solve_path([slides] * 2, at_critical="stop")):
-        with pytest.raises(ValueError, match="sliding clips"):
-            refused()
     curved = Rod(1.0, (1.0, 2.0), 1.0, 1e6)
     with pytest.raises(ValueError, match=r"clips must be \(\) in the continuum for a rod, loads or clips"):
         rj.solve_continuum(Scene(curved, scene.start, scene.end, clips=scene.clips))

@@ -223,6 +223,39 @@ def test_every_feature_solves_in_a_harness(names):
     np.testing.assert_allclose(force, 0.0, rtol=0, atol=1e-6)
 
 
+# What branches (`rj.follow`, `rj.critical_point`, `at_critical="stop"`) refuse: loads without a potential, as no energy
+# tells where they lose stability, and contact, which opens and closes along them.
+NOT_ON_BRANCHES = {
+    "have none": [
+        "follower force along",
+        "couple along",
+        "point couple",
+        "follower point force",
+        "end moment",
+        "follower end force",
+    ],
+    "without obstacles": ["floor"],
+}
+
+
+def test_what_branches_refuse_is_listed():
+    found = {}
+    for kind, names in FEATURES.items():
+        for name in list(names)[1:] if kind != "planar" else []:
+            scene = scene_of({kind: name})
+            for operation in (rj.follow, rj.critical_point):
+                try:
+                    # What begins far beyond the scenes is refused after all else.
+                    operation([scene, scene], start=9.0)
+                except ValueError as error:
+                    if "start must lie" not in str(error):
+                        found[name] = str(error)
+    expected = {name: message for message, names in NOT_ON_BRANCHES.items() for name in names}
+    assert found.keys() == expected.keys()
+    for name, message in expected.items():
+        assert message in found[name]
+
+
 # Each feature that solves at least once, several at a time.
 TOGETHER = [
     {"rod": "varying", "ends": "clamp and swivel", "load": "point force", "clip": "tangent"},

@@ -11,6 +11,7 @@ from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.linalg.blocks import negative_count
+from rodjax.linalg.bordered import BorderedFactors, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
@@ -345,3 +346,21 @@ def test_negative_eigenvalues_are_counted(size):
     mixed = np.concatenate([(mixed + mixed.swapaxes(1, 2)) / 2, np.zeros((1, size, size))])
     assert int(jax.jit(negative_count)(jnp.asarray(mixed))) == np.sum(values < 0)
     assert int(negative_count(jnp.asarray(np.diag(np.r_[0.0, -np.ones(size - 1)])[None]))) == size - 1
+
+
+# --- borders that may be full ----------------------------------------------------------------------------------------
+
+
+def complemented(complement: jax.Array) -> BorderedFactors:
+    return BorderedFactors(None, Vectors(*2 * [jnp.zeros(0)]), Vectors(*2 * [jnp.zeros(0)]), complement, False)
+
+
+@pytest.mark.parametrize("j", [1, 2, 4])
+def test_pivots_of_a_complement_tell_where_it_is_singular(j):
+    """Of symmetric ones they count negative eigenvalues; of others the parity is that of the determinant."""
+    rng = np.random.default_rng(j)
+    for _ in range(20):
+        matrix = rng.normal(size=(j, j))
+        symmetric = complemented(jnp.asarray(matrix + matrix.T))
+        assert symmetric.below_by_pivots == symmetric.below == np.sum(np.linalg.eigvalsh(matrix + matrix.T) < 0)
+        assert (-1) ** int(complemented(jnp.asarray(matrix)).below_by_pivots) == np.sign(np.linalg.det(matrix))

@@ -163,6 +163,95 @@ def test_a_magnet_presses_a_cable_on_the_floor():
     np.testing.assert_allclose(pushes + result.end_force - result.start_force, [0, 0, 20.0], rtol=0, atol=1e-6)
 
 
+# --- branches --------------------------------------------------------------------------------------------------------
+
+FIELD, PRESS, STIFF = 5 * np.pi**4, 80.0, 1e8
+
+
+def around(k, position, s):
+    return k / 2 * (position[1] ** 2 + position[2] ** 2)
+
+
+def column(load, k=FIELD, EI=1.0) -> Scene:
+    """Between pins that come together, on a bedding all around it."""
+    field = Potential(jax.tree_util.Partial(around, jnp.asarray(k)))
+    return Scene(Rod(1.0, EI, 0.7, STIFF), Pin((0, 0, 0)), Pin((1 - load / STIFF, 0, 0)), potentials=[field])
+
+
+STRAIGHT = rj.Guess(np.linspace((0.0, 0.0, 0.0), X, 5))
+
+
+def winkler(m: int, k=FIELD, EI=1.0) -> float:
+    """The load under which a column between pins buckles in m half waves."""
+    return np.pi**2 * m**2 * EI + k / (np.pi**2 * m**2)
+
+
+@pytest.mark.slow
+def test_a_column_on_a_bedding_buckles_in_two_half_waves():
+    branch = rj.follow([column(0.0), column(PRESS)], segments=48, guess=STRAIGHT)
+    assert branch.ended == rj.BranchEnd.SCENES
+    first, second = branch.critical_points
+    assert [(point.index_before, point.index_after) for point in (first, second)] == [(0, 2), (2, 4)]
+    np.testing.assert_array_equal(branch.index, branch.equilibria.index)
+    # The mesh error of 48 elements; as much of the load is the change of length.
+    for point, m in ((first, 2), (second, 1)):
+        np.testing.assert_allclose(PRESS * point.parameter, winkler(m), rtol=1e-6)
+        np.testing.assert_allclose(rj.lowest_mode(second.equilibrium).stiffness, winkler(2) - winkler(1), rtol=1e-5)
+        size = np.linalg.norm(point.mode.displacement, axis=1)
+        np.testing.assert_allclose(size, np.abs(np.sin(m * np.pi * point.equilibrium.s)), rtol=0, atol=1e-5)
+    stopped = rj.solve_path(
+        [column(load) for load in (40.0, 50.0, 55.0)], segments=48, guess=STRAIGHT, at_critical="stop"
+    )
+    assert stopped.energy.shape == (2,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("EI", [1.0, pytest.param((1.0, 2.0), marks=pytest.mark.exhaustive)])
+def test_the_derivatives_of_a_critical_load_on_a_bedding(EI):
+    """By k L^2/(4 pi^2) and 4 pi^2 EI/L^2."""
+
+    def critical(k, part):
+        scenes = [column(load, k, jnp.asarray(EI) * part if EI == 1.0 else (part, 2.0)) for load in (0.0, PRESS)]
+        point = rj.critical_point(scenes, segments=48, guess=STRAIGHT)
+        assert (point.kind, point.index_after) == ("branch", 2 if EI == 1.0 else 1)
+        return PRESS * point.parameter
+
+    load, (by_k, by_EI) = jax.value_and_grad(critical, argnums=(0, 1))(FIELD, 1.0)
+    np.testing.assert_allclose(load, winkler(2), rtol=1e-6)
+    np.testing.assert_allclose(by_k, 1 / (4 * np.pi**2), rtol=2e-6)
+    np.testing.assert_allclose(by_EI, 4 * np.pi**2, rtol=2e-6)
+    difference = (critical(FIELD + 1.0, 1.0) - critical(FIELD - 1.0, 1.0)) / 2
+    np.testing.assert_allclose(by_k, difference, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_branch_in_a_uniform_field_is_one_in_gravity():
+    """An arch that snaps through under its weight, and under a field as heavy."""
+    half = 0.5
+    cosine, sine, span = np.cos(half), np.sin(half), np.sin(half) / half
+    ends = Clamp((0, 0, 0), rj.frame((cosine, 0, sine))), Clamp((span, 0, 0), rj.frame((cosine, 0, -sine)))
+    angle = np.linspace(-half, half, 101)
+    rise = (np.cos(angle) - cosine) / (2 * half)
+    circle = rj.Guess(np.stack([span / 2 + np.sin(angle) / (2 * half), 0 * angle, rise], axis=1))
+
+    def scene(weight: float, of_field: bool) -> Scene:
+        force = jnp.array([0.0, 0.0, -weight])
+        if of_field:
+            return Scene(rod(), *ends, potentials=[Potential(Uniform(force))])
+        return Scene(rod(), *ends, force)
+
+    found = [
+        rj.follow([scene(weight, of_field) for weight in (0.0, 100.0)], segments=24, guess=circle, max_points=30)
+        for of_field in (True, False)
+    ]
+    field, gravity = ([(p.kind, p.index_before, p.index_after) for p in branch.critical_points] for branch in found)
+    assert field == gravity
+    assert len(field) == 3
+    loads = [[float(point.parameter) for point in branch.critical_points] for branch in found]
+    # Of fourth order apart, as their forces stand elsewhere in the equations.
+    np.testing.assert_allclose(*loads, rtol=1e-4)
+
+
 def test_what_pushes_out_of_a_plane_is_told():
     ends = START, Clamp((0.8, 0, 0.1), rj.frame((1, 0, 0.3)))
     aside = Potential(Uniform(jnp.array([0.0, 3.0, 0.0])))
@@ -208,7 +297,6 @@ def test_what_takes_no_fields_says_so(tmp_path):
     for refused, message in (
         (lambda: rj.solve(scene, discretization="finite_difference"), "discretization must be 'hermite'"),
         (lambda: rj.solve_continuum(scene), r"potentials must be \(\) in the continuum"),
-        (lambda: rj.follow([scene, scene]), "without potentials"),
         (lambda: rj.save(result, tmp_path / "result.vtkhdf"), r"potentials must be \(\): a potential is code"),
         (lambda: rj.write_scene(scene, tmp_path / "scene.toml"), r"potentials must be \(\) to be written"),
     ):

@@ -130,6 +130,25 @@ def test_a_softest_motion_may_be_limited(shortest):
 
 
 @pytest.mark.slow
+def test_the_softest_motion_of_a_rod_that_slides_may_be_limited():
+    """The least energy is that of a slacker rod: the limit is active, to the reserve for the mesh."""
+    scene = corner()
+    clip = rj.Clip(0.16, (0.13, 0.0, 0.07), sliding=True)
+    scene = rj.Scene(scene.rod, scene.start, scene.end, clips=[clip])
+    first = rj.solve(scene, segments=16)
+    stiffness = float(rj.lowest_mode(first).stiffness)
+    margins = rj.margins(first, rj.Limits(stability=stiffness / 2))
+    assert dict(zip(margins.names, np.asarray(margins.value), strict=True))["stability"] == pytest.approx(stiffness)
+    limits = rj.Limits(stability=1.2 * stiffness)
+    variables = [rj.Between("end.position.0", 0.17, 0.21)]
+    route = rj.route(
+        scene, variables, limits=limits, objective=rj.Objective(energy=1.0), starts=2, segments=16, solver=TIGHT
+    )
+    assert route.feasible
+    assert float(rj.lowest_mode(route.verified).stiffness) == pytest.approx(1.2 * stiffness, rel=0.01)
+
+
+@pytest.mark.slow
 def test_an_obstacle_in_the_way_is_passed(shortest):
     """A ball on the arc: the way around it is longer, and clear of it on a finer mesh."""
     ball = rj.Sphere(np.asarray(shortest.equilibrium.nodes[8]) + np.array([0.0, 0.002, 0.0]), 0.01)

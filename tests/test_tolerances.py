@@ -57,6 +57,25 @@ def test_a_taut_wire():
     assert "not of first order: bend radius" in str(envelope)
 
 
+@pytest.mark.slow
+def test_the_softest_motion_of_a_rod_that_slides():
+    """Its deviation beside the difference of two solves."""
+
+    def scene(EI: float) -> Scene:
+        ends = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.6, 0.2, 0.0), frame((1, 1, 0)))
+        return Scene(Rod(1.0, EI, 1.0, EA), *ends, clips=[Clip(0.5, (0.35, 0.05, 0.1), sliding=True)])
+
+    result = rj.solve(scene(1.0), segments=12, solver=rj.Newton(tolerance=1e-12))
+    envelope = rj.tolerances(result, [Tolerance("rod.EI", 0.001)])
+    assert envelope.stiffness == float(rj.lowest_mode(result).stiffness)
+    most, least = (
+        rj.lowest_mode(rj.solve(scene(EI), segments=12, guess=result, solver=rj.Newton(tolerance=1e-12))).stiffness
+        for EI in (1.001, 0.999)
+    )
+    # Differences of second order.
+    assert envelope.stiffness_deviation == pytest.approx(abs(float(most - least)) / 2, rel=1e-4)
+
+
 @pytest.mark.exhaustive
 def test_a_taut_wire_beside_a_monte_carlo():
     envelope = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=2000, seed=1)

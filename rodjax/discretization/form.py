@@ -115,6 +115,11 @@ class Form(eqx.Module):
         """The point where a solver stopped, with all that is known of it."""
 
     @property
+    def arclengths(self) -> int:
+        """How many of the multipliers, the first ones, are arclengths of sliding clips."""
+        return 0
+
+    @property
     def carries_twist(self) -> bool:
         """Whether the total twist is an unknown that steps carry, and not read off the frames."""
         return False

@@ -21,6 +21,34 @@ class Motion(eqx.Module):
         return Motion(self.rotation - share * other.rotation, self.multipliers - share * other.multipliers)
 
 
+class Metric(eqx.Module):
+    """The square of a motion: that of its rotations by the length of rod, none where a support holds the tangent. A
+    clip through which the rod slides by its length counts as a turn of all of it by 1 rad.
+    """
+
+    mass: Float[Array, "m"]
+    arclengths: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(form: Form, here: Linearization) -> "Metric":
+        mass = form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+        return Metric(mass, form.arclengths)
+
+    def inner(self, motion: Motion, other: Motion) -> Float[Array, ""]:
+        of_rotations = jnp.sum(self.mass[None] * motion.rotation * other.rotation)
+        if not self.arclengths:
+            return of_rotations
+        first = slice(self.arclengths)
+        return of_rotations + jnp.sum(self.mass) * jnp.sum(motion.multipliers[first] * other.multipliers[first])
+
+    def times(self, motion: Motion) -> Motion:
+        """The forces whose work in any other motion is the inner product with it."""
+        multipliers, first = jnp.zeros_like(motion.multipliers), slice(self.arclengths)
+        if self.arclengths:
+            multipliers = multipliers.at[first].set(jnp.sum(self.mass) * motion.multipliers[first])
+        return Motion(self.mass[None] * motion.rotation, multipliers)
+
+
 class Neutral(eqx.Module):
     """The motions that leave an equilibrium one: the turn of the whole rod about an axis, and the spin of all sections
     about their tangents, at right angles to it; no motion, where there is none. `spin`: `None` where it is no unknown.

@@ -208,6 +208,10 @@ class SlidingForm(Form):
         return self.first.layout
 
     @property
+    def arclengths(self) -> int:
+        return len(self._numbers)
+
+    @property
     def has_potential(self) -> bool:
         return dataclasses.replace(self.first, scene=self.scene).has_potential
 

@@ -45,6 +45,11 @@ class BorderedSystem(eqx.Module):
     def diagonal(self) -> Float[Array, "b b m"]:
         return self.inner.diagonal
 
+    @property
+    def transposed(self) -> "BorderedSystem":
+        """M is symmetric."""
+        return dataclasses.replace(self, columns=self.rows, rows=self.columns, corner=self.corner.T)
+
     def parted(self, y: Float[Array, "j+k"]) -> tuple[Float[Array, "j"], Float[Array, "k"]]:
         return y[: len(self.corner)], y[len(self.corner) :]
 
@@ -87,6 +92,16 @@ class BorderedFactors(eqx.Module):
         """The negative eigenvalues of S."""
         values = self.symmetric[0] if len(self.complement) == 1 else jnp.linalg.eigvalsh(self.symmetric)
         return jnp.sum(values < 0)
+
+    @property
+    def below_by_pivots(self) -> Int[Array, ""]:
+        """The same from the signs of the pivots of S: this changes where S is singular, also without symmetry."""
+        matrix, below = self.complement, jnp.zeros((), int)
+        for k in range(len(matrix)):
+            pivot = matrix[k, k]
+            below += (pivot < 0).astype(int)
+            matrix = matrix - matrix[:, k, None] * matrix[None, k] / pivot
+        return below
 
     @property
     def symmetric(self) -> Float[Array, "j j"]:

@@ -109,6 +109,11 @@ AnyFactors = Factors | ChainFactors | BorderedFactors
 AnySystem = SaddlePointSystem | ChainSystem | BorderedSystem
 
 
+def transposed(system: AnySystem) -> AnySystem:
+    """Of rods whose loads have a potential, which only a border leaves without symmetry."""
+    return system.transposed if isinstance(system, BorderedSystem) else system
+
+
 def factor(system: AnySystem, *, is_regularized: bool = False) -> "AnyFactors":
     """Factorisation, O(n): by cyclic reduction, of a chain from node to node.
 

@@ -10,6 +10,7 @@ Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1
 stability analysis" (2010).
 """
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -18,18 +19,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
-from rodjax.discretization.motion import Motion, neutral_turn
+from rodjax.discretization.motion import Metric, Motion, neutral_turn
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.vectors import components
 from rodjax.linalg.blocks import short_sum
-from rodjax.linalg.saddle_point import AnyFactors, SaddlePointSystem, factor
-from rodjax.model.scene import Scene, between, nondimensional
+from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.saddle_point import AnyFactors, AnySystem, SaddlePointSystem, factor, transposed
+from rodjax.model.scene import Scene, between, nondimensional, slid
 from rodjax.model.supports import Clamp, rotate
 from rodjax.paths.modes import Mode, mode_of
 from rodjax.programs.compilation import compiled
+from rodjax.solving.equilibrium import on_mesh_of
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
+from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, free_form_and_point
 from rodjax.solving.stability import carried_to
 from rodjax.solving.status import Outcome, Status
 
@@ -112,7 +119,7 @@ class Problem(eqx.Module):
 
     @property
     def point(self) -> Point:
-        return form_and_point(self.equilibrium)[1]
+        return free_form_and_point(self.equilibrium)[1]
 
     @property
     def scale(self) -> float:
@@ -121,7 +128,8 @@ class Problem(eqx.Module):
 
     def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
         scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
-        return carried_to(scaled, self.equilibrium.state.shape, point, motion)
+        state = self.equilibrium.state
+        return carried_to(scaled, state.shape, point, motion, made_at=state.places)
 
     def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
         """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
@@ -139,20 +147,11 @@ def no_motion(result: Equilibrium) -> Motion:
     """A motion of an equilibrium that leaves it where it is."""
 
     def unbalanced(result: Equilibrium) -> Motion:
-        form, point = form_and_point(result)
+        form, point = free_form_and_point(result)
         here = form.linearized(point)
         return Motion(here.gradient, here.closure)
 
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(unbalanced, result))
-
-
-def mass(form: Form, here: Linearization) -> Float[Array, "m"]:
-    """The length of rod that each tangent stands for; none where a support holds it."""
-    return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
-
-
-def inner(mass: Float[Array, "m"], motion: Motion, other: Motion) -> Float[Array, ""]:
-    return jnp.sum(mass[None] * motion.rotation * other.rotation)
 
 
 def times(motion: Motion, other: Motion) -> Float[Array, ""]:
@@ -160,9 +159,9 @@ def times(motion: Motion, other: Motion) -> Float[Array, ""]:
     return jnp.sum(motion.rotation * other.rotation) + jnp.sum(motion.multipliers * other.multipliers)
 
 
-def less(motion: Motion, other: Motion, mass: Float[Array, "m"]) -> Motion:
+def less(motion: Motion, other: Motion, metric: Metric) -> Motion:
     """The part at right angles to another motion of length 1, or to none."""
-    return added(motion, other, -inner(mass, motion, other))
+    return added(motion, other, -metric.inner(motion, other))
 
 
 def added(motion: Motion, other: Motion, share: Float[Array, ""]) -> Motion:
@@ -178,28 +177,50 @@ class Regularized(eqx.Module):
     @property
     def negative(self) -> Int[Array, ""]:
         """The number of negative eigenvalues under the constraints: a hold is none of these."""
-        return self.factors.negative + self.holds
+        factors = self.factors
+        if isinstance(factors, BorderedFactors):
+            return factors.inner.negative + factors.below_by_pivots + self.holds
+        return factors.negative + self.holds
 
     def solve(self, motion: Motion) -> Motion:
         rotation, multipliers = self.factors.solve(motion.rotation, jnp.pad(motion.multipliers, (0, self.holds)))
         return Motion(rotation, multipliers[: len(motion.multipliers)])
 
 
-def regularized(form: Form, here: Linearization, neutral: Motion) -> Regularized:
+def regularized(form: Form, system: AnySystem, neutral: Motion) -> Regularized:
     """The factors of a linearisation with a spring against its neutral turn, where this turns a tangent most.
 
     What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
 
     A loop that slides along its rod, or a rod that is free but for its closure, makes the part without border nearly
     singular where the whole is not, and pivots are not exchanged. So springs hold the rod at a few places that are
-    eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly.
+    eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly. A chain
+    from node to node has the forces that close it between them.
     """
     place = jnp.argmax(jnp.sum(neutral.rotation**2, axis=0))
     turn = neutral.rotation[:, place]
     squared = jnp.sum(turn**2)
     spring = SPRING * turn[:, None] * turn[None] / jnp.where(squared > 0, squared, 1.0)
-    system = form.regular(here.system)
-    b, m = here.gradient.shape
+    system = form.regular(system)
+    if isinstance(system, BorderedSystem):
+        inner, holds = _held(system.inner, place, spring)
+        columns, rows = (
+            Vectors(part.x, jnp.pad(part.y, ((0, 0), (0, holds)))) for part in (system.columns, system.rows)
+        )
+        system = dataclasses.replace(system, inner=inner, columns=columns, rows=rows)
+        return Regularized(factor(system), holds)
+    system, holds = _held(system, place, spring)
+    return Regularized(factor(system), holds)
+
+
+def _held(
+    system: SaddlePointSystem | ChainSystem, place: Int[Array, ""], spring: Float[Array, "b b"]
+) -> tuple[SaddlePointSystem | ChainSystem, int]:
+    """With a spring at one point, and the multipliers that take away what holds the rod at others: so many."""
+    diagonal = system.diagonal.at[:, :, place].add(spring)
+    if isinstance(system, ChainSystem):
+        return dataclasses.replace(system, diagonal=diagonal), 0
+    b, m = diagonal.shape[1:]
     stride = 2 ** math.ceil(math.log2(max(m - 1, 1) / PARTS)) if m > PARTS else 1
     places = np.arange(stride, m - 1, stride)
     holds = b * len(places)
@@ -209,42 +230,56 @@ def regularized(form: Form, here: Linearization, neutral: Motion) -> Regularized
     border = jnp.asarray(border.reshape(b, holds, m), system.border.dtype)
     held = jnp.sum(border, axis=1)
     identity = jnp.eye(b, dtype=held.dtype)[..., None]
-    diagonal = system.diagonal.at[:, :, place].add(spring) + SPRING_STIFFNESS * identity * held[None]
+    diagonal += SPRING_STIFFNESS * identity * held[None]
     k = len(system.compliance)
     compliance = jnp.zeros((k + holds, k + holds), held.dtype).at[:k, :k].set(system.compliance)
     compliance = compliance.at[k:, k:].set(-jnp.eye(holds, dtype=held.dtype) / SPRING_STIFFNESS)
     system = SaddlePointSystem(
         diagonal, system.lower, jnp.concatenate([system.border, border], axis=1), compliance, across=system.across
     )
-    return Regularized(factor(system), holds)
+    return system, holds
 
 
 def nearest_to_zero(
     form: Form, point: Point, here: Linearization, neutral: Motion, others: tuple[Motion, ...] = ()
 ) -> tuple[Float[Array, ""], Motion]:
     """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
-    weights = mass(form, here)
+    metric = Metric.of(form, here)
     nothing = jnp.zeros_like(here.closure)
-    factors = regularized(form, here, neutral)
+    factors = regularized(form, here.system, neutral)
 
     def unit(motion: Motion) -> Motion:
         for other in (neutral, *others):
-            motion = less(motion, other, weights)
-        size = jnp.sqrt(inner(weights, motion, motion))
+            motion = less(motion, other, metric)
+        size = jnp.sqrt(metric.inner(motion, motion))
         return jax.tree.map(lambda x: x / size, motion)
 
     def closer(_, motion: Motion) -> Motion:
-        return unit(factors.solve(Motion(weights[None] * motion.rotation, nothing)))
+        return unit(factors.solve(metric.times(motion)))
 
     first = unit(Motion(components(here.bases, generic_field(point.tangents)), nothing))
     motion = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
     return times(motion, Motion(*here.system.times(motion.rotation, motion.multipliers))), motion
 
 
+def left_of(
+    form: Form, point: Point, here: Linearization, neutral: Motion, motion: Motion, others: tuple[Motion, ...] = ()
+) -> Motion:
+    """The left eigenvector to the eigenvalue nearest to zero, whose motion is given: the same where the system has
+    symmetry, else on its side.
+    """
+    if not form.arclengths:
+        return motion
+    there = eqx.tree_at(lambda here: here.system, here, transposed(here.system))
+    left = nearest_to_zero(form, point, there, neutral, others)[1]
+    sign = jnp.sign(Metric.of(form, here).inner(left, motion))
+    return jax.tree.map(lambda x: sign * x, left)
+
+
 def neutral_motion(form: Form, point: Point, here: Linearization) -> Motion:
     """The turn of the whole rod that leaves it in equilibrium, of length 1, or no motion."""
-    turn, weights = neutral_turn(form, point, here), mass(form, here)
-    squared = inner(weights, turn, turn)
+    turn = neutral_turn(form, point, here)
+    squared = Metric.of(form, here).inner(turn, turn)
     return jax.tree.map(lambda x: x / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), turn)
 
 
@@ -280,23 +315,27 @@ def stepped(
     far = jax.tree.map(lambda x: distance * x, along)
     first = jnp.where(is_given, target, parameter + far.rate)
     form, begin = problem.at(parameter, problem.point)
+    reach = form.longest_step(begin, form.others(far.motion.multipliers))
     normal = short_sum(form.bases_at(begin) * along.motion.rotation[None], axis=1)
     _, predicted = problem.at(first, problem.point, far.motion)
 
     def corrected(state: _Correction) -> _Correction:
         form, point, here, change = problem.linearized(state.parameter, state.point)
-        weights = mass(form, here)
+        metric = Metric.of(form, here)
         neutral = neutral_motion(form, point, here)
-        factors = regularized(form, here, neutral)
-        back = less(factors.solve(Motion(-here.gradient, -here.closure)), neutral, weights)
-        follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, weights)
-        across = Motion(components(here.bases, normal), here.closure)
-        squared = jnp.where(is_given, 1.0, inner(weights, across, follows) + along.rate / problem.scale**2)
-        share = jnp.where(is_given, 0.0, -inner(weights, across, back)) / squared
+        factors = regularized(form, here.system, neutral)
+        back = less(factors.solve(Motion(-here.gradient, -here.closure)), neutral, metric)
+        follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, metric)
+        across = Motion(components(here.bases, normal), along.motion.multipliers)
+        squared = jnp.where(is_given, 1.0, metric.inner(across, follows) + along.rate / problem.scale**2)
+        share = jnp.where(is_given, 0.0, -metric.inner(across, back)) / squared
         motion = added(back, follows, share)
         part = jnp.minimum(1.0, MAX_ROTATION / jnp.max(jnp.abs(motion.rotation)))
+        longest = form.longest_step(point, form.others(motion.multipliers))
+        part = part if longest is None else jnp.minimum(part, longest)
         force_change = form.layout.forces(form.closure(part * motion.multipliers))
-        moved = form.moved(point, here.bases, part * motion.rotation, force_change)
+        others = form.others(part * motion.multipliers)
+        moved = form.moved(point, here.bases, part * motion.rotation, force_change, others)
         least = jnp.maximum(TOLERANCE, STAGNATION * form.rounding_floor(point))
         is_there = (here.residual <= least) & form.is_closed(here.closure, 0.0)
         return _Correction(
@@ -319,26 +358,34 @@ def stepped(
     )
     here, change = nothing
     count = jnp.zeros((), int)
-    state = _Correction(first, predicted, here, change, change, count, jnp.array(False), count)
+    # A step that takes a clip beyond its neighbours is none.
+    begins = count if reach is None else jnp.where(reach < 1, MAX_ITERATIONS, count)
+    state = _Correction(first, predicted, here, change, change, count, jnp.array(False), begins)
     state = jax.lax.while_loop(is_running, corrected, state)
 
     here, point, change = state.here, state.point, state.change
     form, point = problem.at(state.parameter, point)
-    weights = mass(form, here)
+    metric = Metric.of(form, here)
     # The tangent, on in the direction in which the step went.
-    before = Motion(components(here.bases, normal), here.closure)
-    size = jnp.sqrt(inner(weights, state.follows, state.follows) + 1 / problem.scale**2)
-    cosine = (inner(weights, before, state.follows) + along.rate / problem.scale**2) / size
+    before = Motion(components(here.bases, normal), along.motion.multipliers)
+    size = jnp.sqrt(metric.inner(state.follows, state.follows) + 1 / problem.scale**2)
+    cosine = (metric.inner(before, state.follows) + along.rate / problem.scale**2) / size
     sign = jnp.where(cosine < 0, -1.0, 1.0).astype(size.dtype) / size
     tangent = BranchTangent(jax.tree.map(lambda x: sign * x, state.follows), sign)
-    stiffness, motion = nearest_to_zero(form, point, here, neutral_motion(form, point, here))
+    neutral = neutral_motion(form, point, here)
+    stiffness, motion = nearest_to_zero(form, point, here, neutral)
+    left = left_of(form, point, here, neutral, motion)
 
     scene = scene_at(scenes, segment, state.parameter)
     units = nondimensional(scene)[1]
     status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
     outcome = Outcome(here.residual, state.iterations, state.iterations, status.astype(int))
+    places = None
+    if isinstance(form, SlidingForm):
+        assert isinstance(point, SlidingPoint)
+        form, point, places = form.at(point.places), point.inner, point.places
     shape = result.state.shape.reached(form, point)
-    found = Found(SolverState(shape, point.end_force, units), point, outcome, state.index == 0)
+    found = Found(SolverState(shape, point.end_force, units, places), point, outcome, state.index == 0)
     return Station(
         parameter=state.parameter,
         equilibrium=build_result(scene, found, jnp.ones((), int)),
@@ -347,14 +394,49 @@ def stepped(
         index=state.index,
         stiffness=stiffness,
         motion=motion,
-        slope=work(motion, change, weights),
+        slope=work(left, change, metric),
     )
 
 
-def work(motion: Motion, change: Motion, mass: Float[Array, "m"]) -> Float[Array, ""]:
+@compiled
+def is_misplaced(result: Equilibrium, made: Equilibrium) -> Bool[Array, ""]:
+    """Whether a rod has slid so far that its mesh, that of `made` stretched, is to be made anew."""
+    scaled, _ = nondimensional(result.scene)
+    assert made.state.places is not None
+    form = SlidingForm.of(slid(scaled, made.state.places), made.state.shape)
+    point = free_form_and_point(result)[1]
+    is_blocked = form.is_blocked(point)
+    is_off = form.is_misplaced(point)
+    return is_off if is_blocked is None else is_off | is_blocked
+
+
+@compiled
+def on_new_mesh(result: Equilibrium, along: BranchTangent, mesh: Shape) -> tuple[Equilibrium, BranchTangent]:
+    """An equilibrium of a rod that slides on a mesh like that of a shape, to begin with, and the tangent of its branch.
+
+    Of the tangent's multipliers those for the arclengths alone are of use there.
+    """
+    form, point = free_form_and_point(result)
+    normal = short_sum(form.bases_at(point) * along.motion.rotation[None], axis=1)
+    shape = on_mesh_of(nondimensional(result.scene)[0], result.state.shape, mesh)
+    anew = eqx.tree_at(lambda result: result.state.shape, result, shape)
+    there, begin = free_form_and_point(anew)
+    before, after = _points(form), _points(there)
+    normal = jax.vmap(lambda component: jnp.interp(after, before, component))(normal)
+    motion = Motion(components(there.bases_at(begin), normal), along.motion.multipliers)
+    return anew, BranchTangent(motion, along.rate)
+
+
+def _points(form: Form) -> Float[Array, "m"]:
+    """Arclengths of the tangents or frames."""
+    field = form.field
+    return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.places
+
+
+def work(motion: Motion, change: Motion, metric: Metric) -> Float[Array, ""]:
     """What a change of the residual does in a motion of length 1, as a part of the most that one of its size could."""
-    is_free = mass > 0
-    forces = jnp.where(is_free, 1 / jnp.where(is_free, mass, 1.0), 0.0)[None] * change.rotation**2
+    is_free = metric.mass > 0
+    forces = jnp.where(is_free, 1 / jnp.where(is_free, metric.mass, 1.0), 0.0)[None] * change.rotation**2
     gaps, pulls = (jnp.sqrt(jnp.sum(x**2)) for x in (change.multipliers, motion.multipliers))
     most = jnp.sqrt(jnp.sum(forces)) + gaps * (1 + pulls)
     return times(motion, change) / jnp.where(most > 0, most, 1.0)
@@ -363,5 +445,5 @@ def work(motion: Motion, change: Motion, mass: Float[Array, "m"]) -> Float[Array
 @compiled
 def mode_at(result: Equilibrium, stiffness: Float[Array, ""], motion: Motion) -> Mode:
     """A motion of an equilibrium in SI units."""
-    form, point = form_and_point(result)
-    return mode_of(form, point, form.linearized(point), stiffness, motion, nondimensional(result.scene)[1])
+    form, point = free_form_and_point(result)
+    return mode_of(form, point, form.linearized(point), stiffness, motion, result)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.checks import instance, is_known, number_array, positive, whole_number
-from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.scene import Scene, has_potential
 from rodjax.paths.branch import BranchTangent, mode_at, scene_at
 from rodjax.paths.critical import differentiable_parameter
 from rodjax.paths.modes import Mode
@@ -92,7 +92,8 @@ def follow(
     """One branch of equilibria through a sequence of scenes, stable or not, and through folds: pseudo-arclength.
 
     A scene may be passed several times, as the branch turns back at folds. It ends where it reaches the first or the
-    last scene.
+    last scene. Of sliding clips the arclengths are unknowns, and the mesh goes along with them; a branch also ends,
+    in ever shorter steps, where the rod slips out of one.
 
     **Arguments:**
 
@@ -108,8 +109,8 @@ def follow(
     - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
         notebook.
 
-    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential.
-    Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).
+    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential,
+    obstacles and `self_contact`. Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).
     """
     stacked = _checked(scenes, "follow")
     steps = _checked_steps(step, max_step, max_points)
@@ -295,14 +296,10 @@ def _checked(scenes: Any, name: str) -> Scene:
             "scenes must have a potential: dead moments on a free end, couples along the rod and follower loads "
             "have none"
         )
-    if slides(stacked):
-        raise ValueError(f"{name} needs scenes without sliding clips")
     if stacked.obstacles:
         raise ValueError(f"{name} needs scenes without obstacles")
     if stacked.self_contact:
         raise ValueError(f"{name} needs scenes without self_contact")
-    if stacked.potentials:
-        raise ValueError(f"{name} needs scenes without potentials")
     return stacked
 
 

@@ -14,22 +14,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.form import Linearization
-from rodjax.discretization.motion import Motion
+from rodjax.discretization.motion import Metric, Motion
+from rodjax.linalg.saddle_point import AnySystem, transposed
 from rodjax.model.scene import Scene
 from rodjax.paths.branch import (
     Problem,
     Regularized,
     added,
+    left_of,
     less,
-    mass,
     nearest_to_zero,
     neutral_motion,
     regularized,
     times,
 )
 from rodjax.programs.compilation import compiled
-from rodjax.solving.result import Equilibrium, form_and_point
+from rodjax.solving.result import Equilibrium, free_form_and_point
 
 # A second motion with less stiffness than this [EI/L^2] is critical too, as in a rod that buckles in all directions.
 DOUBLE = 1e-5
@@ -68,55 +68,62 @@ def _(primals, tangents):
 @functools.partial(compiled, static_argnames=("is_fold",))
 def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, is_fold: bool) -> Scene:
     """The derivative of the parameter by the scenes."""
-    form, point = form_and_point(result)
+    form, point = free_form_and_point(result)
     here = form.linearized(point)
-    weights = mass(form, here)
     neutral = neutral_motion(form, point, here)
     _, critical = nearest_to_zero(form, point, here, neutral)
+    left = left_of(form, point, here, neutral, critical)
     segment = jnp.clip(jnp.floor(parameter), 0, scenes.rod.length.shape[0] - 2).astype(int)
 
-    def linearized(scenes: Scene, parameter: Float[Array, ""], motion: Motion | None = None) -> Linearization:
+    nothing = jax.tree.map(jnp.zeros_like, critical)
+
+    def residual(scenes: Scene, parameter: Float[Array, ""], motion: Motion) -> tuple[Motion, Float[Array, ""]]:
+        """Of a moved point, and its critical eigenvalue."""
         form, there = Problem(scenes, segment, result).at(parameter, point, motion)
-        return form.linearized(there)
+        here = form.linearized(there)
+        rate = Motion(*here.system.times(critical.rotation, critical.multipliers))
+        return Motion(here.gradient, here.closure), times(left, rate)
 
-    def eigenvalue(there: Linearization) -> Float[Array, ""]:
-        return times(critical, Motion(*there.system.times(critical.rotation, critical.multipliers)))
-
+    (_, none), derivatives = jax.vjp(residual, scenes, parameter, nothing)
     if is_fold:
-        weight = critical
-    else:
-        stiffness, second = nearest_to_zero(form, point, here, neutral, (critical,))
-        second = jax.tree.map(lambda x: jnp.where(jnp.abs(stiffness) < DOUBLE, x, 0.0), second)
-        nothing = jax.tree.map(jnp.zeros_like, critical)
-        by_motion = jax.grad(lambda motion: eigenvalue(linearized(scenes, parameter, motion)))(nothing)
-        followed = _solved(regularized(form, here, neutral), here, by_motion, weights, (critical, second, neutral))
-        weight = jax.tree.map(jnp.negative, followed)
-
-    def stays_zero(scenes: Scene, parameter: Float[Array, ""]) -> Float[Array, ""]:
-        there = linearized(scenes, parameter)
-        work = times(weight, Motion(there.gradient, there.closure))
-        return work if is_fold else work + eigenvalue(there)
-
-    by_scenes, by_parameter = jax.grad(stays_zero, argnums=(0, 1))(scenes, parameter)
+        by_scenes, by_parameter, _ = derivatives((left, jnp.zeros_like(none)))
+        return jax.tree.map(lambda by: -by / by_parameter, by_scenes)
+    stiffness, second = nearest_to_zero(form, point, here, neutral, (critical,))
+    other = left_of(form, point, here, neutral, second, (left,))
+    is_double = jnp.abs(stiffness) < DOUBLE
+    second, other = jax.tree.map(lambda x: jnp.where(is_double, x, 0.0), (second, other))
+    *of_eigenvalue, by_motion = derivatives((nothing, jnp.ones_like(none)))
+    system = transposed(here.system)
+    on_right, on_left = (critical, second, neutral), (left, other, neutral)
+    followed = _solved(regularized(form, system, neutral), system, by_motion, Metric.of(form, here), on_right, on_left)
+    # What stays zero: the eigenvalue less the work of the residual in this motion.
+    *of_work, _ = derivatives((followed, jnp.zeros_like(none)))
+    by_scenes, by_parameter = jax.tree.map(jnp.subtract, of_eigenvalue, of_work)
     return jax.tree.map(lambda by: -by / by_parameter, by_scenes)
 
 
 def _solved(
-    factors: Regularized, here: Linearization, right: Motion, mass: Float[Array, "m"], without: tuple[Motion, ...]
+    factors: Regularized,
+    system: AnySystem,
+    right: Motion,
+    metric: Metric,
+    left_without: tuple[Motion, ...],
+    without: tuple[Motion, ...],
 ) -> Motion:
-    """The solution of the linearised system at right angles to motions that have no stiffness, of length 1 or none."""
+    """The solution of a linearised system at right angles to its null vectors, for a right side without what does work
+    in its left ones, of length 1 or none.
+    """
 
     def step(right: Motion) -> Motion:
-        for motion in without:
-            share = times(motion, right)
-            right = Motion(right.rotation - share * mass[None] * motion.rotation, right.multipliers)
+        for motion in left_without:
+            right = added(right, metric.times(motion), -times(motion, right))
         found = factors.solve(right)
         for motion in without:
-            found = less(found, motion, mass)
+            found = less(found, motion, metric)
         return found
 
-    one = jnp.ones((), mass.dtype)
+    one = jnp.ones((), metric.mass.dtype)
     found = step(right)
     # What the shift, by which the system is regular, has changed.
-    left = added(right, Motion(*here.system.times(found.rotation, found.multipliers)), -one)
+    left = added(right, Motion(*system.times(found.rotation, found.multipliers)), -one)
     return added(found, step(left), one)

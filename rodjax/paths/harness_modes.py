@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import Form, Linearization
 from rodjax.discretization.joints import generic_field
+from rodjax.discretization.motion import Metric
 from rodjax.discretization.nodal import NodalForm
 from rodjax.geometry.vectors import components
 from rodjax.linalg.chain import ChainSystem
@@ -22,7 +23,7 @@ from rodjax.solving.coupling import ENDS, Coupling, RodInBodies, coupling, end_c
 from rodjax.solving.harness import ends_of, split_pressures
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import form_and_point
-from rodjax.solving.stability import INVERSE_ITERATIONS, below_lowest, inertia
+from rodjax.solving.stability import INVERSE_ITERATIONS, below_lowest
 
 
 class HarnessMode(eqx.Module):
@@ -68,7 +69,7 @@ def _of_rod(rod: RodInBodies, point: object, pressures: Float[Array, "o 2"] | No
         stiff = jnp.einsum("oei,oej->eij", rates, rates) / form.softness
         couple = couple._replace(second=couple.second + jax.scipy.linalg.block_diag(*stiff))
         couple = couple._replace(of_closure=_with_gaps(here, couple))
-    return here, couple, inertia(form, here) / rod.units.force, of_ends.reshape(12, 12) / rod.units.force
+    return here, couple, Metric.of(form, here).mass / rod.units.force, of_ends.reshape(12, 12) / rod.units.force
 
 
 def _with_gaps(here: Linearization, couple: Coupling) -> Float[Array, "k 12"]:

@@ -14,17 +14,17 @@ from rodjax.discretization.framed_curve import FramedCurve, cells_of
 from rodjax.discretization.framed_results import framed_on_elements
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.nodal_forms import NodalFrames
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
-from rodjax.model.scene import nondimensional, slides
+from rodjax.model.scene import nondimensional
 from rodjax.paths.harness_modes import HarnessMode, harness_mode
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import Equilibrium, form_and_point, over_leading_axes
+from rodjax.solving.result import Equilibrium, free_form_and_point, over_leading_axes, slopes
 from rodjax.solving.stability import softest
 from rodjax.solving.status import Status
-from rodjax.units import Units
 
 
 class Mode(eqx.Module):
@@ -32,8 +32,9 @@ class Mode(eqx.Module):
 
     - `stiffness` [...] N: the second variation of the energy in this motion, by the integral along the rod of the
       squared change of the tangent. Negative where the energy falls, zero for a neutral motion. A straight strut
-      loses as much of it as it is pressed. Derivatives by the scene are exact, of two motions equally soft those of one
-    - `displacement` [..., n+1, 3] of the nodes, the largest 1; taken as fixed by derivatives
+      loses as much of it as it is pressed. A rod that slides by its length through a clip counts as one that turns by
+      1 rad. Derivatives by the scene are exact, of two motions equally soft those of one
+    - `displacement` [..., n+1, 3] of the places of the rod at the nodes, the largest 1; taken as fixed by derivatives
     """
 
     stiffness: Float[Array, "..."]
@@ -46,10 +47,12 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
 
     Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
     where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n). Of a harness
-    a `HarnessMode`, of all rods and joints together, without derivatives.
+    a `HarnessMode`, of all rods and joints together, without derivatives. A rod slides through its sliding clips in the
+    motion; where one holds its direction, sliding has no energy of its own, and the eigenvalue is that of the
+    linearised equilibrium.
 
-    Raises `TypeError` for anything but an equilibrium, `ValueError` for one of the continuum, of a rod that slides
-    through clips or under loads without a potential, and for several of a harness.
+    Raises `TypeError` for anything but an equilibrium, `ValueError` for one of the continuum or under loads without a
+    potential, and for several of a harness.
     """
     instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     if isinstance(equilibrium, HarnessEquilibrium):
@@ -60,8 +63,6 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
         return harness_mode(jax.lax.stop_gradient(equilibrium))
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
-    if slides(equilibrium.scene):
-        raise ValueError("equilibrium must be of a scene without sliding clips")
     return _lowest_mode(equilibrium)
 
 
@@ -128,14 +129,14 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
 
 @over_leading_axes
 def _lowest_mode(equilibrium: Equilibrium) -> Mode:
-    form, point = form_and_point(equilibrium)
+    form, point = free_form_and_point(equilibrium)
     if not form.has_potential:
         raise ValueError(
             "equilibrium must have a potential: dead moments on a free end, couples along the rod and follower loads "
             "have none"
         )
     here = form.linearized(point)
-    mode = mode_of(form, point, here, *softest(form, point, here), nondimensional(equilibrium.scene)[1])
+    mode = mode_of(form, point, here, *softest(form, point, here), equilibrium)
     return eqx.tree_at(lambda mode: mode.displacement, mode, replace_fn=jax.lax.stop_gradient)
 
 
@@ -145,14 +146,24 @@ def mode_of(
     here: Linearization,
     stiffness: Float[Array, ""],
     motion: Motion,
-    units: Units,
+    equilibrium: Equilibrium,
 ) -> Mode:
     """A motion of an equilibrium and its nondimensional stiffness, as a `Mode`."""
     force_change = form.layout.forces(form.closure(motion.multipliers))
 
-    def nodes(amount: Float[Array, ""]) -> Float[Array, "n+1 3"]:
-        return form.nodes(form.edges(form.moved(point, here.bases, amount * motion.rotation, amount * force_change)))
+    def moved(amount: Float[Array, ""]) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"] | None]:
+        if not isinstance(form, SlidingForm):
+            there = form.moved(point, here.bases, amount * motion.rotation, amount * force_change)
+            return form.nodes(form.edges(there)), None
+        assert isinstance(point, SlidingPoint)
+        others = form.others(amount * motion.multipliers)
+        there = form.moved(point, here.bases, amount * motion.rotation, amount * force_change, others)
+        at_places = form.at(there.places)
+        return at_places.nodes(at_places.edges(there.inner)), at_places.field.s
 
-    _, displacement = jax.jvp(nodes, (jnp.zeros_like(stiffness),), (jnp.ones_like(stiffness),))
+    _, (displacement, along) = jax.jvp(moved, (jnp.zeros_like(stiffness),), (jnp.ones_like(stiffness),))
+    if along is not None:
+        # Nodes go along the rod with the clips.
+        displacement -= along[:, None] * slopes(equilibrium)
     largest = jnp.sqrt(jnp.max(jnp.sum(displacement**2, axis=1)))
-    return Mode(stiffness * units.force, displacement / largest)
+    return Mode(stiffness * nondimensional(equilibrium.scene)[1].force, displacement / largest)

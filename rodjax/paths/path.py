@@ -18,7 +18,7 @@ from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional, slides
+from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional
 from rodjax.notes import note
 from rodjax.paths.harness_path import harness_path
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
@@ -151,14 +151,10 @@ def _check_stop(scenes: Scene) -> None:
         raise ValueError(
             "at_critical must be 'jump' for dead moments, couples and follower loads, which have no potential"
         )
-    if slides(scenes):
-        raise ValueError("at_critical must be 'jump' for scenes with sliding clips")
     if scenes.obstacles:
         raise ValueError("at_critical must be 'jump' for scenes with obstacles")
     if scenes.self_contact:
         raise ValueError("at_critical must be 'jump' for scenes with self_contact")
-    if scenes.potentials:
-        raise ValueError("at_critical must be 'jump' for scenes with potentials")
 
 
 def _before_critical(scenes: Scene, path: Equilibrium) -> int:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.form import NEUTRAL
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, slides
 from rodjax.notes import note
-from rodjax.paths.branch import BranchTangent, Station, no_motion, stepped
+from rodjax.paths.branch import BranchTangent, Station, is_misplaced, no_motion, on_new_mesh, stepped
 from rodjax.solving.result import Equilibrium
 
 # A step that turns the tangent of the branch by more than 26 degrees is halved, and one of 14 is not made longer.
@@ -113,6 +113,7 @@ def trace(
     last = scenes.rod.length.shape[0] - 1
     segment, station = begun(scenes, start, first, direction)
     stations, crossings = [station], []
+    mesh = made = station.equilibrium
     if not station.equilibrium.converged:
         return Trace(stations, crossings, BranchEnd.NOT_CONVERGED)
     if float(station.parameter) == (last if direction > 0 else 0):
@@ -132,6 +133,8 @@ def trace(
         if only_first and found:
             return Trace(stations, crossings, BranchEnd.FIRST_CRITICAL)
         station = step.there
+        if slides(scenes):
+            station, made = _on_its_mesh(Line(scenes, segment, station), step.bound, made, mesh)
         stations.append(station)
         if step.bound is not None:
             rising = step.bound > segment
@@ -140,6 +143,19 @@ def trace(
             segment, station = begun(scenes, step.bound, station.equilibrium, 1.0 if rising else -1.0)
         distance = min(distance * step.growth, steps.longest)
     return Trace(stations, crossings, BranchEnd.MAX_POINTS)
+
+
+def _on_its_mesh(line: Line, bound: int | None, made: Equilibrium, mesh: Equilibrium) -> tuple[Station, Equilibrium]:
+    """The station on a mesh that fits where the rod has slid to, and the equilibrium for which that was made; `made`:
+    for which the mesh was; `mesh`: of the first equilibrium, as which meshes are made.
+    """
+    station = line.station
+    if not is_misplaced(station.equilibrium, made):
+        return station, made
+    result, along = on_new_mesh(station.equilibrium, station.along, mesh.state.shape)
+    target = math.nan if bound is None else bound
+    there = towards(line.scenes, line.segment, station.parameter, result, along, 0.0, target)
+    return (there, there.equilibrium) if _is_good(there) else (station, made)
 
 
 class _Step(NamedTuple):

@@ -11,7 +11,7 @@ from rodjax.analysis.curvature import curvature_along, most_curved
 from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.model.along import Along
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import has_potential, slides
+from rodjax.model.scene import has_potential
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
@@ -222,7 +222,6 @@ def _finite(value: float, unit: str, s: float) -> tuple[float | None, str, float
 def _stiffness(equilibrium: Equilibrium) -> Fact:
     name = "lowest eigenvalue"
     reasons = {
-        "not of a rod that slides through clips": slides(equilibrium.scene),
         "not under loads without a potential": not has_potential(equilibrium.scene),
         "not of the continuum": equilibrium.discretization == "continuum",
         "not of what is no equilibrium": not bool(equilibrium.converged),

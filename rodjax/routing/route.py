@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, positive, whole_number
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import Scene, check_without_friction, slides
+from rodjax.model.scene import Scene, check_without_friction
 from rodjax.paths.batch import solve_stack
 from rodjax.programs.answers import one_answer
 from rodjax.programs.tasks import Workers, checked_executor, checked_threads, in_order, rows_of
@@ -252,8 +252,6 @@ def _problem(
     instance(solver, "solver", Newton)
     segments = SEGMENTS if segments is None else segments
     checked_options(scene, segments, None, "hermite", solver, None, False)
-    if limits is not None and limits.stability is not None and slides(scene):
-        raise ValueError("limits.stability must be None for a scene with sliding clips")
     return Problem(scene, variables, limits, obstacles, objective, segments, solver), names
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.checks import Numbers
 from rodjax.identification.unknowns import nominal, with_values
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Free
 from rodjax.notes import bar
 from rodjax.paths.batch import LANES, chunk_size, solve_stack
@@ -131,7 +131,7 @@ def _solved_part(
 @compiled
 def _slopes(scattering: Scattering) -> Slopes:
     result = scattering.equilibrium
-    is_examined = has_potential(result.scene) and not slides(result.scene)
+    is_examined = has_potential(result.scene)
 
     def found(z: Float[Array, "p"]) -> tuple[Quantities, Float[Array, ""]]:
         near = differentiable(scattering.scene(z), result)

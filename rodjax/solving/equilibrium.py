@@ -810,7 +810,7 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
         state = last.found.state
         assert state.places is not None
         here = slid(scene, state.places)
-        anew = _on_mesh_of(here, state.shape, guess.shape)
+        anew = on_mesh_of(here, state.shape, guess.shape)
         shape = jax.tree.map(lambda old, new: jnp.where(last.count == 0, old, new), state.shape, anew)
         state = dataclasses.replace(state, shape=shape)
         found, goes_on = _slid_once(here, state, FirstTwist(last.found.point.total_twist), options)
@@ -858,7 +858,7 @@ def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Opt
     return found, goes_on if is_blocked is None else goes_on | is_blocked
 
 
-def _on_mesh_of(scene: Scene, shape: Shape, other: Shape) -> Shape:
+def on_mesh_of(scene: Scene, shape: Shape, other: Shape) -> Shape:
     """A shape on the mesh of another one, as a scene has it."""
     if isinstance(shape, Curve) and isinstance(other, Curve):
         return shape.on(form_of(scene, shape.on(other.s)).field.s)

@@ -241,8 +241,8 @@ class Equilibrium(eqx.Module):
     def tangents(self) -> Float[Array, "... n+1 3"]:
         if self.shear_strain is None:
             return self.frames[..., 2]
-        slopes = _slopes(self)
-        return slopes / jnp.sqrt(jnp.sum(slopes**2, axis=-1, keepdims=True))
+        along = slopes(self)
+        return along / jnp.sqrt(jnp.sum(along**2, axis=-1, keepdims=True))
 
     def __str__(self) -> str:
         """How the solve ended, and the largest and last values along the rod with their units."""
@@ -501,9 +501,7 @@ def _examination(equilibrium: Equilibrium) -> _Examination:
     nothing = _Examination(jnp.array(False), jnp.full((), -1), jnp.array(False))
     if equilibrium.discretization == "continuum":
         return nothing
-    form, point = form_and_point(equilibrium)
-    if slides(equilibrium.scene):
-        form, point = sliding_at(form.scene, equilibrium.state.shape, point)
+    form, point = free_form_and_point(equilibrium)
     here = form.linearized(point)
     _, critical, neutral = examined(form, point, here, equilibrium.residual)
     if not form.has_potential:
@@ -585,11 +583,12 @@ def _self_contacts_of(equilibrium: Equilibrium) -> SelfContacts:
 
 
 @compiled
-def _slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
-    """phi' of a rod with shear."""
+def slopes(equilibrium: Equilibrium) -> Float[Array, "... n+1 3"]:
+    """phi' at the nodes."""
     frames, shear = equilibrium.frames, equilibrium.shear_strain
-    assert shear is not None
     along = 1 + equilibrium.axial_strain[..., None]
+    if shear is None:
+        return along * frames[..., 2]
     return jnp.sum(frames * jnp.concatenate([shear, along], axis=-1)[..., None, :], axis=-1)
 
 
@@ -635,6 +634,12 @@ def form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
     state = equilibrium.state
     form, point = form_of(scaled, state.shape), state.point(equilibrium.total_twist)
     return form, form.begun(point, state.shape.nodes, state.pressures, state.friction)
+
+
+def free_form_and_point(equilibrium: Equilibrium) -> tuple[Form, Any]:
+    """The same with the arclengths of sliding clips among the unknowns."""
+    form, point = form_and_point(equilibrium)
+    return sliding_at(form.scene, equilibrium.state.shape, point) if slides(equilibrium.scene) else (form, point)
 
 
 def describe(equilibrium: Equilibrium | Described) -> str:

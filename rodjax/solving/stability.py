@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.joints import generic_field
-from rodjax.discretization.motion import Motion, Neutral, neutral_motions
+from rodjax.discretization.motion import Metric, Motion, Neutral, neutral_motions
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.vectors import components
-from rodjax.linalg.saddle_point import AnyFactors, factor, factor_and_solve
+from rodjax.linalg.saddle_point import AnyFactors, AnySystem, factor, factor_and_solve, transposed
 from rodjax.model.scene import Scene, slid
 
 # Shift of the Hessian, in roundings of its largest entries, by which neutral turns leave it regular.
@@ -35,14 +35,23 @@ HALVINGS = 16
 INVERSE_ITERATIONS = 4
 
 
-def carried_to(scene: Scene, shape: Shape, point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
+def carried_to(
+    scene: Scene,
+    shape: Shape,
+    point: Point,
+    motion: Motion | None = None,
+    made_at: Float[Array, "slides"] | None = None,
+) -> tuple[Form, Point]:
     """The form of a nondimensional scene on the mesh of a shape, and a point under it, moved.
 
     The tangents that supports hold and the total twist are those of the scene; `motion` is by the bases at the point so
-    carried there. Of a `SlidingPoint` the arclengths are its own, and no change of the scene's.
+    carried there. Of a `SlidingPoint` the arclengths are its own, and no change of the scene's; `made_at`: those to
+    which the mesh of the shape belongs, if not the same.
     """
-    is_sliding = isinstance(point, SlidingPoint)
-    form: Any = SlidingForm.of(slid(scene, point.places), shape) if is_sliding else form_of(scene, shape)
+    if isinstance(point, SlidingPoint):
+        form: Any = SlidingForm.of(slid(scene, point.places if made_at is None else made_at), shape)
+    else:
+        form = form_of(scene, shape)
     begin = form.holding(point)
     if motion is None:
         return form, begin
@@ -105,41 +114,48 @@ def softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array,
     """The lowest eigenvalue [EI/L^2] of the Hessian under the constraints, by the length of rod, and its motion.
 
     The derivative of the eigenvalue is that of Rayleigh's quotient of its motion, which is stationary at it; of two
-    equal eigenvalues that of one motion. The motion has none.
+    equal eigenvalues that of one motion; of a system without symmetry, that of the quotient with its left eigenvector.
+    The motion has none.
     """
-    stiffness, motion = _softest(*jax.lax.stop_gradient((form, point, here)))
+    stiffness, motion, left = _softest(*jax.lax.stop_gradient((form, point, here)))
     moments, gaps = here.system.times(motion.rotation, motion.multipliers)
-    work = jnp.sum(motion.rotation * moments) + jnp.sum(motion.multipliers * gaps)
-    quotient = work / jnp.sum(inertia(form, here)[None] * motion.rotation**2)
+    work = jnp.sum(left.rotation * moments) + jnp.sum(left.multipliers * gaps)
+    quotient = work / Metric.of(form, here).inner(left, motion)
     return stiffness + quotient - jax.lax.stop_gradient(quotient), motion
 
 
-def inertia(form: Form, here: Linearization) -> Float[Array, "m"]:
-    """By the length of rod; none where a support holds the tangent."""
-    return form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
+def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion, Motion]:
+    """The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion, and
+    the left eigenvector, the same where the system is symmetric.
+    """
+    metric = Metric.of(form, here)
 
-
-def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array, ""], Motion]:
-    """The number of negative eigenvalues under a shift brackets it; inverse iteration from below finds the motion."""
-    mass = inertia(form, here)
+    def shifted(system: AnySystem, value: Float[Array, ""]) -> AnySystem:
+        return system.shifted(-value * metric.mass)
 
     def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
-        return factor(here.system.shifted(-value * mass)).negative > 0
+        return factor(shifted(here.system, value)).negative > 0
 
-    low = below_lowest(lies_below, jnp.ones((), mass.dtype))
-    factors = factor(here.system.shifted(-low * mass))
+    low = below_lowest(lies_below, jnp.ones((), metric.mass.dtype))
     generic = components(here.bases, generic_field(point.tangents))
     first = Motion(generic, jnp.zeros_like(here.closure)), low
 
-    def closer(_, found: tuple[Motion, Float[Array, ""]]) -> tuple[Motion, Float[Array, ""]]:
-        motion, _ = found
-        motion = Motion(*factors.solve(mass[None] * motion.rotation, jnp.zeros_like(here.closure)))
-        size = jnp.sqrt(jnp.sum(mass[None] * motion.rotation**2))
-        share = jnp.sum(mass[None] * motion.rotation * found[0].rotation)
-        return Motion(motion.rotation / size, motion.multipliers / size), low + share / size**2
+    def nearest_to(low: Float[Array, ""], system: AnySystem) -> tuple[Motion, Float[Array, ""]]:
+        factors = factor(shifted(system, low))
 
-    motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
-    return stiffness, motion
+        def closer(_, found: tuple[Motion, Float[Array, ""]]) -> tuple[Motion, Float[Array, ""]]:
+            right = metric.times(found[0])
+            motion = Motion(*factors.solve(right.rotation, right.multipliers))
+            size = jnp.sqrt(metric.inner(motion, motion))
+            share = metric.inner(motion, found[0])
+            return Motion(motion.rotation / size, motion.multipliers / size), low + share / size**2
+
+        return jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
+
+    motion, stiffness = nearest_to(low, here.system)
+    if not form.arclengths:
+        return stiffness, motion, motion
+    return stiffness, motion, nearest_to(low, transposed(here.system))[0]
 
 
 def below_lowest(lies_below: Callable[[Float[Array, ""]], Bool[Array, ""]], unit: Float[Array, ""]) -> Float[Array, ""]:

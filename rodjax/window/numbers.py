@@ -45,7 +45,7 @@ def _stability_rows(session: Session, limits: Limits | None) -> list[Row]:
         is_stable = bool(session.result.stable)
         return [Row("stability", "stable" if is_stable else "not stable, or not known", not is_stable)]
     if session.softest is None:
-        return [] if session.can_settle else [Row("softest motion", "not known with these loads or clips")]
+        return [] if session.can_settle else [Row("softest motion", "not known with these loads")]
     stability = None if limits is None else limits.stability
     is_low = session.is_soft or (stability is not None and session.softest < float(stability))
     remark = ", about to snap" if session.is_soft else ""

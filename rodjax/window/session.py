@@ -13,7 +13,7 @@ import numpy as np
 
 from rodjax.checks import instance, whole_number
 from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, has_potential, slides
+from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Directed
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import compiled_only
@@ -242,7 +242,7 @@ class Session:
     @property
     def can_settle(self) -> bool:
         """Whether the stiffness of the softest motion can be told."""
-        return isinstance(self.scene, Scene) and has_potential(self.scene) and not slides(self.scene)
+        return isinstance(self.scene, Scene) and has_potential(self.scene)
 
     def settle(self) -> float | None:
         """The stiffness of the softest motion [N], as by `rodjax.lowest_mode`; `None` where it cannot be told."""

@@ -81,11 +81,11 @@ def rows(count: int, segments: int, discretization: Discretization, repeats: int
     tried = lanes(candidates)
     turns = np.where(np.asarray(tried.converged), np.asarray(tried.evaluations), 0)
     chosen = np.argsort(np.abs(turns - HARD_TURNS * typical))[: count // HARD_SHARE]
-    places = np.arange(len(chosen)) * HARD_SHARE + HARD_SHARE // 2
+    indices = np.arange(len(chosen)) * HARD_SHARE + HARD_SHARE // 2
 
     def replaced(all, hard):
         all = np.array(all)
-        all[places] = np.asarray(hard)[chosen]
+        all[indices] = np.asarray(hard)[chosen]
         return jnp.asarray(all)
 
     mixed = jax.tree.map(replaced, easy, candidates)

@@ -132,17 +132,21 @@ def dragged(friction: float = 0.3, segments: int = 64) -> None:
         rj.Rod(1.0, 0.01, 0.008, 100.0, 0.1, radius=RADIUS),
     )
     way, stiffness, first = 2e-4, 100.0 * friction, friction / segments / 2
-    ways = np.concatenate([np.linspace(0, way, 5), np.linspace(way, 0, 5)[1:]])
+    displacements = np.concatenate([np.linspace(0, way, 5), np.linspace(way, 0, 5)[1:]])
     scenes = [
-        rj.Scene(rod, rj.Swivel((-x, 0, 0), (1, 0, 0)), rj.Free(), (0, 0, -10.0), obstacles=[floor]) for x in ways
+        rj.Scene(rod, rj.Swivel((-x, 0, 0), (1, 0, 0)), rj.Free(), (0, 0, -10.0), obstacles=[floor])
+        for x in displacements
     ]
     path = rj.solve_path(scenes, segments=segments, guess=rj.Guess([(0, 0, 0), (1, 0, 0)]))
     pull, most = np.asarray(path.start_force)[:, 0], np.sqrt(2 * stiffness * way)
-    expected = np.sqrt(2 * stiffness * ways[:5]) - first, most - 2 * np.sqrt(stiffness * (way - ways[5:])) + first
+    expected = (
+        np.sqrt(2 * stiffness * displacements[:5]) - first,
+        most - 2 * np.sqrt(stiffness * (way - displacements[5:])) + first,
+    )
     off = np.max(np.abs(pull - np.concatenate(expected))[1:])
     states = np.asarray(path.contact_states)[:, 0]
     print(
-        f"drawn over a floor and back, {segments} elements: {np.sum(path.converged)} of {len(ways)} converged, "
+        f"drawn over a floor and back, {segments} elements: {np.sum(path.converged)} of {len(scenes)} converged, "
         f"iterations most {np.max(path.iterations)}; pull at most {off:.1e} N off, {off * segments / friction:.2f} of "
         f"what a node holds; nodes that slip {[int(np.sum(state == 2)) for state in states[1:]]}"
     )

@@ -137,15 +137,15 @@ def kernels(segments: int) -> Iterator[Kernel]:
     yield Kernel("derivatives of each joint, jax.hessian", of_each_joint, at.form, at.point)
 
     here, flat = jax.jit(linearized)(at.form, at.point), jax.jit(linearized)(planar, at.point)
-    right_side = here.gradient, here.closure
+    right_side = here.gradient, here.constraint_residual
     yield Kernel(FACTORED, solved, None, (here.system, *right_side))
-    yield Kernel("factor_and_solve, in a plane", solved, None, (flat.system, flat.gradient, flat.closure))
+    yield Kernel("factor_and_solve, in a plane", solved, None, (flat.system, flat.gradient, flat.constraint_residual))
     yield Kernel("Factors.solve", lambda factors, f: factors.solve(*f), jax.jit(factor)(here.system), right_side)
     if segments <= DENSE_UP_TO:
-        unknowns = jnp.concatenate([here.gradient.T.ravel(), here.closure])
+        unknowns = jnp.concatenate([here.gradient.T.ravel(), here.constraint_residual])
         yield Kernel("jnp.linalg.solve, dense", lambda _, f: jnp.linalg.solve(*f), None, (full(here.system), unknowns))
     step = here.bases, 1e-3 * here.gradient, jnp.zeros((3, 1))
-    yield Kernel(MOVED, lambda form, given: form.moved(*given), at.form, (at.point, *step))
+    yield Kernel(MOVED, lambda form, given: form.retract(*given), at.form, (at.point, *step))
     yield Kernel("resultants", at_nodes, at.form, at.point)
     count = jnp.zeros((), int)
     state = SolverState(at.polyline, at.point.end_force, nondimensional(at.scene)[1])

@@ -71,8 +71,8 @@ def start_shape(problem: Problem, elements: int) -> tuple[np.ndarray, np.ndarray
     fine = 100
     angle = problem.angle((np.arange(fine * elements) + 0.5) / (fine * elements))
     steps = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1) / len(angle)
-    ways = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])[::fine]
-    return clamped(problem.scenes[0].start)[0] + ways, planar_frames(problem.angle(arclengths(elements)))
+    offsets = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])[::fine]
+    return clamped(problem.scenes[0].start)[0] + offsets, planar_frames(problem.angle(arclengths(elements)))
 
 
 def planar_frames(angle: np.ndarray) -> np.ndarray:

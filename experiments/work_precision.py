@@ -143,12 +143,12 @@ def begun(scene: rodjax.Scene, polyline: Polyline, twist: Float[Array, ""]) -> t
     return FiniteDifference.begin(nondimensional(scene)[0], polyline, FirstTwist(twist))
 
 
-def moved(problem: FiniteDifference, polyline: Polyline, x: Float[Array, "3*m"]) -> Polyline:
-    return problem.moved(polyline, x.reshape(-1, 3))
+def displaced(problem: FiniteDifference, polyline: Polyline, x: Float[Array, "3*m"]) -> Polyline:
+    return problem.displaced(polyline, x.reshape(-1, 3))
 
 
 def energy(problem: FiniteDifference, polyline: Polyline, x: Float[Array, "3*m"]) -> Float[Array, ""]:
-    return problem.energies(moved(problem, polyline, x)).total
+    return problem.energies(displaced(problem, polyline, x)).total
 
 
 energy_and_gradient = jax.value_and_grad(energy, argnums=2)
@@ -160,7 +160,7 @@ def hessian_times(problem: FiniteDifference, polyline: Polyline, x: Float[Array,
 
 def reached(problem: FiniteDifference, polyline: Polyline, x: Float[Array, "3*m"]):
     """The new polyline, its total twist, and the largest component of the gradient."""
-    end = moved(problem, polyline, x)
+    end = displaced(problem, polyline, x)
     return end, problem.total_twist(end), jnp.max(jnp.abs(energy_and_gradient(problem, polyline, x)[1]))
 
 

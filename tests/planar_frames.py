@@ -33,7 +33,7 @@ def _shot(rod: PlanarRod, start: np.ndarray) -> np.ndarray:
 
 
 def solve_frame(
-    rods: Sequence[PlanarRod], loads: dict[str, tuple[float, float, float]], guess: np.ndarray, places: dict
+    rods: Sequence[PlanarRod], loads: dict[str, tuple[float, float, float]], guess: np.ndarray, poses: dict
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Poses of the joints, and states at the starts of the rods. `guess`: (nx, ny, m) of each rod at its start."""
     names = list(loads)
@@ -44,12 +44,12 @@ def solve_frame(
             return x, y, angle + support[1]
         return support
 
-    def parted(unknowns: np.ndarray) -> tuple[dict, np.ndarray]:
+    def split(unknowns: np.ndarray) -> tuple[dict, np.ndarray]:
         joints = dict(zip(names, unknowns[: 3 * len(names)].reshape(-1, 3), strict=True))
         return joints, unknowns[3 * len(names) :].reshape(-1, 3)
 
     def begins(unknowns: np.ndarray) -> list[np.ndarray]:
-        joints, forces = parted(unknowns)
+        joints, forces = split(unknowns)
         found = []
         for rod, (nx, ny, m) in zip(rods, forces, strict=True):
             x, y, angle = pose(rod.start, joints)
@@ -58,7 +58,7 @@ def solve_frame(
         return found
 
     def lacking(unknowns: np.ndarray) -> np.ndarray:
-        joints, _ = parted(unknowns)
+        joints, _ = split(unknowns)
         balance = {name: np.array(load, float) for name, load in loads.items()}
         rows = []
         for rod, begin in zip(rods, begins(unknowns), strict=True):
@@ -72,7 +72,7 @@ def solve_frame(
         return np.concatenate([rows, *[of_joint / scale for of_joint in balance.values()]])
 
     scale = max(rod.EI / rod.length**2 for rod in rods)
-    first = np.concatenate([np.ravel([places[name] for name in names]), np.ravel(guess)])
+    first = np.concatenate([np.ravel([poses[name] for name in names]), np.ravel(guess)])
     found = root(lacking, first, tol=1e-13)
     assert np.max(np.abs(lacking(found.x))) < 1e-10
-    return parted(found.x)[0], begins(found.x)
+    return split(found.x)[0], begins(found.x)

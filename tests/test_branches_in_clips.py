@@ -82,15 +82,15 @@ def critical(place, EI, tangent, segments=32, most=None):
 @pytest.mark.parametrize("tangent", [None, pytest.param(X, marks=pytest.mark.exhaustive)])
 def test_critical_loads_of_columns_and_their_derivatives(tangent):
     """By the clip's place those of the closed form, by EI the load itself."""
-    load, (by_place, by_EI) = jax.value_and_grad(critical, argnums=(0, 1))(0.6, 1.0, tangent)
+    load, (by_position, by_EI) = jax.value_and_grad(critical, argnums=(0, 1))(0.6, 1.0, tangent)
     # The mesh error of 32 elements.
     np.testing.assert_allclose(load, of_clips(0.6, tangent), rtol=1e-6)
     np.testing.assert_allclose(by_EI, load, rtol=2e-6)
     closed = (of_clips(0.6 + 1e-4, tangent) - of_clips(0.6 - 1e-4, tangent)) / 2e-4
-    np.testing.assert_allclose(by_place, closed, rtol=3e-6)
+    np.testing.assert_allclose(by_position, closed, rtol=3e-6)
     # Differences of fourth order.
     wide, narrow = ((critical(0.6 + h, 1.0, tangent) - critical(0.6 - h, 1.0, tangent)) / (2 * h) for h in (2e-3, 1e-3))
-    np.testing.assert_allclose(by_place, (4 * narrow - wide) / 3, rtol=1e-6)
+    np.testing.assert_allclose(by_position, (4 * narrow - wide) / 3, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -167,17 +167,19 @@ def jacobian(result: rj.Equilibrium) -> tuple[jax.Array, jax.Array]:
     here = form.linearized(point)
     b, m = here.gradient.shape
 
-    def unbalanced(change: jax.Array) -> jax.Array:
+    def residual_vectors(change: jax.Array) -> jax.Array:
         turned, multipliers = change[: b * m].reshape(b, m), change[b * m :]
-        force = form.layout.forces(form.closure(multipliers))
-        gradient, closure = form.unbalanced(form.moved(point, here.bases, turned, force, form.others(multipliers)))
-        return jnp.concatenate([gradient.reshape(-1), closure])
+        force = form.layout.forces(form.force_components(multipliers))
+        gradient, constraint_residual = form.residual_vectors(
+            form.retract(point, here.bases, turned, force, form.others(multipliers))
+        )
+        return jnp.concatenate([gradient.reshape(-1), constraint_residual])
 
     metric = Metric.of(form, here)
     places = jnp.full(form.arclengths, jnp.sum(metric.mass))
-    forces = jnp.zeros(len(here.closure) - form.arclengths)
+    forces = jnp.zeros(len(here.constraint_residual) - form.arclengths)
     mass = jnp.concatenate([jnp.tile(metric.mass, b), places, forces])
-    return jax.jacfwd(unbalanced)(jnp.zeros(len(mass))), mass
+    return jax.jacfwd(residual_vectors)(jnp.zeros(len(mass))), mass
 
 
 @pytest.mark.slow
@@ -360,7 +362,7 @@ def test_the_derivative_of_the_largest_load(through):
         scenes = [pressed(load, place, EI, stiffness) for load in LOADS]
         return load_of(rj.critical_point(scenes, guess=first, start=start).parameter)
 
-    load, (by_place, by_EI, by_EA) = jax.value_and_grad(fold, argnums=(0, 1, 2))(KNIFE, 1.0, EA)
+    load, (by_position, by_EI, by_EA) = jax.value_and_grad(fold, argnums=(0, 1, 2))(KNIFE, 1.0, EA)
     np.testing.assert_allclose(by_EI + EA * by_EA, load, rtol=1e-6)
     wide, narrow = ((fold(KNIFE + h) - fold(KNIFE - h)) / (2 * h) for h in (2e-4, 1e-4))
-    np.testing.assert_allclose(by_place, (4 * narrow - wide) / 3, rtol=1e-6)
+    np.testing.assert_allclose(by_position, (4 * narrow - wide) / 3, rtol=1e-6)

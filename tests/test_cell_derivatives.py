@@ -77,7 +77,7 @@ def test_the_linearization_is_that_of_the_lagrangian(rod, kind):
     nodes = jnp.array([0.0, 0.4, 0.7, 1.0]) if kind is ElementCells else jnp.linspace(0.0, 1.0, CELLS + 1)
     form = FrameForm.of(scene, kind(nodes))
     generator = np.random.default_rng(1)
-    q = np.array([1.0, 0.5, 0.3, 0.2])[:, None] + 0.2 * generator.normal(size=(4, len(form.field.places)))
+    q = np.array([1.0, 0.5, 0.3, 0.2])[:, None] + 0.2 * generator.normal(size=(4, len(form.field.arclengths)))
     point = FramePoint(jnp.asarray(q / np.linalg.norm(q, axis=0)), jnp.array([[3.0], [-5.0], [2.0]]), jnp.zeros(()))
     bases = form.bases_at(point)
     shape = bases.shape[1:]
@@ -85,20 +85,20 @@ def test_the_linearization_is_that_of_the_lagrangian(rod, kind):
     @jax.jit
     def found_and_expected(form, point):
         def at(unknowns):
-            moved = form.moved(point, bases, unknowns[:-3].reshape(shape), unknowns[-3:, None])
-            return form.linearized(moved)
+            retracted = form.retract(point, bases, unknowns[:-3].reshape(shape), unknowns[-3:, None])
+            return form.linearized(retracted)
 
         def matrix(here):
             unit = jnp.eye(shape[0] * shape[1] + 3)
             return jax.vmap(lambda x: flat(*here.system.times(x[:-3].reshape(shape), x[-3:])))(unit)
 
-        def flat(gradient, closure):
-            return jnp.concatenate([gradient.reshape(-1), closure])
+        def flat(gradient, constraint_residual):
+            return jnp.concatenate([gradient.reshape(-1), constraint_residual])
 
         nowhere = jnp.zeros(shape[0] * shape[1] + 3)
         here = form.linearized(point)
         expected = jax.grad(lambda x: at(x).energy)(nowhere), jax.jacfwd(jax.grad(lambda x: at(x).energy))(nowhere)
-        return (flat(here.gradient, here.closure), matrix(here)), expected
+        return (flat(here.gradient, here.constraint_residual), matrix(here)), expected
 
     (gradient, matrix), (slopes, second) = found_and_expected(form, point)
     # Roundings of second derivatives up to 1e3.

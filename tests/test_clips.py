@@ -290,10 +290,10 @@ def test_the_error_of_a_rod_that_slides(discretization, sizes, order):
     truth = rj.solve(scene, segments=96, solver=TIGHT)
     results = [rj.solve(scene, segments=n, discretization=discretization, solver=TIGHT) for n in sizes]
     errors = [float(np.max(np.linalg.norm(r.nodes - truth.position_at(r.s), axis=1))) for r in results]
-    places = [abs(float(r.scene.clips[1].at - truth.scene.clips[1].at)) for r in results]
+    deviations = [abs(float(r.scene.clips[1].at - truth.scene.clips[1].at)) for r in results]
     # 16 elements are few for a rod that is thick and bent in three spans.
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.7)
-    assert np.log2(places[0] / places[1]) == pytest.approx(order, abs=0.7)
+    assert np.log2(deviations[0] / deviations[1]) == pytest.approx(order, abs=0.7)
     np.testing.assert_allclose([float(r.error_estimate) for r in results], errors, rtol=0.15)
 
 
@@ -325,8 +325,8 @@ def test_derivatives_by_place_position_and_direction(discretization, end, slidin
             clips.append(Clip(at, clip.position + change[1:4] / 10, tangent, clip.sliding))
         moved = Scene(scene.rod, scene.start, scene.end, scene.gravity, clips=clips)
         result = rj.solve(moved, guess=base, **options)
-        places = jnp.stack([clip.at for clip in result.scene.clips])
-        moments = (result.start_moment, result.end_moment, result.clip_moments.reshape(-1), places)
+        arclengths = jnp.stack([clip.at for clip in result.scene.clips])
+        moments = (result.start_moment, result.end_moment, result.clip_moments.reshape(-1), arclengths)
         return jnp.concatenate([result.start_force, result.end_force, result.clip_forces.reshape(-1), *moments])
 
     # One of these compiled, as inside a user's program; the others called as they are take a third of the time.

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")
 FIELDS = ("nodes", "clip_forces", "clip_moments", "start_force", "end_force", "start_moment", "end_moment", "energy")
 
 
-def spun(angle: float, about=LEVEL):
+def rotated_about_tangent(angle: float, about=LEVEL):
     """A frame turned about its tangent."""
     return rotate(about, angle * jnp.asarray(about)[:, 2])
 
@@ -32,8 +32,10 @@ GJ = 0.7
 
 
 def straight(angle: float, end_angle: float, at: float = 0.3) -> Scene:
-    clips = [Clip(at, (at, 0.0, 0.0), frame=spun(angle))]
-    return Scene(Rod(1.0, 1.0, GJ, 1e4), Clamp(ORIGIN, LEVEL), Clamp((1.0, 0, 0), spun(end_angle)), clips=clips)
+    clips = [Clip(at, (at, 0.0, 0.0), frame=rotated_about_tangent(angle))]
+    return Scene(
+        Rod(1.0, 1.0, GJ, 1e4), Clamp(ORIGIN, LEVEL), Clamp((1.0, 0, 0), rotated_about_tangent(end_angle)), clips=clips
+    )
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +228,7 @@ def test_the_difference_to_a_rod_by_tangents_is_of_fourth_order(end, with_tangen
 def cut() -> tuple[rj.Equilibrium, list[rj.Equilibrium]]:
     """A flat rod, held at its middle as by a clamp, and its two halves between clamps."""
     rod = Rod(1.0, (1.0, 1.5), 0.8, 1e4, mass_per_length=1.0)
-    middle = Clamp((0.42, 0.1, -0.1), spun(0.8, frame((1, 0.5, 0.2))))
+    middle = Clamp((0.42, 0.1, -0.1), rotated_about_tangent(0.8, frame((1, 0.5, 0.2))))
     ends = [Clamp(ORIGIN, LEVEL), middle, Clamp((0.7, 0.4, 0), LEVEL)]
     clip = Clip(0.5, ends[1].position, frame=ends[1].frame)
     whole = rj.solve(Scene(rod, ends[0], ends[2], (0, 2.0, -9.81), clips=[clip]), segments=16, solver=TIGHT)
@@ -294,10 +296,10 @@ def on_arc(s: float) -> tuple[np.ndarray, np.ndarray]:
 def precurved(gravity, moved=(0.0, 0.0, 0.0)) -> Scene:
     """In three clips: one that holds the place, one the direction, one the frame."""
     rod = Rod(1.0, (1.0, 1.5), 0.7, 1e4, mass_per_length=1.0, rest_curvature=(0.0, BEND))
-    places = {s: on_arc(s) for s in (0.0, 0.25, 0.5, 0.75, 1.0)}
-    (a, _), (b, at_b), (c, at_c) = (places[s] for s in (0.25, 0.5, 0.75))
+    poses = {s: on_arc(s) for s in (0.0, 0.25, 0.5, 0.75, 1.0)}
+    (a, _), (b, at_b), (c, at_c) = (poses[s] for s in (0.25, 0.5, 0.75))
     clips = [Clip(0.25, a + np.array(moved)), Clip(0.5, b, at_b[:, 2]), Clip(0.75, c, frame=at_c)]
-    return Scene(rod, Clamp(*places[0.0]), Clamp(*places[1.0]), gravity, clips=clips)
+    return Scene(rod, Clamp(*poses[0.0]), Clamp(*poses[1.0]), gravity, clips=clips)
 
 
 @pytest.fixture(scope="module")
@@ -349,7 +351,7 @@ def test_derivatives_by_place_position_and_frame(is_plain):
     scene = precurved((0.0, 1.0, -9.81), (0.02, 0.03, 0.05))
     if is_plain:
         first, second = in_space((1.0, 0.3, 0.4)).clips
-        held = Clip(second.at, second.position, frame=spun(0.7, frame((1.0, 0.2, -0.3))))
+        held = Clip(second.at, second.position, frame=rotated_about_tangent(0.7, frame((1.0, 0.2, -0.3))))
         ends = in_space()
         scene = Scene(problems.cable(20.0), ends.start, ends.end, GRAVITY, clips=[first, held])
     base = rj.solve(scene, **options)
@@ -446,17 +448,19 @@ def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
         here = by_numpy(form.linearized)(point)
         generator = np.random.default_rng(0)
         x = jnp.asarray(generator.normal(size=form.is_free.shape)) * form.is_free
-        y = jnp.asarray(generator.normal(size=here.closure.shape))
+        y = jnp.asarray(generator.normal(size=here.constraint_residual.shape))
         if result is not resting:
             nodes = slice(-form.layout.size - 3 * len(form.field.s), -form.layout.size)
             y = y.at[nodes].multiply(jnp.repeat(jnp.where(form.is_held, 0.0, 1.0), 3))  # a held node does not move
 
-        def moved(part, form=form, point=point, here=here, x=x, y=y):
-            change = form.layout.forces(form.closure(y))
+        def residual_at(part, form=form, point=point, here=here, x=x, y=y):
+            change = form.layout.forces(form.force_components(y))
             others = jax.tree.map(lambda change: part * change, form.others(y))
-            return form.unbalanced(form.moved(point, here.bases, part * x, part * change, others))
+            return form.residual_vectors(form.retract(point, here.bases, part * x, part * change, others))
 
-        expected = by_numpy(lambda moved=moved: jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))[1])()
+        expected = by_numpy(
+            lambda residual_at=residual_at: jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))[1]
+        )()
         found = by_numpy(here.system.times)(x, y)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9 * float(np.max(np.abs(b))))  # the solver's 1e-12
@@ -469,7 +473,7 @@ def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
 def test_the_rod_spins_with_a_single_held_frame(start):
     """Nothing twists it then, whatever the frame: the other end follows."""
     rod = Rod(1.0, (1.0, 1.0), 0.7, 1e4, mass_per_length=1.0)
-    clip = Clip(0.4, (0.3, 0.1, -0.1), frame=spun(2.0, frame((1.0, 0.5, 0.2))))
+    clip = Clip(0.4, (0.3, 0.1, -0.1), frame=rotated_about_tangent(2.0, frame((1.0, 0.5, 0.2))))
     scene = Scene(rod, start, Pin((0.6, 0.3, 0)), (0, 0, -9.81), clips=[clip])
     result = rj.solve(scene, segments=16)
     assert result.converged
@@ -486,14 +490,16 @@ def test_routes_with_corners_are_found_without_a_guess():
         [((0.27, 0.0, 0.0), (1, 0, 0)), ((0.45, 0.16, 0.0), (0.2, 1, 0)), ((0.47, 0.4, 0.0), (0, 1, 0))],
         [((0.27, 0.0, 0.0), (1, 0, 0)), ((0.42, 0.17, 0.0), (0, 1, 0.2)), ((0.42, 0.26, 0.18), (0, 0, 1))],
     ]
-    for k, places in enumerate(corners):
+    for k, poses in enumerate(corners):
         for angle in (0.0, 1.5, 3.0):
             at = (0.28, 0.55, 0.8)
             clips = [
-                Clip(s, position, frame=spun(angle * (-1) ** j, frame(tangent, (0.3, 0.2, 1.0 - j / 2))))
-                for j, (s, (position, tangent)) in enumerate(zip(at, places, strict=True))
+                Clip(
+                    s, position, frame=rotated_about_tangent(angle * (-1) ** j, frame(tangent, (0.3, 0.2, 1.0 - j / 2)))
+                )
+                for j, (s, (position, tangent)) in enumerate(zip(at, poses, strict=True))
             ]
-            last, along = places[2]
+            last, along = poses[2]
             end = Pin(np.array(last) + 0.19 * np.array(along))
             result = rj.solve(Scene(rod, Clamp(ORIGIN, LEVEL), end, (0, 0, -9.81), clips=clips), segments=16)
             assert result.converged, (k, angle)
@@ -558,7 +564,7 @@ def test_frames_of_clips_in_a_scene_file(tmp_path):
     path.write_text(SCENE_FILE)
     first, second, third = rj.read_scene(path).clips
     np.testing.assert_allclose(first.frame, frame((1, 0, 0), (0, 0, 1)), atol=1e-15)
-    np.testing.assert_allclose(second.frame, spun(np.pi / 2), atol=1e-15)
+    np.testing.assert_allclose(second.frame, rotated_about_tangent(np.pi / 2), atol=1e-15)
     np.testing.assert_array_equal(third.frame, [[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     assert first.tangent is second.tangent is third.tangent is None
     for old, new, message in (
@@ -597,7 +603,7 @@ def test_frames_of_clips_have_keys_and_names(tmp_path):
 
     varied = SceneVariations(tomllib.loads(SCENE_FILE), ["clips.1.spin", "clips.2.frame"])
     scene = varied.read({"clips.1.spin": np.array(0.5), "clips.2.frame": np.asarray(LEVEL)}).scenes[0]
-    np.testing.assert_allclose(scene.clips[1].frame, spun(0.5), atol=1e-15)
+    np.testing.assert_allclose(scene.clips[1].frame, rotated_about_tangent(0.5), atol=1e-15)
     np.testing.assert_array_equal(scene.clips[2].frame, LEVEL)
     turned = rj.Turned("clips.2.frame", 0.3)
     from rodjax.routing.variables import with_numbers
@@ -605,12 +611,12 @@ def test_frames_of_clips_have_keys_and_names(tmp_path):
     same = with_numbers(scene, [turned], jnp.full(3, 0.5))
     np.testing.assert_allclose(same.clips[2].frame, LEVEL, atol=1e-15)
     moved = with_numbers(scene, [turned], jnp.array([0.5, 0.5, 1.0]))
-    np.testing.assert_allclose(moved.clips[2].frame, spun(0.3), atol=1e-15)
+    np.testing.assert_allclose(moved.clips[2].frame, rotated_about_tangent(0.3), atol=1e-15)
 
 
 def test_a_scene_half_way_turns_the_frames_of_clips():
     half = between(straight(0.4, 0.0), straight(1.0, 0.0), jnp.asarray(0.5))
-    np.testing.assert_allclose(half.clips[0].frame, spun(0.7), atol=1e-15)
+    np.testing.assert_allclose(half.clips[0].frame, rotated_about_tangent(0.7), atol=1e-15)
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

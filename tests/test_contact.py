@@ -221,7 +221,7 @@ def test_a_thin_pipe_between_nodes_carries_a_heavy_cable():
 def test_contact_points_within_elements_have_exact_derivatives():
     """Second ones too, beside those that JAX finds of the same point."""
     rng = np.random.default_rng(0)
-    places, tangents = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+    positions, tangents = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
     tangents /= np.linalg.norm(tangents, axis=0)
     axes, h = rng.normal(size=(3, 2, 3)), np.array([0.3, 0.5])
     forces = rng.normal(size=(3, 2))
@@ -231,11 +231,11 @@ def test_contact_points_within_elements_have_exact_derivatives():
         turn = jnp.einsum("cbn,nb->cn", axes, change[:, :2])
         across = jnp.cross(turn, tangents, axis=0)
         turned = tangents + across + jnp.cross(turn, across, axis=0) / 2
-        middles = Middles.of(places + change[:, 2:], turned, jnp.asarray(axes), jnp.ones(3), jnp.asarray(h))
+        middles = Middles.of(positions + change[:, 2:], turned, jnp.asarray(axes), jnp.ones(3), jnp.asarray(h))
         return jnp.sum(middles.points.T * forces)
 
     nothing = jnp.zeros((3, 5))
-    middles = by_numpy(Middles.of)(*map(jnp.asarray, (places, tangents, axes)), jnp.ones(3), jnp.asarray(h))
+    middles = by_numpy(Middles.of)(*map(jnp.asarray, (positions, tangents, axes)), jnp.ones(3), jnp.asarray(h))
     rates = np.einsum("cn,cemn->enm", forces, middles.rates)
     first = np.zeros((3, 5))
     first[:-1] += rates[0]
@@ -400,16 +400,16 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
     generator = np.random.default_rng(0)
     rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
     change = jnp.asarray(generator.normal(size=point.end_force.shape))
-    displacements = jnp.asarray(generator.normal(size=point.nodal.places.shape))
+    displacements = jnp.asarray(generator.normal(size=point.nodal.positions.shape))
     displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
     # Pressures stay, as their contacts are soft in the system.
     step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
 
-    def moved(part):
+    def residual_at(part):
         others = jax.tree.map(lambda change: part * change, step)
-        return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
+        return form.residual_vectors(form.retract(point, here.bases, part * rotation, part * change, others))
 
-    (_, rows), (_, expected) = by_numpy(lambda: jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),)))()
+    (_, rows), (_, expected) = by_numpy(lambda: jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),)))()
     before = len(rows) - form.layout.size - displacements.size - step.pressures.size
     multipliers = jnp.concatenate(
         [jnp.zeros(before), step.pressures.ravel(), displacements.ravel(), form.layout.components(change)]

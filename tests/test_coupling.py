@@ -50,15 +50,15 @@ def test_coupling_is_that_of_automatic_derivatives(kind):
         ends = [end if isinstance(end, Clamp) else END for end in (scene.start, scene.end)]
         # Bodies under which the clamps are where they are.
         of_body = jnp.stack([end.frame @ own.T for end, own in zip(ends, frames, strict=True)])
-        places = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
-        poses, joints = (frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
+        positions = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
+        poses, joints = (frames, offsets, jnp.stack(positions), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
         rod = RodInBodies(form, units, joints, *poses, joints)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
-        point = form.holding(form.moved(search.point, bases, 0.3 * rotation, 3.0 * force))
+        point = form.holding(form.retract(search.point, bases, 0.3 * rotation, 3.0 * force))
         here, coupling = linearized_with_ends(rod, form, point)
         expected = form.linearized(point)
-        more = len(here.closure) - form.layout.size
+        more = len(here.constraint_residual) - form.layout.size
 
         def value(rotation, forces, motions):
             step = RodStep(point, here.bases, rotation, form.layout.forces(forces))
@@ -68,11 +68,11 @@ def test_coupling_is_that_of_automatic_derivatives(kind):
         slopes = jax.grad(value, argnums=(0, 1, 2))
         (_, _, by_motions), changes = jax.jvp(lambda motions: slopes(*nowhere, motions), (jnp.zeros(12),), (direction,))
         # The torque is an unknown of its own in the linearisation: eliminated here.
-        rows, system = coupling.of_closure[:more], here.system
+        rows, system = coupling.of_constraints[:more], here.system
         torque = jnp.linalg.solve(system.compliance[:more, :more], rows @ direction)
         of_gradient = coupling.of_gradient @ direction + jnp.einsum("bkm,k->bm", system.border[:, :more], torque)
         second = coupling.second @ direction + rows.T @ torque
-        found = coupling.first, of_gradient, coupling.of_closure[more:] @ direction, second
+        found = coupling.first, of_gradient, coupling.of_constraints[more:] @ direction, second
         return (here, found), (expected, (by_motions, *changes))
 
     axes = jnp.stack([frame((0.2, -1, 0.4)), frame((0.5, 1, 0.3))])
@@ -112,27 +112,27 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
         search = Search.of(*in_units_of(scene, state), first, options)
         form, units = search.form, search.units
         of_body = jnp.stack([end.frame @ own.T for end, own in zip((START, END), frames, strict=True)])
-        places = [end.position - turn @ off for end, turn, off in zip((START, END), of_body, offsets, strict=True)]
-        poses, joints = (frames, offsets, jnp.stack(places), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
+        positions = [end.position - turn @ off for end, turn, off in zip((START, END), of_body, offsets, strict=True)]
+        poses, joints = (frames, offsets, jnp.stack(positions), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
         rod = RodInBodies(form, units, joints, *poses, joints)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
-        point = form.holding(form.moved(search.point, bases, 0.3 * rotation, 3.0 * force))
-        moved = 0.02 * shift[:9].reshape(3, 3)
-        nodal = dataclasses.replace(point.nodal, places=point.nodal.places + moved, pressures=pressures)
+        point = form.holding(form.retract(search.point, bases, 0.3 * rotation, 3.0 * force))
+        displacements = 0.02 * shift[:9].reshape(3, 3)
+        nodal = dataclasses.replace(point.nodal, positions=point.nodal.positions + displacements, pressures=pressures)
         point = form.holding(dataclasses.replace(point, nodal=nodal))
         here, coupling = linearized_with_ends(rod, form, point)
         expected = form.linearized(point)
         assert isinstance(here.system, ChainSystem)
         assert coupling.of_gaps is not None
 
-        def there(rotation, moved, forces, motions):
-            change = NodalChange(moved, jnp.zeros_like(pressures))
+        def there(rotation, displacements, forces, motions):
+            change = NodalChange(displacements, jnp.zeros_like(pressures))
             step = RodStep(point, here.bases, rotation, form.layout.forces(forces), change)
             value, _, there = step.value(rod, motions.reshape(2, 6), jnp.ones(()))
-            near = rod.moved(motions.reshape(2, 6))
+            near = rod.form_at(motions.reshape(2, 6))
             assert isinstance(near, NodalForm)
-            gaps = jnp.concatenate([near.gaps_and_normals(there.nodal.places)[0], near.within_elements(there)[1]])
+            gaps = jnp.concatenate([near.gaps_and_normals(there.nodal.positions)[0], near.within_elements(there)[1]])
             return value - jnp.sum(pressures * gaps), gaps
 
         nowhere = jnp.zeros_like(here.gradient), jnp.zeros((3, 3)), jnp.zeros(form.layout.size)
@@ -145,15 +145,21 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
         # The torque is an unknown of its own in the linearisation: eliminated here.
         system = here.system
         more = len(system.compliance)
-        rows = coupling.of_closure[:more]
+        rows = coupling.of_constraints[:more]
         torque = jnp.linalg.solve(system.compliance, rows @ direction)
         of_gradient = coupling.of_gradient @ direction + jnp.einsum("bkm,k->bm", system.border, torque)
         second = coupling.second @ direction + rows.T @ torque
-        _, _, of_places, of_forces = system.parted(coupling.of_closure @ direction)
-        found = coupling.first, of_gradient, of_places, of_forces.reshape(-1), second, coupling.of_gaps @ direction
-        x, y = jnp.ones_like(here.gradient), jnp.cos(jnp.arange(1.0, 1.0 + len(here.closure)))
-        same = (system.times(x, y), here.gradient, here.closure, here.energy, here.residual)
-        other = (expected.system.times(x, y), expected.gradient, expected.closure, expected.energy, expected.residual)
+        _, _, of_positions, of_forces = system.split(coupling.of_constraints @ direction)
+        found = coupling.first, of_gradient, of_positions, of_forces.reshape(-1), second, coupling.of_gaps @ direction
+        x, y = jnp.ones_like(here.gradient), jnp.cos(jnp.arange(1.0, 1.0 + len(here.constraint_residual)))
+        same = (system.times(x, y), here.gradient, here.constraint_residual, here.energy, here.residual)
+        other = (
+            expected.system.times(x, y),
+            expected.gradient,
+            expected.constraint_residual,
+            expected.energy,
+            expected.residual,
+        )
         return (same, other), (found, (by_all[3], *changes, of_gaps))
 
     axes = jnp.stack([frame((0.2, -1, 0.4)), frame((0.5, 1, 0.3))])

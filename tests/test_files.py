@@ -353,7 +353,7 @@ def test_every_dataset_has_units_and_a_description(single, loaded_path, tmp_path
     scenes = [*SCENES.values(), *map(general_scene, GENERAL), clipped, touching]
     results = [loaded_path, with_frames(single, 10), *(dataclasses.replace(single, scene=scene) for scene in scenes)]
     before = Before(single.nodes, touching.obstacles)
-    state = dataclasses.replace(single.state, places=single.s[:1], clip_moments=single.nodes[:1], before=before)
+    state = dataclasses.replace(single.state, arclengths=single.s[:1], clip_moments=single.nodes[:1], before=before)
     state = dataclasses.replace(state, pressures=single.s[None], friction=Friction.from_rest(1, single.nodes))
     results.append(dataclasses.replace(single, state=state))
     results.append(dataclasses.replace(single, shear_strain=single.nodes[:, :2], free_index=single.iterations))

@@ -28,7 +28,7 @@ def begin(scene: Scene, seed: int = 0) -> tuple[FiniteDifference, Polyline]:
 def test_gradient_is_the_derivative_of_the_energy(name):
     problem, polyline = begin(loaded_scenes()[name])
     _, gradient = jax.jit(lambda polyline: problem.energy_and_gradient(polyline))(polyline)
-    energy = jax.jit(lambda displacement: problem.energies(problem.moved(polyline, displacement)).total)
+    energy = jax.jit(lambda displacement: problem.energies(problem.displaced(polyline, displacement)).total)
     step = 1e-6
     for k in np.ndindex(gradient.shape):
         energies = [energy(jnp.zeros_like(gradient).at[k].set(sign * step)) for sign in (1, -1)]
@@ -51,8 +51,8 @@ def test_total_twist_is_that_of_carried_frames():
     problem, polyline = begin(loaded_scenes()["clamps"])
     for seed in range(3):
         noise = 0.003 * np.random.default_rng(seed).normal(size=(N - 1, 3))
-        moved = problem.moved(polyline, jnp.asarray(noise))
-        carried = last_frame_without_twist(problem.scene.start.frame, moved)
+        displaced = problem.displaced(polyline, jnp.asarray(noise))
+        carried = last_frame_without_twist(problem.scene.start.frame, displaced)
         end = np.asarray(problem.scene.end.frame)
         axis = np.cross(carried[:, 2], end[:, 2])
         smallest = Rotation.from_rotvec(
@@ -60,7 +60,7 @@ def test_total_twist_is_that_of_carried_frames():
         )
         d1 = smallest.as_matrix() @ carried[:, 0]
         angle = np.arctan2(end[:, 2] @ np.cross(d1, end[:, 0]), d1 @ end[:, 0])
-        twist = float(problem.total_twist(moved))
+        twist = float(problem.total_twist(displaced))
         assert abs(twist - problem.total_twist(polyline)) < 1.0
         np.testing.assert_allclose(np.exp(1j * twist), np.exp(1j * angle), atol=1e-13)
 
@@ -102,7 +102,7 @@ def test_gauss_newton_is_the_hessian_where_nothing_is_strained(start, end, segme
     nodes = jnp.linspace(jnp.zeros(3), jnp.array([1.0, 0, 0]), segments + 1)
     problem, polyline = FiniteDifference.begin(scaled, Polyline.through(nodes), FirstTwist(jnp.array(0.0)))
     zero = problem.no_displacement(polyline)
-    bending_and_stretch = lambda d: problem.energies(problem.moved(polyline, d)).elastic  # noqa: E731
+    bending_and_stretch = lambda d: problem.energies(problem.displaced(polyline, d)).elastic  # noqa: E731
     hessian = jax.jit(jax.hessian(bending_and_stretch))(zero)
     direction = jnp.asarray(np.random.default_rng(0).normal(size=zero.shape))
     forces = jnp.einsum("iajb,jb->ia", hessian, direction)

@@ -46,7 +46,7 @@ def test_a_rod_that_turns_as_a_whole_stays_in_equilibrium(kind):
         form, point = form_and_point(result)
         here = form.linearized(point)
         rotation = form.turn(point, here.bases, AXIS)
-        multipliers = form.multipliers_turned(point, AXIS, jnp.zeros_like(here.closure))
+        multipliers = form.multipliers_turned(point, AXIS, jnp.zeros_like(here.constraint_residual))
         of_rotation, of_multipliers = here.system.times(rotation, multipliers)
         forces = jnp.linalg.norm(jnp.cross(AXIS[:, None], point.end_force, axis=0), axis=0)
         return jnp.abs(of_rotation), jnp.abs(of_multipliers), forces
@@ -71,17 +71,17 @@ def test_what_another_force_changes_is_that_of_the_lagrangian(kind):
         here = form.under_force(point, form.linearized(point), rotation, change, None)
         trial = dataclasses.replace(point, end_force=point.end_force + change)
         energy = form.linearized(trial).energy - form.linearized(point).energy
-        closure = form.closure(form.linearized(trial).closure)
+        constraint_residual = form.force_components(form.linearized(trial).constraint_residual)
 
         def at(step):
-            moved = form.moved(point, bases, step * rotation, jnp.zeros_like(change))
+            retracted = form.retract(point, bases, step * rotation, jnp.zeros_like(change))
             still = jnp.zeros_like(rotation)
-            lacking, _, more, _ = form.under_force(moved, form.linearized(moved), still, change, None)
+            lacking, _, more, _ = form.under_force(retracted, form.linearized(retracted), still, change, None)
             return lacking, more
 
         step = 1e-5
         rates = jax.tree.map(lambda a, b: (a - b) / (2 * step), at(step), at(-step))
-        return here, (closure, rates[0], energy, rates[1])
+        return here, (constraint_residual, rates[0], energy, rates[1])
 
     result = solved(kind)
     numbers = jnp.asarray(random.normal(size=100))
@@ -111,7 +111,7 @@ def test_the_slope_of_a_step_in_contact_is_that_of_its_objective(EI):
 
         def objective(part):
             others = jax.tree.map(lambda change: part * change, step)
-            there = form.moved(point, bases, part * rotation, change, others)
+            there = form.retract(point, bases, part * rotation, change, others)
             return form.objective(form.linearized(there), point)
 
         return more + jnp.sum(rotation * here.gradient), (objective(1e-9) - objective(-1e-9)) / 2e-9

@@ -56,17 +56,17 @@ def agree(corners: dict, members: list, EI: float, EA: float, held: dict, loads:
             third = math.atan2(rod.tangents[0, 2], rod.tangents[0, 0])
         forces.append([float(rod.start_force[0]), float(rod.start_force[2]), float(third)])
     free = [name for name in corners if name not in held]
-    places = {}
+    poses = {}
     for name in free:
         body = found.joints[name]
-        places[name] = (body.position[0], body.position[2], math.atan2(body.frame[2, 0], body.frame[0, 0]))
+        poses[name] = (body.position[0], body.position[2], math.atan2(body.frame[2, 0], body.frame[0, 0]))
     joints, _ = solve_frame(
-        rods, {name: (*loads.get(name, (0.0, 0.0)), 0.0) for name in free}, np.array(forces) * (1 + 1e-4), places
+        rods, {name: (*loads.get(name, (0.0, 0.0)), 0.0) for name in free}, np.array(forces) * (1 + 1e-4), poses
     )
     largest = max(np.linalg.norm(np.subtract(joints[name][:2], corners[name])) for name in free)
     for name in free:
-        assert np.max(np.abs(np.subtract(joints[name][:2], places[name][:2]))) < 1e-6 * largest
-        assert abs(joints[name][2] - places[name][2]) < 1e-6
+        assert np.max(np.abs(np.subtract(joints[name][:2], poses[name][:2]))) < 1e-6 * largest
+        assert abs(joints[name][2] - poses[name][2]) < 1e-6
 
 
 TIGHT = Newton(tolerance=1e-10)

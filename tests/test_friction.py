@@ -59,18 +59,18 @@ def check_cone(result: rj.Equilibrium, friction: float = MU) -> None:
 
 @pytest.fixture(scope="module")
 def there_and_back() -> tuple[np.ndarray, rj.Equilibrium]:
-    ways = np.concatenate([np.linspace(0, 2e-4, 5), np.linspace(2e-4, 0, 5)[1:]])
-    return ways, drawn([on_floor(-way) for way in ways])
+    displacements = np.concatenate([np.linspace(0, 2e-4, 5), np.linspace(2e-4, 0, 5)[1:]])
+    return displacements, drawn([on_floor(-way) for way in displacements])
 
 
 def test_the_end_of_a_cable_that_is_drawn_a_little_slips_and_the_rest_sticks(there_and_back):
     """Friction carries off the pull F after F/(mu w), and the end moves by F^2/(2 EA mu w); drawn back, twice the
     change of F in half of the change of the way. The support carries the weight of the first half of an element.
     """
-    ways, path = there_and_back
+    displacements, path = there_and_back
     stiffness, first = 100.0 * MU * WEIGHT, MU * WEIGHT * H / 2
-    out = np.sqrt(2 * stiffness * ways[:5])
-    back = out[-1] - 2 * np.sqrt(stiffness * (ways[4] - ways[5:]))
+    out = np.sqrt(2 * stiffness * displacements[:5])
+    back = out[-1] - 2 * np.sqrt(stiffness * (displacements[4] - displacements[5:]))
     pull = np.asarray(path.start_force)[:, 0]
     # As each node holds what is at most mu p, the pull is off by a part of a node's mu w h.
     np.testing.assert_allclose(pull[1:5], out[1:] - first, rtol=0, atol=0.1 * MU * WEIGHT * H)
@@ -84,19 +84,19 @@ def test_the_end_of_a_cable_that_is_drawn_a_little_slips_and_the_rest_sticks(the
 
 
 def test_a_step_from_an_equilibrium_is_that_of_the_path(there_and_back):
-    ways, path = there_and_back
+    displacements, path = there_and_back
     fourth, fifth = (jax.tree.map(lambda leaf, k=k: leaf[k], path) for k in (4, 5))
-    step = rj.solve(on_floor(-ways[5]), segments=ELEMENTS, guess=fourth)
+    step = rj.solve(on_floor(-displacements[5]), segments=ELEMENTS, guess=fourth)
     np.testing.assert_allclose(step.friction_forces, fifth.friction_forces, rtol=0, atol=ROUGHLY)
     np.testing.assert_array_equal(step.contact_states, fifth.contact_states)
-    again = rj.solve(on_floor(-ways[5]), segments=ELEMENTS, guess=fifth)
+    again = rj.solve(on_floor(-displacements[5]), segments=ELEMENTS, guess=fifth)
     np.testing.assert_allclose(again.friction_forces, fifth.friction_forces, rtol=0, atol=ROUGHLY)
     told = rj.describe(fifth)
     drag = np.linalg.norm(fifth.friction_forces[0].sum(0))
     sticks, slips = (int(np.sum(fifth.contact_states == k)) for k in (1, 2))
     assert f", drags with {drag:.4g} N, sticks at {sticks} nodes and slips at {slips}" in told
     # Without a memory friction does not act.
-    rest = rj.solve(on_floor(-ways[5]), segments=ELEMENTS, guess=LYING)
+    rest = rj.solve(on_floor(-displacements[5]), segments=ELEMENTS, guess=LYING)
     np.testing.assert_array_equal(rest.friction_forces, 0.0)
     assert "without friction as from rest" in rj.describe(rest)
 
@@ -116,9 +116,11 @@ def test_a_cable_dragged_over_a_floor_is_held_by_its_weight_times_friction():
 
 def test_a_cable_dragged_aside_is_held_against_its_way():
     path = drawn([on_floor(-0.1 * k, 0.02 * k * k, EA=1e4) for k in range(STEPS)])
-    ways = np.diff(np.asarray(path.nodes), axis=0)[:, 1:]
+    displacements = np.diff(np.asarray(path.nodes), axis=0)[:, 1:]
     drags = np.asarray(path.friction_forces)[1:, 0, 1:]
-    along = np.sum(drags * ways, axis=-1) / np.linalg.norm(drags, axis=-1) / np.linalg.norm(ways, axis=-1)
+    along = (
+        np.sum(drags * displacements, axis=-1) / np.linalg.norm(drags, axis=-1) / np.linalg.norm(displacements, axis=-1)
+    )
     np.testing.assert_allclose(along, -1.0, atol=1e-9)
     assert np.max(np.abs(drags[..., 1])) > 0.3 * np.max(np.abs(drags[..., 0]))
 
@@ -159,9 +161,9 @@ def half_around() -> rj.Guess:
     return rj.Guess(x)
 
 
-def pulled(ways: tuple[float, ...], stiffness: float, segments: int) -> list[float]:
+def pulled(displacements: tuple[float, ...], stiffness: float, segments: int) -> list[float]:
     result, pulls = half_around(), []
-    for way in ways:
+    for way in displacements:
         result = rj.solve(over_cylinder(way, stiffness), segments=segments, guess=result, strain_limit=None)
         assert result.converged
         if pulls:
@@ -247,23 +249,25 @@ def test_the_coupled_system_is_the_derivative_of_what_is_out_of_balance(last):
     generator = np.random.default_rng(0)
     rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
     change = jnp.asarray(generator.normal(size=point.end_force.shape))
-    places = jnp.asarray(generator.normal(size=point.nodal.places.shape))
-    places = jnp.where(form.is_held[:, None], 0.0, places)
+    displacements = jnp.asarray(generator.normal(size=point.nodal.positions.shape))
+    displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
     rows = np.array(NodalChange.nothing(point.nodal).pressures)
     rows[:2] = generator.normal(size=rows[:2].shape) * (np.asarray(states) > 0)
-    step = NodalChange(places, jnp.asarray(rows))
+    step = NodalChange(displacements, jnp.asarray(rows))
 
-    def moved(part):
+    def residual_at(part):
         others = jax.tree.map(lambda change: part * change, step)
-        return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
+        return form.residual_vectors(form.retract(point, here.bases, part * rotation, part * change, others))
 
-    _, (_, expected) = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
-    before = len(expected) - form.layout.size - places.size - rows.size
-    multipliers = jnp.concatenate([jnp.zeros(before), rows.ravel(), places.ravel(), form.layout.components(change)])
+    _, (_, expected) = jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))
+    before = len(expected) - form.layout.size - displacements.size - rows.size
+    multipliers = jnp.concatenate(
+        [jnp.zeros(before), rows.ravel(), displacements.ravel(), form.layout.components(change)]
+    )
     _, found = system.times(rotation, multipliers)
-    nodes = slice(-form.layout.size - places.size, -form.layout.size)
+    nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
     np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
-    # Slips of what sticks, but for the softness of the pressures in the system.
+    # Slips of what sticks, but for the compliance of the contacts in the system.
     sticking = np.repeat(np.asarray(states) == 1, 3, axis=0).ravel()
     sticking = np.concatenate([np.zeros(2 * len(form.field.s), bool), sticking])
     slips = [np.asarray(values)[before : before + rows.size][sticking] for values in (found, expected)]

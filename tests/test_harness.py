@@ -135,8 +135,8 @@ def test_a_star_is_that_of_an_independent_code(solved):
     angle = math.atan2(body.frame[2, 0], body.frame[0, 0])
     forces = [(c.start_force[0], c.start_force[2], -c.start_moment[1]) for c in solved.values()]
     # From a guess that differs in the third digit.
-    places = {"hub": np.array([body.position[0], body.position[2], angle]) + 1e-3}
-    joints, begins = solve_frame(rods, {"hub": LOAD}, np.array(forces) * 1.001, places)
+    poses = {"hub": np.array([body.position[0], body.position[2], angle]) + 1e-3}
+    joints, begins = solve_frame(rods, {"hub": LOAD}, np.array(forces) * 1.001, poses)
     # The error of 32 elements, of fourth order.
     assert abs(joints["hub"][:2] - body.position[jnp.array([0, 2])]).max() < 1e-7
     assert abs(joints["hub"][2] - angle) < 1e-6

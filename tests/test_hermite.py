@@ -147,20 +147,20 @@ def test_figure_1_is_of_fourth_order(slenderness):
 # --- point forces ----------------------------------------------------------------------------------------------------
 
 
-def with_point_forces(*places: float, slenderness: float = 200.0) -> Scene:
+def with_point_forces(*arclengths: float, slenderness: float = 200.0) -> Scene:
     rod = problems.cable(slenderness)
     EI = float(rod.EI)
-    loads = [PointForce(at, (0, 10 * (-1) ** k * EI, -20 * EI)) for k, at in enumerate(places)]
+    loads = [PointForce(at, (0, 10 * (-1) ** k * EI, -20 * EI)) for k, at in enumerate(arclengths)]
     end = Clamp((0.7, 0.1, 0.0), frame((1, 0.3, 0), (0.2, 1, 0.5)))
     return Scene(rod, Clamp(ORIGIN, LEVEL), end, point_forces=loads)
 
 
 @pytest.mark.parametrize(
-    ("places", "segments"),
+    ("arclengths", "segments"),
     [((0.43,), 8), ((0.43, 0.8), 8), ((0.05, 0.95), 8), ((0.43,), 2), ((0.0, 1.0), 4), ((0.25,), 4)],
 )
-def test_a_node_lies_at_every_point_force_away_from_others_and_ends(places, segments):
-    scaled, _ = nondimensional(with_point_forces(*places))
+def test_a_node_lies_at_every_point_force_away_from_others_and_ends(arclengths, segments):
+    scaled, _ = nondimensional(with_point_forces(*arclengths))
     s = np.asarray(QuadraticRotationElements.of(scaled, jnp.linspace(0.0, 1.0, segments + 1)).s)
     assert len(s) == segments + 1
     assert s[0] == 0.0
@@ -168,7 +168,7 @@ def test_a_node_lies_at_every_point_force_away_from_others_and_ends(places, segm
     lengths = np.diff(s) * segments
     assert np.min(lengths) >= LEAST_ELEMENT - 1e-12
     assert np.max(lengths) <= 1.5
-    for at in places:
+    for at in arclengths:
         if LEAST_ELEMENT <= segments * at <= segments - LEAST_ELEMENT:
             assert at in s
 
@@ -484,7 +484,7 @@ def test_without_torsion_no_angle_is_traced():
         def moved_and_linearized(scaled, point, rotation):
             form = MixedForm.of(scaled, QuadraticRotationElements.of(scaled, jnp.linspace(0.0, 1.0, 5)))
             here = form.linearized(point)
-            return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
+            return form.linearized(form.retract(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
 
         point = MixedPoint(jnp.ones((3, 9)), jnp.zeros((3, 1)), jnp.array(0.0))
         return str(jax.make_jaxpr(moved_and_linearized)(scaled, point, jnp.zeros((2, 9))))

@@ -241,13 +241,13 @@ def with_inner_contacts(system: ChainSystem) -> ChainSystem:
     rng = np.random.default_rng(3)
     elements = system.across.shape[-1]
     free = np.where(system.held, 0.0, 1.0)
-    places = rng.normal(size=(1, 3, 2, elements)) * np.stack([free[:-1], free[1:]])
-    inner = InnerRows(jnp.asarray(rng.normal(size=(1, 2, 2, elements))), jnp.asarray(places), 2)
+    by_position = rng.normal(size=(1, 3, 2, elements)) * np.stack([free[:-1], free[1:]])
+    inner = InnerRows(jnp.asarray(rng.normal(size=(1, 2, 2, elements))), jnp.asarray(by_position), 2)
     contacts = system.contacts
     is_closed = np.append(np.arange(elements) % 2 == 0, False)[None]
     contacts = ContactRows(
         jnp.pad(contacts.normals, ((0, 1), (0, 0), (0, 0))),
-        contacts.softness,
+        contacts.contact_compliance,
         jnp.concatenate([contacts.is_closed, jnp.asarray(is_closed)]),
         inner=inner,
     )
@@ -264,11 +264,11 @@ def with_far_contacts(system: ChainSystem) -> ChainSystem:
     elements = system.across.shape[-1]
     first, second = np.array([0, 1, 1]), np.array([2, 3, elements - 1])
     nodes = np.stack([first, first + 1, second, second + 1])
-    places = rng.normal(size=(5, 3, 4, 3)) * np.where(system.held, 0.0, 1.0)[nodes]
+    by_position = rng.normal(size=(5, 3, 4, 3)) * np.where(system.held, 0.0, 1.0)[nodes]
     scale = np.array([1.0, 0.3, 0.3, 0.3, 0.3])[:, None, None, None]
     far = FarRows(
         jnp.asarray(rng.normal(size=(5, 2, 4, 3)) * scale),
-        jnp.asarray(places * scale),
+        jnp.asarray(by_position * scale),
         jnp.asarray(nodes),
         jnp.asarray([2, 0, 1]),
         2,
@@ -277,7 +277,7 @@ def with_far_contacts(system: ChainSystem) -> ChainSystem:
     is_closed = np.isin(np.arange(elements + 1), (0, 2))[None]
     contacts = ContactRows(
         jnp.pad(contacts.normals, ((0, 1), (0, 0), (0, 0))),
-        contacts.softness,
+        contacts.contact_compliance,
         jnp.concatenate([contacts.is_closed, jnp.asarray(is_closed)]),
         far=far,
     )
@@ -312,14 +312,14 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
     factors = factored(system)
     assert isinstance(factors, ChainFactors)
     given = jnp.asarray(right[: 2 * m].reshape(2, m)), jnp.asarray(right[2 * m :])
-    places = np.arange(2 * m + 1, 2 * m + 1 + pressures)
+    rows = np.arange(2 * m + 1, 2 * m + 1 + pressures)
     # As soft as 1e-5, and as if they were hard.
     hard = np.array(matrix)
-    hard[places, places] += np.where(np.ravel(system.contacts.is_closed), 1e-5, 0.0)
+    hard[rows, rows] += np.where(np.ravel(system.contacts.is_closed), 1e-5, 0.0)
     for solve, full in ((factors.solve_softly, matrix), (factors.solve, hard)):
         found, truth = np.concatenate([np.ravel(x) for x in by_numpy(solve)(*given)]), np.linalg.solve(full, right)
-        is_pressure = np.isin(np.arange(len(found)), places)
-        # The contacts, of 1e5, cost the dense solve some digits; a pressure is a difference over its softness.
+        is_pressure = np.isin(np.arange(len(found)), rows)
+        # The contacts, of 1e5, cost the dense solve some digits; a pressure is a difference over its compliance.
         np.testing.assert_allclose(found[~is_pressure], truth[~is_pressure], rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(found[is_pressure], truth[is_pressure], rtol=1e-6, atol=1e-6)
     if loads is not None:

@@ -81,15 +81,15 @@ def derivatives(form: MixedForm, point: MixedPoint, function):
     """The linearization at the point, and `function`s of that at a moved point by the rotations and the force."""
 
     def at(rotation, force_change):
-        return function(form.linearized(form.moved(point, here.bases, rotation, force_change[:, None])))
+        return function(form.linearized(form.retract(point, here.bases, rotation, force_change[:, None])))
 
     here = linearized(form, point)
     return here, at, (jnp.zeros_like(here.gradient), jnp.zeros(3))
 
 
-def vector_and_closure(here: Linearization) -> tuple[jax.Array, jax.Array]:
+def vector_and_constraint_residual(here: Linearization) -> tuple[jax.Array, jax.Array]:
     """What does not depend on the choice of bases."""
-    return jnp.sum(here.bases * here.gradient[None], axis=1), here.closure[-3:]
+    return jnp.sum(here.bases * here.gradient[None], axis=1), here.constraint_residual[-3:]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -100,16 +100,18 @@ def test_gradient_is_the_derivative_of_the_energy(name, kind):
     by_rotation, by_force = by_numpy(jax.grad(energy, argnums=(0, 1)))(*nowhere)
     # Derivatives up to 1e3, and a few hundred roundings.
     np.testing.assert_allclose(here.gradient, by_rotation, rtol=0, atol=1e-11)
-    if here.closure.size:
-        np.testing.assert_allclose(here.closure[-3:], by_force, rtol=0, atol=1e-12)
+    if here.constraint_residual.size:
+        np.testing.assert_allclose(here.constraint_residual[-3:], by_force, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", POTENTIAL + MOMENT)
 def test_the_system_is_the_derivative_of_gradient_and_closure(name, kind):
     form, point = begin(name, kind)
-    here, both, nowhere = derivatives(form, point, vector_and_closure)
-    (vectors, vectors_by_force), (closure, closure_by_force) = by_numpy(jax.jacfwd(both, argnums=(0, 1)))(*nowhere)
+    here, both, nowhere = derivatives(form, point, vector_and_constraint_residual)
+    (vectors, vectors_by_force), (constraint_residual, residual_by_force) = by_numpy(jax.jacfwd(both, argnums=(0, 1)))(
+        *nowhere
+    )
     size = here.gradient.size
     by_rotation = np.einsum("cin,cnjm->nimj", here.bases, vectors).reshape(size, size)
     by_rotation += np.diag(np.einsum("cin->ni", here.bases**2).ravel() == 0)  # the unit block of a held tangent
@@ -119,8 +121,10 @@ def test_the_system_is_the_derivative_of_gradient_and_closure(name, kind):
     if mixed.shape[1]:
         columns = np.einsum("cin,cnf->nif", here.bases, vectors_by_force).reshape(size, 3)
         np.testing.assert_allclose(mixed, columns, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(mixed, np.asarray(closure).transpose(2, 1, 0).reshape(size, 3), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(by_force, closure_by_force, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(
+            mixed, np.asarray(constraint_residual).transpose(2, 1, 0).reshape(size, 3), rtol=0, atol=1e-12
+        )
+        np.testing.assert_allclose(by_force, residual_by_force, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", MOMENT)
@@ -138,9 +142,9 @@ def test_gradient_with_a_dead_moment_is_that_of_the_work_on_the_end_frame(name):
     bare = Scene(scene.rod, *ends, scene.gravity)
     only_force = MixedForm.of(bare, field(bare))
     for sign in (1, -1):
-        moved = form.moved(point, here.bases, sign * step * direction, jnp.zeros((3, 1)))
-        energies.append(float(linearized(only_force, moved).energy))
-        tangents = moved.tangents if free is scene.end else moved.tangents[:, ::-1]
+        retracted = form.retract(point, here.bases, sign * step * direction, jnp.zeros((3, 1)))
+        energies.append(float(linearized(only_force, retracted).energy))
+        tangents = retracted.tangents if free is scene.end else retracted.tangents[:, ::-1]
         frames.append(last_frame_without_twist(clamp.frame, tangents))
     spin = Rotation.from_matrix(frames[0] @ frames[1].T).as_rotvec()
     work = np.asarray(free.moment) @ spin
@@ -202,7 +206,7 @@ def test_energies_agree(solved):
     np.testing.assert_allclose(here.energy, energies.total, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(form.elastic_energy(point), energies.elastic, rtol=1e-12)
     assert here.residual < 1e-9
-    assert np.all(np.abs(here.closure) < 1e-13)
+    assert np.all(np.abs(here.constraint_residual) < 1e-13)
 
 
 def test_residual_is_the_largest_component_of_the_gradient_by_nodes(solved):
@@ -210,10 +214,10 @@ def test_residual_is_the_largest_component_of_the_gradient_by_nodes(solved):
     form, problem, _, point = solved
     here = linearized(form, point)
     rotation = 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=(2, N)))
-    moved = form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))
-    edges = form.edges(moved)
+    retracted = form.retract(point, here.bases, rotation, jnp.zeros((3, 1)))
+    edges = form.edges(retracted)
     _, gradient = eqx.filter_jit(problem.energy_and_gradient)(Polyline(form.nodes(edges), edges))
-    residual = linearized(form, moved).residual
+    residual = linearized(form, retracted).residual
     assert residual > 1.0  # far above the floor
     # The strains by edges, times EA = 1600, have the roundings of the lengths: 1e-12 of 10.
     np.testing.assert_allclose(residual, jnp.max(jnp.abs(gradient)), rtol=1e-11)
@@ -228,7 +232,7 @@ def jaxpr_text(scene: Scene) -> str:
     def moved_and_linearized(scaled, point, rotation):
         form = MixedForm.of(scaled, field(scaled))
         here = form.linearized(point)
-        return form.linearized(form.moved(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
+        return form.linearized(form.retract(point, here.bases, rotation, jnp.zeros((3, 1)))).gradient
 
     point = MixedPoint(jnp.ones((3, N)), jnp.zeros((3, 1)), jnp.array(0.0))
     return str(jax.make_jaxpr(moved_and_linearized)(scaled, point, jnp.zeros((2, N))))

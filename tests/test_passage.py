@@ -10,7 +10,7 @@ from scenes import box_mesh
 
 import rodjax as rj
 from rodjax import Pin, Rod, Scene
-from rodjax.mechanics.passage import PLACES, Before, passage
+from rodjax.mechanics.passage import SAMPLES, Before, passage
 from rodjax.model.obstacles import InUnits
 from rodjax.solving.status import Status
 
@@ -18,7 +18,7 @@ RADIUS, SPAN = 0.01, 0.8
 PIPE = rj.Capsule((0.4, -2, -0.05), (0.4, 2, -0.05), 0.1)  # its top is 0.05 above the pins
 
 
-def arch(height: float, count: int = PLACES) -> np.ndarray:
+def arch(height: float, count: int = SAMPLES) -> np.ndarray:
     """A parabola between the pins, so far above them in its middle."""
     x = np.linspace(0, 1, count)
     return np.stack([SPAN * x, 0 * x, 4 * height * x * (1 - x)], axis=1)
@@ -37,7 +37,7 @@ judged = jax.jit(passage)
 
 def found(before, after, obstacle, raised=0.0):
     """`raised`: by how much the obstacle goes up meanwhile."""
-    radius, nowhere = jnp.full(PLACES, RADIUS), jnp.full((PLACES, 3), jnp.nan)
+    radius, nowhere = jnp.full(SAMPLES, RADIUS), jnp.full((SAMPLES, 3), jnp.nan)
     here, there = (InUnits(obstacle, jnp.array([0, 0, -up]), jnp.ones(())) for up in (0.0, raised))
     return judged(Before(jnp.asarray(before), (here,)), jnp.asarray(after), (there,), radius, nowhere)
 

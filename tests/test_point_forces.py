@@ -11,21 +11,21 @@ from rodjax import Clamp, Free, PointForce, Rod, Scene, frame, problems
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at
 
 
-@pytest.mark.parametrize("places", [[0.43], [0.43, 0.45], [0.01, 0.99], [0.1, 0.11, 0.12, 0.13], [0.9, 0.95, 0.97]])
-def test_every_place_gets_a_node_and_no_two_fall_together(places):
-    s = np.asarray(with_nodes_at(jnp.linspace(0.0, 1.0, 9), jnp.array(places)))
-    for place in places:
+@pytest.mark.parametrize("arclengths", [[0.43], [0.43, 0.45], [0.01, 0.99], [0.1, 0.11, 0.12, 0.13], [0.9, 0.95, 0.97]])
+def test_every_place_gets_a_node_and_no_two_fall_together(arclengths):
+    s = np.asarray(with_nodes_at(jnp.linspace(0.0, 1.0, 9), jnp.array(arclengths)))
+    for place in arclengths:
         assert place in s
     assert s[0] == 0.0
     assert s[-1] == 1.0
     assert np.min(np.diff(s)) >= LEAST_ELEMENT / 8
     # Found again, the mesh stays, to the last bit.
-    np.testing.assert_array_equal(with_nodes_at(jnp.asarray(s), jnp.array(places)), s)
+    np.testing.assert_array_equal(with_nodes_at(jnp.asarray(s), jnp.array(arclengths)), s)
 
 
-@pytest.mark.parametrize(("places", "got"), [([0.43, 0.43], [0.43]), ([0.0, 1.0], []), ([0.001], [])])
-def test_places_that_fall_together_or_on_an_end_share_a_node(places, got):
-    s = np.asarray(with_nodes_at(jnp.linspace(0.0, 1.0, 9), jnp.array(places)))
+@pytest.mark.parametrize(("arclengths", "got"), [([0.43, 0.43], [0.43]), ([0.0, 1.0], []), ([0.001], [])])
+def test_places_that_fall_together_or_on_an_end_share_a_node(arclengths, got):
+    s = np.asarray(with_nodes_at(jnp.linspace(0.0, 1.0, 9), jnp.array(arclengths)))
     assert all(place in s for place in got)
     assert np.min(np.diff(s)) > 0.05
 

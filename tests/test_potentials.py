@@ -128,7 +128,7 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(EI):
     scene = Scene(rod(EI, EA=1e3), START, Free((0.0, 3.0, 5.0)), potentials=[bedding(300.0, 0.5)])
     form, point = form_and_point(rj.solve(scene, segments=4, strain_limit=None))
     generator = np.random.default_rng(0)
-    displacements = jnp.asarray(generator.normal(size=point.nodal.places.shape))
+    displacements = jnp.asarray(generator.normal(size=point.nodal.positions.shape))
     displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
     change = jnp.asarray(generator.normal(size=point.end_force.shape))
 
@@ -137,11 +137,11 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(EI):
         here = form.linearized(point)
         rotation = jnp.where(jnp.sum(here.bases**2, axis=0) > 0, rotation, 0.0)
 
-        def moved(part):
+        def residual_at(part):
             others = NodalChange(part * displacements, point.nodal.pressures)
-            return form.unbalanced(form.moved(point, here.bases, part * rotation, part * change, others))
+            return form.residual_vectors(form.retract(point, here.bases, part * rotation, part * change, others))
 
-        _, expected = jax.jvp(moved, (jnp.array(0.0),), (jnp.array(1.0),))
+        _, expected = jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))
         multipliers = jnp.concatenate([displacements.ravel(), form.layout.components(change)])
         return expected, here.system.times(rotation, multipliers), jnp.max(jnp.abs(here.system.turning))
 

@@ -21,7 +21,7 @@ from rodjax.plot import AZIMUTH, seen_axes
 from rodjax.routing import report_text, web_page
 from rodjax.routing.cable_report import Gradients
 from rodjax.routing.report import FILES
-from rodjax.routing.view_data import azimuth, coloring, extent, sight
+from rodjax.routing.view_data import azimuth, cable_view, coloring, extent
 
 RADIUS = 0.006
 GRAVITY = (0.0, 0.0, -9.81)
@@ -368,8 +368,8 @@ def test_the_picture_names_what_it_shows(report):
     assert written[:4] == sizes
     # None of them on another.
     right, up, _ = seen_axes(AZIMUTH)
-    places = [np.array([right, up]) @ text.get_position_3d() for text in axes.texts[:4]]
-    apart = [np.abs(a - b) for k, a in enumerate(places) for b in places[:k]]
+    positions = [np.array([right, up]) @ text.get_position_3d() for text in axes.texts[:4]]
+    apart = [np.abs(a - b) for k, a in enumerate(positions) for b in positions[:k]]
     assert all(np.max(way) > 0.01 for way in apart)
     assert written[4:6] == ["clip 0", "clip 1"]
 
@@ -381,7 +381,7 @@ def test_places_that_bend_too_much_are_red(report, equilibrium):
     assert np.all((red > blue) | (seen.margin >= 0))
     assert np.all(blue[seen.margin > 0.8] > red[seen.margin > 0.8])
     assert np.any(seen.margin < 0)
-    without = coloring([sight("a", equilibrium, None, extent([equilibrium]))])
+    without = coloring([cable_view("a", equilibrium, None, extent([equilibrium]))])
     assert without.label == "curvature [1/m]"
     assert not without.is_margin
 

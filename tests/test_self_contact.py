@@ -21,15 +21,15 @@ def coil(elements: int) -> tuple[Curve, jax.Array]:
     """A helix of one and a half turns, not quite a smooth one, and random rotation axes."""
     rng = np.random.default_rng(0)
     angles = np.linspace(0.0, 3.2 * np.pi, elements + 1)
-    places = np.stack([0.1 * np.cos(angles), 0.1 * np.sin(angles), 0.005 * angles], axis=1)
-    places /= np.sum(np.linalg.norm(np.diff(places, axis=0), axis=1))
-    tangents = np.gradient(places, axis=0) + 0.02 / elements * rng.normal(size=places.shape)
+    positions = np.stack([0.1 * np.cos(angles), 0.1 * np.sin(angles), 0.005 * angles], axis=1)
+    positions /= np.sum(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    tangents = np.gradient(positions, axis=0) + 0.02 / elements * rng.normal(size=positions.shape)
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
     axes, _ = np.linalg.qr(rng.normal(size=(elements + 1, 3, 3)))
     s, free, radius = np.linspace(0.0, 1.0, elements + 1), np.ones(elements + 1), np.full(elements, 0.01)
     axes = jnp.asarray(np.moveaxis(axes, 0, -1))
     return Curve(
-        jnp.asarray(s), jnp.asarray(places), jnp.asarray(tangents.T), axes, *map(jnp.asarray, (free, radius))
+        jnp.asarray(s), jnp.asarray(positions), jnp.asarray(tangents.T), axes, *map(jnp.asarray, (free, radius))
     ), axes
 
 
@@ -44,11 +44,11 @@ def test_first_and_second_derivatives_of_gaps_are_those_of_jax():
     moves = jnp.asarray(rng.normal(size=(elements + 1, 3)))
     turns = jnp.asarray(rng.normal(size=(3, elements + 1)))
 
-    def gaps(places, rotation):
+    def gaps(displacements, rotation):
         turn = jnp.einsum("cbn,bn->cn", axes, rotation)
         across = jnp.cross(turn, curve.tangents, axis=0)
         tangents = curve.tangents + across + jnp.cross(turn, across, axis=0) / 2
-        moved = curve._replace(places=curve.places + places, tangents=tangents)
+        moved = curve._replace(positions=curve.positions + displacements, tangents=tangents)
         return jnp.where(found.exists, self_contact._gaps(moved, found)[0], 0.0)
 
     def by_jax(moves, turns):

@@ -60,14 +60,14 @@ def clearance(equilibrium: Equilibrium, obstacles: Any, points: Any = None) -> C
 
 @over_leading_axes
 def _clearance(equilibrium: Equilibrium, obstacles: tuple[Obstacle, ...], fractions: Float[Array, "p"]) -> Clearance:
-    s = places(equilibrium, fractions)
+    s = arclengths_between(equilibrium, fractions)
     positions = equilibrium.position_at(s)
     radius = radius_at(equilibrium.scene.rod, s)
     each = [_nearest(obstacle, s, positions, radius) for obstacle in obstacles]
     return jax.tree.map(lambda *values: jnp.stack(values), *each)
 
 
-def places(equilibrium: Equilibrium, fractions: Float[Numbers, "p"]) -> Float[Array, "k"]:
+def arclengths_between(equilibrium: Equilibrium, fractions: Float[Numbers, "p"]) -> Float[Array, "k"]:
     """The arclengths of the nodes, and of places at these fractions of the way between them, 0 the first."""
     nodes = equilibrium.s
     between = nodes[:-1, None] + jnp.asarray(fractions, nodes.dtype)[None] * jnp.diff(nodes)[:, None]
@@ -83,7 +83,7 @@ def _nearest(
     obstacle: Obstacle, s: Float[Array, "k"], positions: Float[Array, "k 3"], radius: Float[Array, "k"]
 ) -> Clearance:
     # The search needs no derivatives; those of the place found cost as much as one place.
-    fixed, *places = jax.lax.stop_gradient((obstacle, positions, radius))
-    nearest = jnp.argmin(fixed.distance(places[0]) - places[1])
+    fixed, *points = jax.lax.stop_gradient((obstacle, positions, radius))
+    nearest = jnp.argmin(fixed.distance(points[0]) - points[1])
     distance = obstacle.at(positions[nearest]) - radius[nearest]
     return Clearance(distance, s[nearest], positions[nearest])

@@ -38,7 +38,7 @@ from rodjax.analysis.shooting import (
     met,
     misses,
     rotation_of,
-    station_places,
+    station_arclengths,
     turn_between,
 )
 from rodjax.checks import instance, is_known, positive, whole_number
@@ -54,7 +54,7 @@ from rodjax.mechanics.energy import (
     twist_under,
 )
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_places
+from rodjax.model.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_arclengths
 from rodjax.model.supports import Clamp, Directed, Pin
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, warn_of_outcome
@@ -350,7 +350,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     fixed, fixed_units = jax.lax.stop_gradient((scene, units))
     x = guess.s / guess.s[-1]
     node_force, growth = _growth_along(fixed, guess, fixed_units)
-    at = station_places(scene, x, growth, intervals)
+    at = station_arclengths(scene, x, growth, intervals)
 
     fixed_s = jax.lax.stop_gradient(at.s)
     reference = _frames_between(x, guess.frames, guess.total_twist, fixed_s)
@@ -365,8 +365,8 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     if scene.clips:
         force = _forces_along(fixed, guess, fixed_units, fixed_s)
         moment = moment.at[at.clips].set(_moments_beyond_clips(fixed, x, tangents, moments))
-    places = sliding_places(fixed)
-    return Start.near(guess, fixed_units, at, reference, force, moment, places)
+    arclengths = sliding_arclengths(fixed)
+    return Start.near(guess, fixed_units, at, reference, force, moment, arclengths)
 
 
 def _moments_beyond_clips(
@@ -414,7 +414,7 @@ def _equilibrium(
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
     equal = jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)
-    s = QuadraticRotationElements.of(scaled, equal).places
+    s = QuadraticRotationElements.of(scaled, equal).arclengths
     station = jnp.searchsorted(start.s, s, side="right") - 1
     before = jax.tree.map(lambda leaf: leaf[station], sections)
     length = s - start.s[station]

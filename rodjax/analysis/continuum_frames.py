@@ -33,7 +33,7 @@ from rodjax.analysis.shooting import (
     met,
     misses,
     rotation_of,
-    station_places,
+    station_arclengths,
     sum_of_loads,
 )
 from rodjax.discretization.cells import ElementCells, varying
@@ -345,10 +345,10 @@ class _Along(eqx.Module):
     the growth of errors to the nodes.
     """
 
-    places: Float[Array, "m"]
+    arclengths: Float[Array, "m"]
     forces: Float[Array, "3 m"]
     moments: Float[Array, "3 m"]
-    frame_places: Float[Array, "k"]
+    frame_arclengths: Float[Array, "k"]
     quaternions: Float[Array, "4 k"]
     s: Float[Array, "n+1"]
     growth: Float[Array, "n+1"]
@@ -361,17 +361,19 @@ def _along(guess: Equilibrium, units: Units) -> _Along:
     assert isinstance(point, FramePoint)
     by_cells = form.forces(point.quaternions, point.end_force)
     own = own_moments(form, point)
-    at = form.field.strain_places
-    places = jnp.concatenate([at[0], at[-1, -1:]])
+    at = form.field.strain_arclengths
+    arclengths = jnp.concatenate([at[0], at[-1, -1:]])
     forces = jnp.concatenate([by_cells[:, 0], by_cells[:, -1, -1:]], axis=1)
     moments = jnp.concatenate([-own[:, 0, :1], own[:, -1]], axis=1)
     scales = guess.state.units.force / units.force, guess.state.units.energy / units.energy
     forces, moments = scales[0] * forces, scales[1] * moments
 
     s = guess.s / guess.s[-1]
-    size = jnp.interp(s, places, jnp.sqrt(dot(forces, forces)))
+    size = jnp.interp(s, arclengths, jnp.sqrt(dot(forces, forces)))
     squared = (guess.curvature**2 + guess.twist**2) * units.length**2
-    return _Along(places, forces, moments, form.field.places, point.quaternions, s, error_growth(s, size, squared))
+    return _Along(
+        arclengths, forces, moments, form.field.arclengths, point.quaternions, s, error_growth(s, size, squared)
+    )
 
 
 @jax.jit
@@ -384,16 +386,16 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     """Stations where errors grow equally, at the point forces and at jumps; their values from a guess."""
     fixed_units = jax.lax.stop_gradient(units)
     along = _along(guess, fixed_units)
-    at = station_places(scene, along.s, along.growth, intervals, varying(scene))
+    at = station_arclengths(scene, along.s, along.growth, intervals, varying(scene))
 
     fixed_s = jax.lax.stop_gradient(at.s)
 
-    def between(places: Float[Array, "m"], values: Float[Array, "c m"]) -> Float[Array, "c k"]:
-        return jnp.stack([jnp.interp(fixed_s, places, component) for component in values])
+    def between(arclengths: Float[Array, "m"], values: Float[Array, "c m"]) -> Float[Array, "c k"]:
+        return jnp.stack([jnp.interp(fixed_s, arclengths, component) for component in values])
 
-    quaternions = unit(between(along.frame_places, along.quaternions))
+    quaternions = unit(between(along.frame_arclengths, along.quaternions))
     reference = jnp.moveaxis(columns(quaternions), 2, 0)
-    force, moment = between(along.places, along.forces).T, between(along.places, along.moments).T
+    force, moment = between(along.arclengths, along.forces).T, between(along.arclengths, along.moments).T
     return Start.near(guess, fixed_units, at, reference, force, moment)
 
 
@@ -404,22 +406,22 @@ def _equilibrium(
     scaled, _ = nondimensional(scene)
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
-    s = ElementCells.of(scaled, jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)).places
+    s = ElementCells.of(scaled, jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)).arclengths
     station = jnp.searchsorted(start.s, s, side="right") - 1
     count = len(start.s) - 1
     intervals = _intervals(start)
-    of_points = intervals[jnp.minimum(station, count - 1)]
-    # One program for the intervals and for the ways to the points.
+    to_points = intervals[jnp.minimum(station, count - 1)]
+    # One program for the intervals and from the stations to the points.
     both = jnp.concatenate([jnp.arange(count, dtype=station.dtype), station])
     lengths = jnp.concatenate([jnp.diff(start.s), s - start.s[station]])
     before = jax.tree.map(lambda leaf: leaf[both], sections)
-    reached, ends = _reached(scaled, rtol, before, start.s[both], lengths, jnp.concatenate([intervals, of_points]))
+    reached, ends = _reached(scaled, rtol, before, start.s[both], lengths, jnp.concatenate([intervals, to_points]))
     points = jax.tree.map(lambda leaf: leaf[count:], reached)
     reached, ends = jax.tree.map(lambda leaf: leaf[:count], (reached, ends))
 
     s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
     strained = jax.vmap(functools.partial(_strained, Material.of(scaled)))(
-        s, of_points[::2], nodes.frame, nodes.force, nodes.moment
+        s, to_points[::2], nodes.frame, nodes.force, nodes.moment
     )
     strains = strained.strains.T
     quaternions = continuous(jax.vmap(from_frame, out_axes=1)(points.frame))

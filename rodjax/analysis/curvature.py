@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.analysis.clearance import POINTS, places
+from rodjax.analysis.clearance import POINTS, arclengths_between
 from rodjax.checks import instance, leaf
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
@@ -58,7 +58,7 @@ def within_elements(equilibrium: Equilibrium) -> Float[Array, "k"]:
     """Places of elements, just beside the nodes too: at a clip that holds a direction the curvature jumps."""
     inset = float(jnp.finfo(equilibrium.s.dtype).eps) ** 0.5
     fractions = np.array([inset, *(np.arange(1, POINTS + 1) / (POINTS + 1)), 1 - inset])
-    return places(equilibrium, fractions)[:-1]
+    return arclengths_between(equilibrium, fractions)[:-1]
 
 
 def curvature_within(equilibrium: Equilibrium, s: Float[Array, "k"]) -> Float[Array, "k"]:

@@ -11,7 +11,7 @@ from rodjax.checks import instance, leaf, number_array
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline, twist_reference
 from rodjax.discretization.first_twist import FirstTwist
-from rodjax.model.scene import Scene, has_node_places, has_potential, nondimensional
+from rodjax.model.scene import Scene, has_node_positions, has_potential, nondimensional
 from rodjax.model.supports import Clamp, Held
 
 
@@ -70,7 +70,7 @@ def _check(scene: Scene) -> None:
         "loads without a potential": not has_potential(scene),
         "loads along the rod": bool(scene.distributed),
         "clips": bool(scene.clips),
-        "obstacles or fields": has_node_places(scene),
+        "obstacles or fields": has_node_positions(scene),
     }
     for what, holds in unfit.items():
         if holds:

@@ -82,10 +82,10 @@ def _samples(equilibrium: Equilibrium, cell: Int[np.ndarray, "k"], fraction: Flo
     s[..., is_node] = nodes[..., number]
     positions[..., is_node, :] = np.asarray(equilibrium.nodes)[..., number, :]
 
-    def between(values, places=nodes) -> np.ndarray:
-        return _interpolated(s, places, np.asarray(values))
+    def between(values, arclengths=nodes) -> np.ndarray:
+        return _interpolated(s, arclengths, np.asarray(values))
 
-    places, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
+    arclengths, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
     tension = between(equilibrium.tension) if force is None else np.sum(force * frames[..., 2], axis=-1)
     contact = None
     if equilibrium.scene.obstacles:
@@ -99,7 +99,7 @@ def _samples(equilibrium: Equilibrium, cell: Int[np.ndarray, "k"], fraction: Flo
         is_node,
         positions,
         frames,
-        between(curvature, places),
+        between(curvature, arclengths),
         between(equilibrium.twist),
         tension,
         force,
@@ -109,10 +109,10 @@ def _samples(equilibrium: Equilibrium, cell: Int[np.ndarray, "k"], fraction: Flo
     )
 
 
-def _interpolated(s: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolated(s: np.ndarray, arclengths: np.ndarray, values: np.ndarray) -> np.ndarray:
     if s.ndim == 1:
-        return np.interp(s, places, values)
-    return np.stack([np.interp(*row) for row in zip(s, places, values, strict=True)])
+        return np.interp(s, arclengths, values)
+    return np.stack([np.interp(*row) for row in zip(s, arclengths, values, strict=True)])
 
 
 @over_leading_axes
@@ -132,9 +132,9 @@ def _along(equilibrium: Equilibrium, cell: Int[Array, "k"], fraction: Float[Arra
     slopes = (1 + equilibrium.axial_strain)[:, None] * equilibrium.tangents
     if rod.GA is not None:
         slopes = jax.jvp(equilibrium.position_at, (nodes,), (jnp.ones_like(nodes),))[1]
-    places = (equilibrium.nodes - units.origin[None]) / units.length
+    positions = (equilibrium.nodes - units.origin[None]) / units.length
     loads = section_loads(form, point)
-    force, moment = loads_between(loads, places, slopes, nodes / units.length, cell, fraction)
+    force, moment = loads_between(loads, positions, slopes, nodes / units.length, cell, fraction)
     return s, centerline, frames, radius, force * units.force, moment * units.energy
 
 

@@ -70,7 +70,7 @@ class Stations(eqx.Module):
     """The unknowns, and the residuals between them. Forces and moments in units of the `Start`'s scales.
 
     `turn`: Rodrigues vector 2 tan(angle/2) axis of the rotation from the guess's material frame, in the axes of that;
-    its pole, half a turn, is far from an equilibrium near the guess. `places`: arclengths of the sliding clips, and in
+    its pole, half a turn, is far from an equilibrium near the guess. `arclengths`: of the sliding clips, and in
     residuals what these apply to the rod along its tangent; `None` where there are none.
     """
 
@@ -78,7 +78,7 @@ class Stations(eqx.Module):
     turn: Float[Array, "k 3"]
     force: Float[Array, "k 3"]
     moment: Float[Array, "k 3"]
-    places: Float[Array, "slides"] | None = None
+    arclengths: Float[Array, "slides"] | None = None
 
 
 class Start(eqx.Module):
@@ -105,7 +105,7 @@ class Start(eqx.Module):
         frames: Float[Array, "k 3 3"],
         force: Float[Array, "k 3"],
         moment: Float[Array, "k 3"],
-        places: Float[Array, "slides"] | None = None,
+        arclengths: Float[Array, "slides"] | None = None,
     ) -> "Start":
         """On the centerline of a guess, with its frames, forces and moments at the stations, nondimensional."""
         position = (guess.position_at(jax.lax.stop_gradient(at.s) * guess.s[-1]) - units.origin[None]) / units.length
@@ -113,7 +113,7 @@ class Start(eqx.Module):
             jnp.maximum(1.0, jnp.sqrt(jnp.max(jnp.sum(v**2, axis=1)))) for v in (force, moment)
         )
         turn = jnp.zeros_like(position)
-        stations = Stations(position, turn, force / force_scale, moment / moment_scale, places)
+        stations = Stations(position, turn, force / force_scale, moment / moment_scale, arclengths)
         return Start(stations, at.s, at.force_steps, frames, force_scale, moment_scale, at.clips, at.loaded)
 
     def sections(self, stations: Stations) -> Section:
@@ -125,12 +125,12 @@ class Start(eqx.Module):
 
     def slid(self, scene: Scene, stations: Stations) -> tuple[Scene, "Start"]:
         """With the sliding clips where the stations have them."""
-        if stations.places is None:
+        if stations.arclengths is None:
             return scene, self
         assert self.clips is not None
         sliding = np.array([k for k, clip in enumerate(scene.clips) if clip.sliding])
-        s = self.s.at[self.clips[sliding]].set(stations.places)
-        return slid(scene, stations.places), eqx.tree_at(lambda start: start.s, self, s)
+        s = self.s.at[self.clips[sliding]].set(stations.arclengths)
+        return slid(scene, stations.arclengths), eqx.tree_at(lambda start: start.s, self, s)
 
 
 def error_growth(
@@ -152,7 +152,7 @@ class StationPlaces(NamedTuple):
     loaded: Int[Array, "loads"] | None
 
 
-def station_places(
+def station_arclengths(
     scene: Scene,
     s: Float[Array, "n+1"],
     growth: Float[Array, "n+1"],
@@ -253,7 +253,7 @@ def _with_loads(scene: Scene, start: Start, gaps: Stations, after: Section) -> S
             moment = moment.at[number - 1].add(value / start.moment_scale)
         else:
             force = force.at[number - 1].add(value / start.force_scale)
-    return Stations(gaps.position, gaps.turn, force, moment, gaps.places)
+    return Stations(gaps.position, gaps.turn, force, moment, gaps.arclengths)
 
 
 def _with_clips(scene: Scene, start: Start, gaps: Stations, after: Section, reached: Section) -> Stations:
@@ -318,8 +318,8 @@ class Reached(eqx.Module):
 
 def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any, reached: Reached) -> Equilibrium:
     """The result in SI units."""
-    if stations.places is not None:
-        scene = slid(scene, stations.places * scene.rod.length)
+    if stations.arclengths is not None:
+        scene = slid(scene, stations.arclengths * scene.rod.length)
     scaled, units = nondimensional(scene)
     sections = start.sections(stations)
     first, last = (jax.tree.map(lambda leaf, k=k: leaf[k], sections) for k in (0, -1))
@@ -358,7 +358,7 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         substeps=none + 1,
         residual=residual,
         scene=scene,
-        state=SolverState(reached.shape, end_force, units, stations.places, reached.clip_moments),
+        state=SolverState(reached.shape, end_force, units, stations.arclengths, reached.clip_moments),
         discretization="continuum",
         shear_strain=reached.shear_strain,
     )

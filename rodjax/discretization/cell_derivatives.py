@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import REFERENCE, Cells, Strains
-from rodjax.discretization.rest_ways import RestWays, part
+from rodjax.discretization.rest_correction import RestCorrection, part
 from rodjax.geometry.rotations import columns, rotated
 from rodjax.geometry.vectors import cross, diagonal, dot, skew
 from rodjax.linalg.blocks import product, short_sum, transpose_product
@@ -26,14 +26,14 @@ from rodjax.mechanics.energy import Sections
 
 
 class CellStates(NamedTuple):
-    """Of all cells: frames, the forces through them, and of the rod at rest strains and ways."""
+    """Of all cells: frames, the forces through them, and of the rod at rest the strains and the correction."""
 
     field: Cells
     sections: Sections
     quaternions: Float[Array, "4 p n"]
     forces: Float[Array, "3 p n"]
     rest_strains: Float[Array, "3 p n"] | None
-    rest_ways: RestWays | None
+    rest_correction: RestCorrection | None
 
     @property
     def acting(self) -> slice:
@@ -45,24 +45,25 @@ class CellStates(NamedTuple):
     @property
     def is_separable(self) -> bool:
         """Whether each strain and each acting force adds to the density on its own."""
-        return self.sections.law is None and (self.rest_ways is None or self.rest_ways.along is None)
+        return self.sections.law is None and (self.rest_correction is None or self.rest_correction.along is None)
 
     @property
     def turning(self) -> Float[Array, "3 n"] | None:
-        return None if self.rest_ways is None else self.rest_ways.turning
+        return None if self.rest_correction is None else self.rest_correction.turning
 
 
 class CellDerivatives(NamedTuple):
     """Of the Lagrangian of each cell, by the rotations of its frames in their own axes and by the force through it.
 
-    `second`: [i, a, j, b] by component a of frame i and b of frame j; `way`: the reverse of the derivative by the
-    force; `by_force`: [a, c, i] by component a of frame i and c of the force; `compliance`: of the way.
+    `second`: [i, a, j, b] by component a of frame i and b of frame j; `segment_vectors`: minus the
+    derivative by the force; `by_force`: [a, c, i] by component a of frame i and c of the force; `compliance`: the
+    derivative of the segment vector by the force.
     """
 
     value: Float[Array, "n"]
     first: Float[Array, "3 p n"]
     second: Float[Array, "p 3 p 3 n"]
-    way: Float[Array, "3 n"]
+    segment_vectors: Float[Array, "3 n"]
     by_force: Float[Array, "3 3 p n"]
     compliance: Float[Array, "3 3 n"]
 
@@ -96,9 +97,9 @@ def density(cells: CellStates, strains: Float[Array, "v p n"]) -> Float[Array, "
     else:
         enthalpy = sections.density(bent, twist, axial) - tension * (1 + sections.stretched(axial))
     value = cells.field.lengths * enthalpy
-    if cells.rest_ways is not None and cells.rest_ways.along is not None:
+    if cells.rest_correction is not None and cells.rest_correction.along is not None:
         assert cells.rest_strains is not None
-        value -= cells.rest_ways.along * part(strains[:2], cells.rest_strains[:2]) * tension
+        value -= cells.rest_correction.along * part(strains[:2], cells.rest_strains[:2]) * tension
     return value
 
 
@@ -161,16 +162,16 @@ def derivatives(cells: CellStates) -> CellDerivatives:
         _add_mixed(blocks, mixed, turned)
         by_force += jnp.stack([short_sum(product(rows, forcing), axis=2) for rows in mixed], axis=2)
 
-    way = -short_sum(dot(by_forces[:, None], forcing), axis=1)
+    segment_vectors = -short_sum(dot(by_forces[:, None], forcing), axis=1)
     value = jnp.sum(density(cells, values), axis=0)
     if cells.turning is not None:
         rest = rotated(cells.quaternions[:, REFERENCE], cells.turning)
-        way += rest
+        segment_vectors += rest
         value -= dot(cells.forces[:, REFERENCE], rest)
     first = _by_rotations(cells, here, slopes, by_forces, turning)
     second = jnp.stack([jnp.stack(row, axis=1) for row in blocks])
     compliance = -short_sum(transpose_product(forcing, by_forcing), axis=2)
-    return CellDerivatives(value, first, second, way, by_force, compliance)
+    return CellDerivatives(value, first, second, segment_vectors, by_force, compliance)
 
 
 def _stresses(cells: CellStates, values: Float[Array, "v p n"]) -> tuple[Float[Array, "v p n"], Stiffness]:
@@ -306,8 +307,8 @@ def _curving(
 
 
 def _tilting(cells: CellStates, here: Coordinates, slopes: Float[Array, "f p n"]) -> Float[Array, "3 3 p n"]:
-    """Derivatives of the directors, and of the ways at rest, by the rotations, times those of the value by the acting
-    forces: [a, c, i] as in `CellDerivatives.by_force`.
+    """Derivatives of the directors, and of the correction at rest, by the rotations, times those of the value by the
+    acting forces: [a, c, i] as in `CellDerivatives.by_force`.
     """
     if cells.sections.GA is None:
         by_turns = jnp.stack([-here.directors[:, 1], here.directors[:, 0], jnp.zeros_like(here.directors[:, 0])])

@@ -1,12 +1,12 @@
-"""Cells of a rod whose frames are unknown: between neighbouring frames, what strains, ways and loads they give.
+"""Cells of a rod whose frames are unknown: the strains, segment vectors and loads of neighbouring frames.
 
 Two kinds, as for rods whose tangents suffice: `JointCells`, the finite differences of the report, with a frame at the
 middle of each edge and at both ends, of second order; and `ElementCells`, with frames at both ends and in the middle of
 an element, of fourth order. Both see only rotations between neighbours, so that no parametrisation has a pole.
 
 A cell is strained by what its strains exceed those of the stress-free rod by, where these come from the same formula
-at the frames of the stress-free rod, and its way is made up by what that misses there (`rest_ways`). So a rod at rest
-has no residual on any mesh.
+at the frames of the stress-free rod, and its segment vector is corrected by what the quadrature misses there
+(`rest_correction`). So a rod at rest has no residual on any mesh.
 Arrays have the components first, then the frames of a cell or its strain points, then the cells.
 """
 
@@ -29,7 +29,7 @@ from rodjax.model.along import Steps, stiffness_at, value_at
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, loads_at_nodes
 
-# The one with which turns what a way has beyond that of the strain points: of an edge its own, of an element the middle
+# The frame that turns the correction of a segment vector: of an edge its own, of an element that in the middle.
 REFERENCE = 1
 
 
@@ -47,7 +47,7 @@ class Cells(Protocol):
         ...
 
     @property
-    def places(self) -> Float[Array, "m"]:
+    def arclengths(self) -> Float[Array, "m"]:
         """Arclengths of the frames."""
         ...
 
@@ -67,7 +67,7 @@ class Cells(Protocol):
         ...
 
     @property
-    def strain_places(self) -> Float[Array, "p n"]:
+    def strain_arclengths(self) -> Float[Array, "p n"]:
         """Arclengths of the strain points."""
         ...
 
@@ -92,16 +92,18 @@ class Cells(Protocol):
         """By the coordinates of each other frame."""
         ...
 
-    def ways(self, by_strain: Float[Array, "3 p n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
-        """From node to node, of ways at the strain points and the rest in each cell."""
+    def segment_vectors(
+        self, by_strain: Float[Array, "3 p n"], rest: Float[Array, "3 n"]
+    ) -> Float[Array, "3 segments"]:
+        """From node to node: the sum of weighted slopes at the strain points and of the correction of each cell."""
         ...
 
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
-        """The rests of ways from node to node as those of the cells."""
+        """The corrections of segment vectors as those of the cells."""
         ...
 
     def of_segments(self, by_segment: Float[Array, "segments"]) -> Float[Array, "p n"]:
-        """At each strain point what is given for the way between nodes to which it belongs; zero without such."""
+        """At each strain point what is given for the segment to which it belongs; zero without such."""
         ...
 
     def sections(self, rod: Rod) -> Sections:
@@ -183,7 +185,7 @@ class JointCells(eqx.Module):
         return len(self.s) - 1
 
     @property
-    def places(self) -> Float[Array, "n+2"]:
+    def arclengths(self) -> Float[Array, "n+2"]:
         return jnp.concatenate([self.s[:1], (self.s[:-1] + self.s[1:]) / 2, self.s[-1:]])
 
     @property
@@ -192,7 +194,7 @@ class JointCells(eqx.Module):
 
     @property
     def spacing(self) -> Float[Array, "n+1"]:
-        return jnp.diff(self.places)
+        return jnp.diff(self.arclengths)
 
     @property
     def lengths(self) -> Float[Array, "2 n+1"]:
@@ -207,8 +209,8 @@ class JointCells(eqx.Module):
         return jnp.concatenate([half, none]) + jnp.concatenate([none, half])
 
     @property
-    def strain_places(self) -> Float[Array, "2 n+1"]:
-        return jnp.stack([self.places[:-1], self.places[1:]])
+    def strain_arclengths(self) -> Float[Array, "2 n+1"]:
+        return jnp.stack([self.arclengths[:-1], self.arclengths[1:]])
 
     def gather(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 2 n"]:
         return jnp.stack([by_frame[:, :-1], by_frame[:, 1:]], axis=1)
@@ -229,7 +231,9 @@ class JointCells(eqx.Module):
     def strains(self, seen: Float[Array, "4 1 n"]) -> "JointStrains":
         return JointStrains(seen, self.spacing)
 
-    def ways(self, by_strain: Float[Array, "3 2 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 segments"]:
+    def segment_vectors(
+        self, by_strain: Float[Array, "3 2 n"], rest: Float[Array, "3 n"]
+    ) -> Float[Array, "3 segments"]:
         return by_strain[:, 1, :-1] + by_strain[:, 0, 1:] + rest[:, :-1]
 
     def rest_of(self, by_segment: Float[Array, "3 segments"]) -> Float[Array, "3 n"]:
@@ -239,7 +243,7 @@ class JointCells(eqx.Module):
         return jnp.stack([jnp.pad(by_segment, (1, 0)), jnp.pad(by_segment, (0, 1))])
 
     def sections(self, rod: Rod) -> Sections:
-        a, b = self.places[:-1], self.places[1:]
+        a, b = self.arclengths[:-1], self.arclengths[1:]
         *of_joints, of_edges = rod.stiffnesses
         joints = [stiffness_at(value, (a + b) / 2, a, b) for value in of_joints]
         # The strain of an edge is one, in both of its joints.
@@ -254,7 +258,7 @@ class JointCells(eqx.Module):
         pair, strain = rod.shear_pair, rod.rest_strain
         GA = None if pair is None else jnp.stack([of_both(stiffness_at(value, middles, a, b)) for value in pair])
         rest_axial = None if strain is None else of_both(value_at(strain, middles, a, b))
-        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_places, rod.law, GA, rest_axial)
+        return Sections(jnp.stack([EI1, EI2]), GJ, EA, self.strain_arclengths, rod.law, GA, rest_axial)
 
     def parts_before(self, at: Float[Array, ""]) -> Float[Array, "2 n+1"]:
         of_edges = jnp.clip((at - self.s[:-1]) / jnp.diff(self.s), 0.0, 1.0)
@@ -282,17 +286,17 @@ class ElementCells(eqx.Module):
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "ElementCells":
         """On these nodes, moved so that one lies at each clip, each point force and each jump of the rod."""
-        places = [load.at for load in scene.point_forces] + [jump for steps in varying(scene) for jump in steps]
+        arclengths = [load.at for load in scene.point_forces] + [jump for steps in varying(scene) for jump in steps]
         if scene.clips:
-            return ElementCells(*with_nodes_at_clips(scene, s, places))
-        return ElementCells(with_nodes_at(s, jnp.sort(jnp.stack(places)), may_repeat=True) if places else s)
+            return ElementCells(*with_nodes_at_clips(scene, s, arclengths))
+        return ElementCells(with_nodes_at(s, jnp.sort(jnp.stack(arclengths)), may_repeat=True) if arclengths else s)
 
     @property
     def h(self) -> Float[Array, "n"]:
         return jnp.diff(self.s)
 
     @property
-    def places(self) -> Float[Array, "m"]:
+    def arclengths(self) -> Float[Array, "m"]:
         return interleaved(self.s, (self.s[:-1] + self.s[1:]) / 2)
 
     @property
@@ -308,7 +312,7 @@ class ElementCells(eqx.Module):
         return self.scatter_add(self.lengths)
 
     @property
-    def strain_places(self) -> Float[Array, "3 n"]:
+    def strain_arclengths(self) -> Float[Array, "3 n"]:
         return jnp.stack([self.s[:-1], (self.s[:-1] + self.s[1:]) / 2, self.s[1:]])
 
     def gather(self, by_frame: Float[Array, "c m"]) -> Float[Array, "c 3 n"]:
@@ -328,7 +332,7 @@ class ElementCells(eqx.Module):
     def strains(self, seen: Float[Array, "3 2 n"]) -> ElementStrains:
         return ElementStrains(seen, self.h)
 
-    def ways(self, by_strain: Float[Array, "3 3 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    def segment_vectors(self, by_strain: Float[Array, "3 3 n"], rest: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         return short_sum(by_strain, axis=1) + rest
 
     def rest_of(self, by_segment: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
@@ -338,7 +342,7 @@ class ElementCells(eqx.Module):
         return jnp.stack([by_segment] * 3)
 
     def sections(self, rod: Rod) -> Sections:
-        s = self.strain_places
+        s = self.strain_arclengths
         a, b = (jnp.broadcast_to(end[None], s.shape) for end in (self.s[:-1], self.s[1:]))
         EI1, EI2, GJ, EA = (stiffness_at(value, s, a, b) for value in rod.stiffnesses)
         GA = None if rod.shear_pair is None else jnp.stack([stiffness_at(value, s, a, b) for value in rod.shear_pair])
@@ -376,10 +380,12 @@ def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbe
     length = xp.asarray(scene.rod.length)[..., None]
     others = [xp.asarray(held.at)[..., None] for held in (*scene.clips, *scene.point_forces)]
     jumps = xp.concatenate([xp.asarray(steps) for steps in jumps], axis=-1) / length
-    places = xp.concatenate([xp.zeros_like(length), xp.ones_like(length), *(at / length for at in others), jumps], -1)
-    is_apart = xp.diff(xp.sort(places, axis=-1), axis=-1) > SAME_PLACE
-    spans = xp.sum(is_apart.astype(places.dtype), axis=-1)
-    gaps = xp.abs(jumps[..., :, None] - places[..., None, :])
+    arclengths = xp.concatenate(
+        [xp.zeros_like(length), xp.ones_like(length), *(at / length for at in others), jumps], -1
+    )
+    is_apart = xp.diff(xp.sort(arclengths, axis=-1), axis=-1) > SAME_PLACE
+    spans = xp.sum(is_apart.astype(arclengths.dtype), axis=-1)
+    gaps = xp.abs(jumps[..., :, None] - arclengths[..., None, :])
     gap = xp.min(xp.where(gaps > SAME_PLACE, gaps, 1.0), axis=(-2, -1))
     return xp.maximum(spans, xp.ceil(LEAST_ELEMENT / gap * (1 + 1e-9))), gap
 

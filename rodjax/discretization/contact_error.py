@@ -43,13 +43,13 @@ def depths_of_elements(form: NodalForm, point: Any) -> Float[Array, "n"]:
     """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
     beside a held place so much more than it is held there.
     """
-    s, nodes = form.field.s, point.nodal.places
+    s, nodes = form.field.s, point.nodal.positions
     at_nodes = form.depths_at(nodes, form.radius)
     held = jnp.where(form.is_held, at_nodes, 0.0)
     parts = jnp.array(DEPTH_PLACES, s.dtype)
-    places = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
-    positions = positions_between_nodes(form, point, nodes, places.reshape(-1))
-    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(places.shape)
+    arclengths = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
+    positions = positions_between_nodes(form, point, nodes, arclengths.reshape(-1))
+    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(arclengths.shape)
     at_ends = jnp.where(form.is_held, 0.0, at_nodes)
     depths = jnp.concatenate(
         [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1

@@ -28,12 +28,12 @@ from rodjax.model.supports import Clamp, Directed, Free, Held
 class EdgeTangents(eqx.Module):
     """n edges, of which each is a point; bending and torsion live in the joints between them.
 
-    The edges are equal but for clips, each of which has a node: then `places` are the arclengths of the nodes, and
+    The edges are equal but for clips, each of which has a node: then `arclengths` are those of the nodes, and
     `clip_nodes` the numbers of those at the clips. Where a clip holds the tangent it parts its joint into two halves.
     """
 
     weights: Float[Array, "n"]
-    places: Float[Array, "n+1"] | None = None
+    arclengths: Float[Array, "n+1"] | None = None
     clip_nodes: Int[Array, "clips"] | None = None
 
     @staticmethod
@@ -50,13 +50,13 @@ class EdgeTangents(eqx.Module):
 
     @property
     def s(self) -> Float[Array, "n+1"]:
-        if self.places is not None:
-            return self.places
+        if self.arclengths is not None:
+            return self.arclengths
         return jnp.linspace(0.0, 1.0, self.segments + 1, dtype=self.weights.dtype)
 
     @property
     def finest(self) -> Float[Array, ""]:
-        return self.weights[0] if self.places is None else jnp.min(self.weights)
+        return self.weights[0] if self.arclengths is None else jnp.min(self.weights)
 
     def append_prescribed(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 k"]:
         return with_held_tangents(scene, tangents)
@@ -83,23 +83,23 @@ class EdgeTangents(eqx.Module):
         if self.clip_nodes is None:
             return between.bending_energy(scene.rod)
         whole = between.spacing * density(scene.rod, squared_curvature=between.squared_curvature)
-        energy = jnp.sum(jnp.where(self._is_parted(scene), 0.0, whole))
+        energy = jnp.sum(jnp.where(self._is_interrupted(scene), 0.0, whole))
         for _, halves in self.halves(scene, tangents):
             energy += halves.bending_energy(scene.rod)
         return energy
 
     def joints(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Joints:
-        return joints(scene, tangents, None if self.places is None else self.weights)
+        return joints(scene, tangents, None if self.arclengths is None else self.weights)
 
-    def _is_parted(self, scene: Scene) -> Bool[Array, "k"]:
+    def _is_interrupted(self, scene: Scene) -> Bool[Array, "k"]:
         """Which joints a clip parts that holds the tangent."""
         first = int(not isinstance(scene.start, Directed))  # the number of the node of the first joint
         count = self.segments - 1 + int(isinstance(scene.start, Directed)) + int(isinstance(scene.end, Directed))
         nodes = jnp.arange(count) + first
-        parted = jnp.zeros(count, bool)
+        is_interrupted = jnp.zeros(count, bool)
         for held in held_nodes(scene, self.clip_nodes):
-            parted |= nodes == held.node
-        return parted
+            is_interrupted |= nodes == held.node
+        return is_interrupted
 
     def halves(self, scene: Scene, tangents: Float[Array, "3 n"]) -> list[tuple[Int[Array, ""], Joints]]:
         """Of each clip that holds the tangent the edge behind it, and the joints of the edges beside with the clip."""
@@ -118,8 +118,8 @@ class EdgeTangents(eqx.Module):
         derivatives = bending_derivatives(scene.rod, between, (bases[..., :-1], bases[..., 1:]))
         if self.clip_nodes is None:
             return between.bending_energy(scene.rod), self._blocks(*scatter_add(scene, derivatives, self.segments))
-        parted = self._is_parted(scene)
-        derivatives = jax.tree.map(lambda derivative: jnp.where(parted, 0.0, derivative), derivatives)
+        is_interrupted = self._is_interrupted(scene)
+        derivatives = jax.tree.map(lambda derivative: jnp.where(is_interrupted, 0.0, derivative), derivatives)
         gradient, diagonal, lower = scatter_add(scene, derivatives, self.segments)
         of_edges = self.basis(scene, bases)
         for edge, halves in self.halves(scene, tangents):
@@ -158,7 +158,7 @@ class EdgeTangents(eqx.Module):
 
     def tangents_at_nodes(self, scene: Scene, tangents: Float[Array, "3 n"]) -> Float[Array, "3 n-1"]:
         """At the nodes between the ends: on the arc between those of the edges beside, or as a clip holds it."""
-        if self.places is None:
+        if self.arclengths is None:
             inner = tangents[:, :-1] + tangents[:, 1:]
         else:
             inner = self.weights[None, 1:] * tangents[:, :-1] + self.weights[None, :-1] * tangents[:, 1:]
@@ -178,7 +178,7 @@ class EdgeTangents(eqx.Module):
         return by_side[..., 0, :]
 
     def loads_beyond(self, scene: Scene) -> Float[Array, "3 1 n"]:
-        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.places).T)[:, None]
+        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.arclengths).T)[:, None]
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 n"], lengths: Float[Array, "n"]) -> Float[Array, ""]:
         """Largest component of the force on a free node."""

@@ -126,18 +126,18 @@ def correction(
     point: Point,
     here: Linearization,
     gradient: Float[Array, "b m"],
-    closure: Float[Array, "k"],
+    constraint_residual: Float[Array, "k"],
     axis: Float[Array, "3"],
 ) -> tuple[Motion, Bool[Array, ""]]:
-    """What takes a gradient and a closure away to leading order, and whether it is so soft a motion that it may be a
-    turn of the whole rod which nothing resists: however little the moment about its axis is, the regular system lets it
-    turn the rod far. The turn about the given axis, zero for none, is taken out.
+    """The motion that cancels a gradient and a constraint residual to leading order, and whether it is so
+    soft that it may be a turn of the whole rod which nothing resists: however small the moment about its axis, the
+    regular system lets it turn the rod far. The turn about the given axis, zero for none, is taken out.
     """
-    motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -closure)[1:])
+    motion = Motion(*factor_and_solve(form.regular(here.system), -gradient, -constraint_residual)[1:])
     if not form.has_potential:
         return motion, jnp.array(False)
-    places = motion.rotation.shape[1]
-    work = jnp.abs(jnp.sum(motion.rotation * gradient)) * places
+    points = motion.rotation.shape[1]
+    work = jnp.abs(jnp.sum(motion.rotation * gradient)) * points
     is_soft = work < SOFT * jnp.sum(motion.rotation**2)
     return motion.without(turn_about(form, point, here, axis)), is_soft
 
@@ -160,9 +160,9 @@ def errors_of_differences(
     scene = form.scene
     elements, begin = on_elements(form, point, at_nodes)
     here = elements.linearized(begin)
-    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, axis)
-    change = elements.layout.forces(elements.closure(motion.multipliers))
-    end = elements.moved(begin, here.bases, motion.rotation, change)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.constraint_residual, axis)
+    change = elements.layout.forces(elements.force_components(motion.multipliers))
+    end = elements.retract(begin, here.bases, motion.rotation, change)
     found, better = resultants(form, point), resultants(elements, end)
     curvature = jnp.max(jnp.abs(better.curvature - found.curvature))
     moments = [better.start_moment - found.start_moment, better.end_moment - found.end_moment]
@@ -226,27 +226,35 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     couples = jnp.concatenate([none, at_end], axis=1) + jnp.concatenate([at_start, none], axis=1)
     by_rotation = -cross(nodes, couples)  # a displacement of the tangent along e turns it about t x e
     gradient = jnp.zeros_like(here.gradient).at[:, ::2].set(components(here.bases[..., ::2], by_rotation))
-    closure = -form.layout.components(form.layout.sums(gap))
+    constraint_residual = -form.layout.components(form.layout.sums(gap))
     if form.has_torsion:
         missing = jnp.sum(bulge(passed) - bulge([nodes[:, :-1], middles, nodes[:, 1:]]))
-        between = jnp.zeros(len(here.closure) - len(closure) - 1, closure.dtype)  # what pushes at the nodes
-        closure = jnp.concatenate([missing[None], *([between] if len(between) else []), closure])
-    elif len(here.closure) > len(closure):
-        closure = jnp.concatenate([jnp.zeros(len(here.closure) - len(closure), closure.dtype), closure])
-    motion, is_soft = correction(form, point, here, gradient, closure, axis)
+        # What pushes at the nodes has no residual.
+        between = jnp.zeros(len(here.constraint_residual) - len(constraint_residual) - 1, constraint_residual.dtype)
+        constraint_residual = jnp.concatenate(
+            [missing[None], *([between] if len(between) else []), constraint_residual]
+        )
+    elif len(here.constraint_residual) > len(constraint_residual):
+        constraint_residual = jnp.concatenate(
+            [
+                jnp.zeros(len(here.constraint_residual) - len(constraint_residual), constraint_residual.dtype),
+                constraint_residual,
+            ]
+        )
+    motion, is_soft = correction(form, point, here, gradient, constraint_residual, axis)
 
-    force_change = form.layout.forces(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.force_components(motion.multipliers))
     turned = short_sum(here.bases * motion.rotation[None], axis=1)
     end_force = point.end_force + force_change
-    ways, change = jax.jvp(
+    segment_vectors, change = jax.jvp(
         lambda tangents: form.edges(MixedPoint(tangents, end_force, point.total_twist)), (tangents,), (turned,)
     )
-    ways = (ways + change - form.edges(point)).T + gap
-    sums = partial_sums(ways)
+    segment_vectors = (segment_vectors + change - form.edges(point)).T + gap
+    sums = partial_sums(segment_vectors)
     displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
-    moved = form.moved(point, here.bases, motion.rotation, force_change)
-    axial = _axial_error(form, form, moved, point)
+    retracted = form.retract(point, here.bases, motion.rotation, force_change)
+    axial = _axial_error(form, form, retracted, point)
 
     # The first multiplier is the torque, where there is one.
     torque_change = motion.multipliers[0] if form.has_torsion or not form.has_potential else jnp.zeros_like(torque)

@@ -88,10 +88,10 @@ class Polyline(Shape):
     def extrapolated(self, older: Any, ratio: Float[Array, ""]) -> "Polyline":
         tangents = self.tangents + ratio * (self.tangents - older.tangents)
         edges = (tangents * (self.lengths / jnp.sqrt(dot(tangents, tangents)))[None]).T
-        ways = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
-        return Polyline(self.nodes[:1] + ways, edges)
+        offsets = jnp.concatenate([jnp.zeros((1, 3), edges.dtype), jnp.cumsum(edges, axis=0)])
+        return Polyline(self.nodes[:1] + offsets, edges)
 
-    def moved(self, displacement: Float[Array, "n+1 3"]) -> "Polyline":
+    def displaced(self, displacement: Float[Array, "n+1 3"]) -> "Polyline":
         return Polyline(self.nodes + displacement, self.edges + jnp.diff(displacement, axis=0))
 
 
@@ -143,8 +143,8 @@ class FiniteDifference(eqx.Module):
         first = int(isinstance(self.scene.start, Held))
         return rows[first : len(rows) - int(isinstance(self.scene.end, Held))]
 
-    def moved(self, polyline: Polyline, displacement: Float[Array, "m 3"]) -> Polyline:
-        return polyline.moved(self._all_nodes(displacement))
+    def displaced(self, polyline: Polyline, displacement: Float[Array, "m 3"]) -> Polyline:
+        return polyline.displaced(self._all_nodes(displacement))
 
     def reference_at(self, polyline: Polyline) -> TwistReference | None:
         """This polyline as the reference of the total twist: no tangent may turn by pi from it."""
@@ -179,7 +179,7 @@ class FiniteDifference(eqx.Module):
 
     def energy_and_gradient(self, polyline: Polyline) -> tuple[Float[Array, ""], Float[Array, "m 3"]]:
         """Potential energy, and its gradient by the displacements."""
-        energy = lambda displacement: self.energies(self.moved(polyline, displacement)).total  # noqa: E731
+        energy = lambda displacement: self.energies(self.displaced(polyline, displacement)).total  # noqa: E731
         return jax.value_and_grad(energy)(self.no_displacement(polyline))
 
     def rounding_floor(self, polyline: Polyline) -> Float[Array, ""]:
@@ -266,8 +266,8 @@ class Preconditioner(eqx.Module):
         stretched = self.per_tension * dot(self.tangents, forces)
         assert isinstance(self.factors, Factors)
         constraints = self.factors.rows.shape[1]
-        closure = (self.tangents @ stretched)[:constraints]
-        rotation, common = self.factors.solve(self.lengths[None] * components(self.bases, forces), closure)
+        constraint_residual = (self.tangents @ stretched)[:constraints]
+        rotation, common = self.factors.solve(self.lengths[None] * components(self.bases, forces), constraint_residual)
         if constraints:
             stretched += self.per_tension * (common @ self.tangents)
         return self.lengths[None] * short_sum(self.bases * rotation[None], axis=1) + stretched[None] * self.tangents
@@ -286,7 +286,7 @@ def _moved_to_ends(guess: Polyline, scene: Scene) -> Polyline:
     ]
     at_start, at_end = offsets[0], offsets[-1]  # the same where only one end is held
     s = jnp.linspace(0.0, 1.0, len(guess.nodes), dtype=guess.nodes.dtype)[:, None]
-    polyline = guess.moved((1 - s) * at_start[None] + s * at_end[None])
+    polyline = guess.displaced((1 - s) * at_start[None] + s * at_end[None])
     nodes = polyline.nodes
     if isinstance(start, Held):
         nodes = nodes.at[0].set(start.position)

@@ -38,7 +38,7 @@ def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
     first, last = (end.position if isinstance(end, Held) else None for end in ends)
     positions = [first, *(clip.position for clip in clips), last]
     zero = jnp.zeros((), s.dtype)
-    places = [zero, *(clip.at for clip in clips), zero + 1]
+    arclengths = [zero, *(clip.at for clip in clips), zero + 1]
     axes = scene_axes(scene)
     held: list[Support] = [scene.start]
     for before, clip, after in zip(positions, clips, positions[2:], strict=False):
@@ -49,7 +49,7 @@ def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:
         held.append(Swivel(clip.position, tangent))
     held.append(scene.end)
     shape = jnp.zeros((len(s), 3), s.dtype)
-    for (start, end), (a, b) in zip(itertools.pairwise(held), itertools.pairwise(places), strict=True):
+    for (start, end), (a, b) in zip(itertools.pairwise(held), itertools.pairwise(arclengths), strict=True):
         length = b - a
         if not isinstance(start, Held):
             assert isinstance(end, Swivel)

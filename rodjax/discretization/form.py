@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.dead_loads import total_force
-from rodjax.discretization.layout import ForceLayout, held_places, nodes_along
+from rodjax.discretization.layout import ForceLayout, held_positions, nodes_along
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import OnElements
 from rodjax.geometry.vectors import dot
@@ -32,25 +32,26 @@ CLOSURE_ROUNDINGS = 64
 class Linearization(eqx.Module):
     """First and second derivatives of L at a point, by rotations in `bases`, by F and by a torque.
 
-    `gradient`: by the rotations; `closure`: by F, what the rod lacks of the span, before it a zero for the torque;
-    `residual`: largest force left on a node; `energy`: L, without the work of a dead moment; `gaps`: of contacts,
-    which `energy` leaves out; `ways`: of the nodes since the last equilibrium, where there is friction.
+    `gradient`: dL by the rotations; `constraint_residual`: dL/dF, the residual of the closure of each span, before it
+    a zero for the torque; `residual`: largest force left on a node; `energy`: L, without the work of a dead moment;
+    `gaps`: of contacts, which `energy` leaves out; `reference_displacements`: of the nodes since the last
+    equilibrium, where there is friction.
     """
 
     bases: Float[Array, "3 b n"]
     gradient: Float[Array, "b n"]
-    closure: Float[Array, "k"]
+    constraint_residual: Float[Array, "k"]
     system: AnySystem
     energy: Float[Array, ""]
     residual: Float[Array, ""]
     gaps: Float[Array, "k n+1"] | None = None
-    ways: Float[Array, "n+1 3"] | None = None
+    reference_displacements: Float[Array, "n+1 3"] | None = None
 
 
 class EndTurn(NamedTuple):
     """What turns with the frame of a clamped end about global axes, beside the position: `rotation`, the rotations at
     the end in the bases of a released linearisation, and what these leave out of the derivatives of L: `torque`, by the
-    axes, of the closure for the torque, `None` where there is none; `first` and `second` ones of L.
+    axes, of the constraint residual of the torque, `None` where there is none; `first` and `second` ones of L.
     """
 
     rotation: Float[Array, "b 3"]
@@ -129,7 +130,7 @@ class Form(eqx.Module):
         return point.total_twist
 
     @abstractmethod
-    def moved(
+    def retract(
         self,
         point: Any,
         bases: Float[Array, "3 b m"],
@@ -137,7 +138,7 @@ class Form(eqx.Module):
         force_change: Float[Array, "3 parts"],
         others: Any = None,
     ) -> Any:
-        """The point turned by rotations in its bases, and under another force; `others`: as of `others`."""
+        """The retraction of a step: rotations in the bases of the point, a change of force, and `others`."""
 
     def no_others(self, point: Any) -> Any:
         """A step that changes nothing of that."""
@@ -155,7 +156,7 @@ class Form(eqx.Module):
         """With held nodes where the supports are."""
         return nodal
 
-    def nodal_moved(self, point: Any, others: Any) -> Any:
+    def retracted_nodal(self, point: Any, others: Any) -> Any:
         """Of a step."""
         return point.nodal
 
@@ -208,9 +209,7 @@ class Form(eqx.Module):
         return here.energy
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
-        """Half of the square of what is out of balance, the closure apart: what a step brings down where no energy is
-        to become least.
-        """
+        """Half of the squared gradient, without the constraint residual: the merit where no minimum is sought."""
         return jnp.sum(here.gradient**2 / self.field.weights[None]) / 2
 
     def sought(
@@ -219,18 +218,20 @@ class Form(eqx.Module):
         """Whether a system, that of a linearisation and stiffer, is one of a minimum; the rotations and multipliers
         that lead there, pushed aside.
         """
-        found = factor_and_solve(system, push - here.gradient, -here.closure, is_regularized=True)
+        found = factor_and_solve(system, push - here.gradient, -here.constraint_residual, is_regularized=True)
         factors, rotation, multipliers = found
         return factors.is_minimum, rotation, multipliers
 
     def coupled(self, point: Any, system: AnySystem) -> AnySystem:
-        """The system of a linearisation with what makes it the derivative of `unbalanced`, if that has no symmetry."""
+        """The system of a linearisation with what makes it the derivative of `residual_vectors`, if that is not
+        symmetric.
+        """
         return system
 
-    def unbalanced(self, point: Any) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        """The gradient and the closure of the linearisation alone."""
+    def residual_vectors(self, point: Any) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        """The gradient and the constraint residual of the linearisation alone."""
         here = self.linearized(point)
-        return here.gradient, here.closure
+        return here.gradient, here.constraint_residual
 
     def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         """L at a point as `Linearization.energy` has it, and what the rod lacks of its spans: for automatic
@@ -276,9 +277,9 @@ class Form(eqx.Module):
         return self.field.clip_nodes
 
     @property
-    def held_places(self) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
+    def held_positions(self) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
         """The positions that are held along the rod, and the numbers of the nodes there."""
-        return held_places(self.scene, self.field.s, self.clip_nodes)
+        return held_positions(self.scene, self.field.s, self.clip_nodes)
 
     def nodes(self, edges: Float[Array, "n 3"]) -> Float[Array, "n+1 3"]:
         """Nodes along the edges, at held places to the last digit."""
@@ -305,7 +306,7 @@ class Form(eqx.Module):
         return None
 
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
-        return self.nodes(self.edges(point)) if point.nodal is None else point.nodal.places
+        return self.nodes(self.edges(point)) if point.nodal is None else point.nodal.positions
 
     def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L."""
@@ -327,7 +328,7 @@ class Form(eqx.Module):
         along = dot(forces, self.tangents_in_clips(point))
         return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
-    def closure(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
+    def force_components(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
         """The part for the forces of the layout, of what is given for all multipliers."""
         return multipliers[len(multipliers) - self.layout.size :]
 
@@ -342,7 +343,7 @@ class Form(eqx.Module):
         of_force = self.force_turned(point, axis)
         return multipliers.at[len(multipliers) - len(of_force) :].set(of_force)
 
-    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+    def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
-        least = CLOSURE_ROUNDINGS * jnp.finfo(closure.dtype).eps
-        return jnp.all(jnp.abs(closure) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))
+        least = CLOSURE_ROUNDINGS * jnp.finfo(constraint_residual.dtype).eps
+        return jnp.all(jnp.abs(constraint_residual) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))

@@ -12,7 +12,7 @@ from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.nodal_forms import NodalFrames, NodalTangents
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import TangentField
-from rodjax.model.scene import Scene, has_node_places
+from rodjax.model.scene import Scene, has_node_positions
 
 
 def form_of(scene: Scene, shape: Shape) -> Form:
@@ -23,8 +23,8 @@ def form_of(scene: Scene, shape: Shape) -> Form:
 def form_on(scene: Scene, field: Any) -> Form:
     """On a mesh that is given: a `TangentField`, or `Cells` of frames."""
     if isinstance(field, JointCells | ElementCells):
-        return NodalFrames.of(scene, field) if has_node_places(scene) else FrameForm.of(scene, field)
-    return NodalTangents.of(scene, field) if has_node_places(scene) else MixedForm.of(scene, field)
+        return NodalFrames.of(scene, field) if has_node_positions(scene) else FrameForm.of(scene, field)
+    return NodalTangents.of(scene, field) if has_node_positions(scene) else MixedForm.of(scene, field)
 
 
 def field_of(scene: Scene, shape: Shape) -> TangentField:

@@ -5,11 +5,12 @@ The mixed form of `mixed`, with a frame R in the place of each tangent. An equil
     L(R, F) = sum h w(strains(R), e) - n . t [h (1 + e) + g rest] - sum n . R rest + sum F . span,
 
 a minimum over the frames and a maximum over the force F of each span; the axial strain e is where dw/de = n . t, and
-both `rest` are what ways at rest have beyond h t (`rest_ways`). Where sections shear, t is their normal d3, and each
-strain point has h (gamma1 d1 + gamma2 d2) in its way too, GA gamma = n . d: shear is a compliance, not an unknown.
-A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between neighbouring
-frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of the three
-rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need elements.
+both `rest` correct the segment vectors at rest (`rest_correction`). Where sections shear, t is their normal d3, and
+each strain point adds h (gamma1 d1 + gamma2 d2) to its segment vector too, GA gamma = n . d: shear is a compliance, not
+an unknown. A frame turns by a vector in its own axes, so that L and its derivatives are sums over the cells between
+neighbouring frames (`cells`, `cell_derivatives`). A clip holds a node, where it holds the direction of the rod two of
+the three rotations of the frame there, and where it holds the twist all three, as a clamp does at an end; clips need
+elements.
 
 Loads without a potential are those of `nodal_forms.NodalFrames`.
 """
@@ -29,7 +30,7 @@ from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.nodes import held_nodes
-from rodjax.discretization.rest_ways import RestWays, part
+from rodjax.discretization.rest_correction import RestCorrection, part
 from rodjax.geometry.rotations import (
     align_tangent,
     columns,
@@ -100,7 +101,8 @@ class Strained(eqx.Module):
     sideways: Float[Array, "3 p n"] | None
 
     @property
-    def ways(self) -> Float[Array, "3 p n"]:
+    def weighted_slopes(self) -> Float[Array, "3 p n"]:
+        """h phi': what each strain point adds to the segment vector."""
         along = self.lengths[None] * self.tangents
         return along if self.sideways is None else along + self.weights[None] * self.sideways
 
@@ -111,14 +113,15 @@ class Strained(eqx.Module):
         return along if self.sideways is None else along + self.sideways
 
     def work(self, forces: Float[Array, "3 p n"]) -> Float[Array, "p n"]:
-        """Of forces on the ways."""
+        """Of forces on the weighted slopes."""
         along = self.lengths * dot(forces, self.tangents)
         return along if self.sideways is None else along + self.weights * dot(forces, self.sideways)
 
 
 class Kinematics(NamedTuple):
-    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the ways at
-    rest what turns with the reference frames, and what lies along the tangents; d1 and d2 where sections shear.
+    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the
+    correction at rest what turns with the reference frames, and what lies along the tangents; d1 and d2 where sections
+    shear.
     """
 
     strains: Float[Array, "3 p n"]
@@ -139,16 +142,16 @@ class HeldFrame(NamedTuple):
 class FrameForm(Form):
     """A nondimensional scene on cells, as a function of a `FramePoint`.
 
-    `rest_strains` and `rest_ways`: of the rod at rest, by the formula of the cells, and what its ways from node to node
-    have beyond that; `loads`: what the dead loads beyond each strain point exert on it; `across`: the normal of the
-    plane in which the rod stays, in the axes of every frame, `None` where it may leave its place in all of space.
+    `rest_strains`: of the rod at rest, by the formula of the cells; `rest_correction`: of its segment vectors; `loads`:
+    what the dead loads beyond each strain point exert on it; `across`: the normal of the plane in which the rod stays,
+    in the axes of every frame, `None` where it may leave its place in all of space.
     """
 
     scene: Scene
     field: Cells
     sections: Sections
     rest_strains: Float[Array, "3 k n"] | None
-    rest_ways: RestWays | None
+    rest_correction: RestCorrection | None
     loads: Float[Array, "3 k n"]
     layout: ForceLayout
     across: Float[Array, "3"] | None = eqx.field(kw_only=True, default=None)
@@ -164,7 +167,7 @@ class FrameForm(Form):
     @property
     def is_free(self) -> Float[Array, "3 m"]:
         """1 for the rotations in the axes of each frame that no support holds, else 0."""
-        free = jnp.ones((3, len(self.field.places)), self.loads.dtype)
+        free = jnp.ones((3, len(self.field.arclengths)), self.loads.dtype)
         for held in self.held_frames:
             free = free.at[: 2 if held.frame is None else 3, held.number].set(0.0)
         return free
@@ -193,7 +196,7 @@ class FrameForm(Form):
         return dataclasses.replace(self, across=None, layout=self.layout.in_axes(None))
 
     def stays_in_plane(self, point: FramePoint) -> Bool[Array, ""]:
-        gradient, _ = dataclasses.replace(self, across=None).unbalanced(point)
+        gradient, _ = dataclasses.replace(self, across=None).residual_vectors(point)
         largest = jnp.max(jnp.abs(self.forces(point.quaternions, point.end_force)))
         return self._residual(gradient - self.projected(gradient)) <= OUT_OF_PLANE * (1 + largest)
 
@@ -250,7 +253,7 @@ class FrameForm(Form):
     def total_twist(self, quaternions: Float[Array, "4 m"]) -> Float[Array, ""]:
         return jnp.sum(self.field.lengths * strains_between(self.field, quaternions)[2])
 
-    def moved(
+    def retract(
         self,
         point: FramePoint,
         bases: Float[Array, "3 3 m"],
@@ -260,7 +263,7 @@ class FrameForm(Form):
     ) -> FramePoint:
         # Rounding would grow with every step.
         quaternions = unit(turned(point.quaternions, rotation))
-        nodal = self.nodal_moved(point, others)
+        nodal = self.retracted_nodal(point, others)
         return FramePoint(quaternions, point.end_force + force_change, point.total_twist, nodal)
 
     # --- forces, and what the spans lack -----------------------------------------------------------------------------
@@ -269,7 +272,7 @@ class FrameForm(Form):
     def spans(self) -> Float[Array, "3 parts"]:
         """Between held places."""
         assert isinstance(self.layout, SpanForces)
-        return self.layout.spans(self.held_places[0])
+        return self.layout.spans(self.held_positions[0])
 
     def tangents_in_clips(self, point: FramePoint) -> Float[Array, "3 clips"]:
         nodes = self.clip_nodes
@@ -308,11 +311,11 @@ class FrameForm(Form):
         strains = field.strains(field.seen(quaternions)[field.coordinates]).values
         if self.rest_strains is not None:
             strains -= self.rest_strains
-        rests = self._rest_of_ways(quaternions, jnp.zeros_like(strains[:, 0]))
+        rests = self._turned_correction(quaternions, jnp.zeros_like(strains[:, 0]))
         along = None
-        if self.rest_ways is not None and self.rest_ways.along is not None:
+        if self.rest_correction is not None and self.rest_correction.along is not None:
             assert self.rest_strains is not None
-            along = self.rest_ways.along * part(strains[:2], self.rest_strains[:2])
+            along = self.rest_correction.along * part(strains[:2], self.rest_strains[:2])
         across = None if self.sections.GA is None else columns(quaternions)[:, :2]
         return Kinematics(strains, tangent(quaternions), rests, along, across)
 
@@ -335,16 +338,24 @@ class FrameForm(Form):
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)
         gather = self.field.gather(quaternions)
-        return CellStates(self.field, self.sections, gather, forces, self.rest_strains, self.rest_ways)
+        return CellStates(self.field, self.sections, gather, forces, self.rest_strains, self.rest_correction)
 
     def edges(self, point: Any) -> Float[Array, "segments 3"]:
         """From node to node."""
         gather = self.field.gather(point.quaternions)
-        ways = self.strained(point).ways
-        return self.field.ways(ways, self._rest_of_ways(gather, jnp.zeros_like(ways[:, 0]))).T
+        weighted_slopes = self.strained(point).weighted_slopes
+        return self.field.segment_vectors(
+            weighted_slopes, self._turned_correction(gather, jnp.zeros_like(weighted_slopes[:, 0]))
+        ).T
 
-    def _rest_of_ways(self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        return nothing if self.rest_ways is None else rotated(quaternions[:, REFERENCE], self.rest_ways.turning)
+    def _turned_correction(
+        self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]
+    ) -> Float[Array, "3 n"]:
+        return (
+            nothing
+            if self.rest_correction is None
+            else rotated(quaternions[:, REFERENCE], self.rest_correction.turning)
+        )
 
     # --- energies ----------------------------------------------------------------------------------------------------
 
@@ -358,7 +369,7 @@ class FrameForm(Form):
         """The potential of dead forces, zero at the origin, where the rod is held; other loads have none."""
         here = self.strained(point)
         work = jnp.sum(here.work(self.loads))
-        rest = self._rest_of_ways(self.field.gather(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
+        rest = self._turned_correction(self.field.gather(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work
 
@@ -370,13 +381,13 @@ class FrameForm(Form):
         """The derivatives of L in each cell by the rotations of its frames, under forces that stay."""
         return first_derivatives(self._cells(quaternions, end_force))
 
-    def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
+    def residual_vectors(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
         """What is out of balance at the frames, in their axes, and what the rod lacks of its spans."""
         gradient = self.field.scatter_add(self.by_rotations(point.quaternions, point.end_force))
-        closure = jnp.zeros(0, gradient.dtype)
+        constraint_residual = jnp.zeros(0, gradient.dtype)
         if self.layout.size:
-            closure = self.layout.components(self.spans - self.layout.sums(self.edges(point).T))
-        return self.projected(gradient), closure
+            constraint_residual = self.layout.components(self.spans - self.layout.sums(self.edges(point).T))
+        return self.projected(gradient), constraint_residual
 
     def by_cells(
         self, point: FramePoint
@@ -408,17 +419,17 @@ class FrameForm(Form):
         assert isinstance(layout, SpanForces)
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         value, dtype = jnp.sum(cells.value), gradient.dtype
-        closure, border = jnp.zeros(0, dtype), jnp.zeros((3, 0, gradient.shape[1]), dtype)
+        constraint_residual, border = jnp.zeros(0, dtype), jnp.zeros((3, 0, gradient.shape[1]), dtype)
         compliance = jnp.zeros((0, 0), dtype)
         if layout.size:
             value += jnp.sum(point.end_force * self.spans)
-            closure = layout.components(self.spans - layout.sums(cells.way))
+            constraint_residual = layout.components(self.spans - layout.sums(cells.segment_vectors))
             border = self._projected_columns(self.field.scatter_add(layout.columns(cells.by_force)))
             compliance = layout.compliance(cells.compliance)
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
-            closure=closure,
+            constraint_residual=constraint_residual,
             system=SaddlePointSystem(diagonal, lower, border, compliance, across=across),
             energy=value,
             residual=self._residual(gradient),
@@ -431,11 +442,11 @@ class FrameForm(Form):
     def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         layout = self.layout
         assert isinstance(layout, SpanForces)
-        value, ways = self.in_cells(self._kinematics(self.field.gather(point.quaternions)), point.end_force)
+        value, segment_vectors = self.in_cells(self._kinematics(self.field.gather(point.quaternions)), point.end_force)
         if not layout.size:
             return value, jnp.zeros(0, value.dtype)
-        closure = layout.components(self.spans - layout.sums(ways))
-        return value + jnp.sum(point.end_force * self.spans), closure
+        constraint_residual = layout.components(self.spans - layout.sums(segment_vectors))
+        return value + jnp.sum(point.end_force * self.spans), constraint_residual
 
     def _residual(self, gradient: Float[Array, "3 m"]) -> Float[Array, ""]:
         """Largest component of the moment left at a frame, per length of rod."""
@@ -443,7 +454,7 @@ class FrameForm(Form):
 
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
-        m = len(self.field.places)
+        m = len(self.field.arclengths)
         return system.shifted(jnp.asarray(NEUTRAL / m, self.loads.dtype))
 
     def under_force(
@@ -462,15 +473,15 @@ class FrameForm(Form):
         kinematics, turning = self.turning(point, rotation)
 
         def parts(of_frames: Kinematics, force: Float[Array, "3 parts"]) -> tuple[Array, Array]:
-            value, ways = self.in_cells(of_frames, force)
-            return value + jnp.sum(force * spans), layout.components(spans - layout.sums(ways))
+            value, segment_vectors = self.in_cells(of_frames, force)
+            return value + jnp.sum(force * spans), layout.components(spans - layout.sums(segment_vectors))
 
         def rates(force: Float[Array, "3 parts"]):
             return jax.jvp(lambda of_frames: parts(of_frames, force), (kinematics,), (turning,))
 
         both = jnp.stack([point.end_force + change, point.end_force])
-        (energy, closure), (rate, closure_rate) = jax.vmap(rates)(both)
-        return closure[0], closure_rate[0], energy[0] - energy[1], rate[0] - rate[1]
+        (energy, constraint_residual), (rate, constraint_rate) = jax.vmap(rates)(both)
+        return constraint_residual[0], constraint_rate[0], energy[0] - energy[1], rate[0] - rate[1]
 
     def turning(self, point: FramePoint, rotation: Float[Array, "3 m"]) -> tuple[Kinematics, Kinematics]:
         """What follows from the frames of the cells alone, and its rates as they begin to turn."""
@@ -481,14 +492,14 @@ class FrameForm(Form):
     def in_cells(
         self, of_frames: Kinematics, end_force: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, ""], Float[Array, "3 n"]]:
-        """What the cells add to L under forces, and their ways."""
+        """What the cells add to L under forces, and their segment vectors."""
         forces = self.through(end_force) + self.loads
         here = self._strained(of_frames, forces)
         value = jnp.sum(self.field.lengths * self._densities(here) - here.tension * here.lengths)
         if here.sideways is not None:
             value -= jnp.sum(here.weights * dot(forces, here.sideways))
         value -= jnp.sum(forces[:, REFERENCE] * of_frames.rests)
-        return value, short_sum(here.ways, axis=1) + of_frames.rests
+        return value, short_sum(here.weighted_slopes, axis=1) + of_frames.rests
 
     def rounding_floor(self, point: FramePoint) -> Float[Array, ""]:
         """Residual [EI/L^2] that rounding alone leaves at an equilibrium of this mesh, see `docs/design.md`."""

@@ -73,7 +73,7 @@ class FramedCurve(Shape):
 
     def on(self, s: Float[Array, "n+1"], of_joints: bool) -> "FramedCurve":
         """The same on other nodes, to begin a solve with."""
-        old, new = self.cells.places, _cells(s, of_joints).places
+        old, new = self.cells.arclengths, _cells(s, of_joints).arclengths
         quaternions = jax.vmap(lambda component: jnp.interp(new, old, component))(self.quaternions)
         nodes = jax.vmap(lambda coordinate: jnp.interp(s, self.s, coordinate), 1, 1)(self.nodes)
         return FramedCurve(nodes, unit(quaternions), s)
@@ -98,8 +98,8 @@ class FramedCurve(Shape):
         if scene.clips:
             q = _turned_to_supports(form, self.quaternions, first, reference)
             return q if scene.turns is None else _with_turns(scene, cells, q, first)
-        q, places = self.quaternions, cells.places
-        for end, k, part in ((scene.start, 0, 1.0 - places), (scene.end, -1, places)):
+        q, arclengths = self.quaternions, cells.arclengths
+        for end, k, part in ((scene.start, 0, 1.0 - arclengths), (scene.end, -1, arclengths)):
             if isinstance(end, Directed):
                 here = q[:, k]
                 held = align_tangent(here, end.tangent)
@@ -133,7 +133,7 @@ def _with_turns(scene: Scene, cells: Cells, q: Float[Array, "4 m"], first: First
         here = jnp.sum(cells.lengths * strains_between(cells, q)[2])
         principal = here - 2 * jnp.pi * jnp.round(here / (2 * jnp.pi))
         turns = jnp.round((nearest_twist(principal, first.total_twist, scene.turns) - here) / (2 * jnp.pi))
-    return jnp.where(turns != 0, rotate_about_tangent(q, 2 * jnp.pi * turns * cells.places), q)
+    return jnp.where(turns != 0, rotate_about_tangent(q, 2 * jnp.pi * turns * cells.arclengths), q)
 
 
 def _turned_to_supports(
@@ -144,33 +144,33 @@ def _turned_to_supports(
 
     `reference`: those of the last equilibrium.
     """
-    cells, places = form.field, form.field.places
+    cells, arclengths = form.field, form.field.arclengths
     had = cells.lengths * strains_between(cells, q)[2]
     is_carried = first.last is not None
-    zero, last = jnp.zeros((), int), jnp.asarray(len(places) - 1)
+    zero, last = jnp.zeros((), int), jnp.asarray(len(arclengths) - 1)
     assert form.clip_nodes is not None
     supports = jnp.stack([zero, *(2 * form.clip_nodes), last])
-    numbered = [(held, jnp.asarray(held.number) % len(places)) for held in form.held_frames]
+    numbered = [(held, jnp.asarray(held.number) % len(arclengths)) for held in form.held_frames]
     for held, number in numbered:
         beside = jnp.searchsorted(supports, number)
-        at = places[number]
-        before = places[supports[jnp.maximum(beside - 1, 0)]]
-        after = places[supports[jnp.minimum(beside + 1, len(supports) - 1)]]
+        at = arclengths[number]
+        before = arclengths[supports[jnp.maximum(beside - 1, 0)]]
+        after = arclengths[supports[jnp.minimum(beside + 1, len(supports) - 1)]]
         # Of an end there is nothing on one side.
-        rise = jnp.where(at > before, (places - before) / jnp.where(at > before, at - before, 1.0), 1.0)
-        fall = jnp.where(after > at, (after - places) / jnp.where(after > at, after - at, 1.0), 1.0)
+        rise = jnp.where(at > before, (arclengths - before) / jnp.where(at > before, at - before, 1.0), 1.0)
+        fall = jnp.where(after > at, (after - arclengths) / jnp.where(after > at, after - at, 1.0), 1.0)
         q = _swung_partly(q, tangent(q[:, number]), held.tangent, jnp.clip(jnp.minimum(rise, fall), 0.0, 1.0))
     spinning = [(held.frame, number) for held, number in numbered if held.frame is not None]
     if not spinning:
         return q
     numbers = jnp.stack([number for _, number in spinning])
     order = jnp.argsort(numbers)
-    at = places[numbers[order]]
+    at = arclengths[numbers[order]]
     nearby = reference if is_carried else q
     held = [nearer(from_frame(frame), nearby[:, number]) for frame, number in spinning]
     spins = jnp.stack([_spin_between(q[:, number], q_held) for q_held, (_, number) in zip(held, spinning, strict=True)])
     spins = spins[order]
-    q = jnp.where(jnp.any(spins != 0), rotate_about_tangent(q, jnp.interp(places, at, spins)), q)
+    q = jnp.where(jnp.any(spins != 0), rotate_about_tangent(q, jnp.interp(arclengths, at, spins)), q)
     if is_carried or len(spinning) == 1:
         return q
     # Between two of them: the cells from the one to the other, and by how much they are twisted.
@@ -181,7 +181,7 @@ def _turned_to_supports(
     more = (first.total_twist - jnp.sum(had)) * jnp.sum(cells.lengths, axis=0)
     wanted = jnp.sum(jnp.where(is_between, (jnp.sum(had - here, axis=0) + more)[None], 0.0), axis=1)
     turns = jnp.concatenate([jnp.zeros_like(spins[:1]), jnp.cumsum(jnp.round(wanted / (2 * jnp.pi)))])
-    return jnp.where(jnp.any(turns != 0), rotate_about_tangent(q, 2 * jnp.pi * jnp.interp(places, at, turns)), q)
+    return jnp.where(jnp.any(turns != 0), rotate_about_tangent(q, 2 * jnp.pi * jnp.interp(arclengths, at, turns)), q)
 
 
 def _swung_partly(
@@ -230,14 +230,16 @@ def framed_through(
     if of_joints:
         tangents = jnp.concatenate([tangents[:, :1], tangents, tangents[:, -1:]], axis=1)
     s = jnp.linspace(0.0, 1.0, len(nodes), dtype=points.dtype)
-    places = _cells(s, of_joints).places
+    arclengths = _cells(s, of_joints).arclengths
     if last is not None:
         frame, total_twist = last
-        return FramedCurve(nodes, rotate_about_tangent(carried(from_frame(frame), tangents), total_twist * places), s)
+        return FramedCurve(
+            nodes, rotate_about_tangent(carried(from_frame(frame), tangents), total_twist * arclengths), s
+        )
     start, end = scene.start, scene.end
     if isinstance(shape, Curve):
         # As a rod without frames begins.
-        tangents = shape.turned_to_ends(scene, places)
+        tangents = shape.turned_to_ends(scene, arclengths)
     if isinstance(start, Directed):
         tangents = tangents.at[:, 0].set(start.tangent)
     if isinstance(end, Directed):
@@ -246,10 +248,12 @@ def framed_through(
     # Not opposite to the first tangent.
     opposite = jnp.sum(tangent(first) * tangents[:, 0]) < -0.9
     first = jnp.where(opposite, product(first, jnp.array([0.0, 1.0, 0.0, 0.0], s.dtype)), first)
-    q = rotate_about_tangent(carried(first, tangents), _twist_at_rest(scene, places))
+    q = rotate_about_tangent(carried(first, tangents), _twist_at_rest(scene, arclengths))
     if isinstance(end, Clamp):
         spin = _spin_between(q[:, -1], nearer(from_frame(end.frame), q[:, -1]))
-        q = rotate_about_tangent(q, spin * places if isinstance(start, Clamp) else jnp.broadcast_to(spin, places.shape))
+        q = rotate_about_tangent(
+            q, spin * arclengths if isinstance(start, Clamp) else jnp.broadcast_to(spin, arclengths.shape)
+        )
     return FramedCurve(nodes, q, s)
 
 
@@ -258,24 +262,24 @@ def rest_twist(scene: Scene) -> Float[Array, ""]:
     return _twist_at_rest(scene, jnp.linspace(0.0, 1.0, 65, dtype=scene.rod.length.dtype))[-1]
 
 
-def _twist_at_rest(scene: Scene, places: Float[Array, "m"]) -> Float[Array, "m"]:
+def _twist_at_rest(scene: Scene, arclengths: Float[Array, "m"]) -> Float[Array, "m"]:
     """By how much the rod at rest is twisted from its start to these places."""
     rest = scene.rod.rest_shape
     if rest is None:
-        return jnp.zeros_like(places)
-    twist = rest.at(places, *_neighbours(places))[2]
-    steps = (twist[1:] + twist[:-1]) / 2 * jnp.diff(places)
-    return jnp.concatenate([jnp.zeros_like(places[:1]), jnp.cumsum(steps)])
+        return jnp.zeros_like(arclengths)
+    twist = rest.at(arclengths, *_neighbours(arclengths))[2]
+    steps = (twist[1:] + twist[:-1]) / 2 * jnp.diff(arclengths)
+    return jnp.concatenate([jnp.zeros_like(arclengths[:1]), jnp.cumsum(steps)])
 
 
-def _neighbours(places: Float[Array, "m"]) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
-    return jnp.concatenate([places[:1], places[:-1]]), jnp.concatenate([places[1:], places[-1:]])
+def _neighbours(arclengths: Float[Array, "m"]) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
+    return jnp.concatenate([arclengths[:1], arclengths[:-1]]), jnp.concatenate([arclengths[1:], arclengths[-1:]])
 
 
 def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurve:
     """The rod at rest in the place to which one of its ends is held; in any place between two pins."""
     start, end = scene.start, scene.end
-    poses = scene.rod.stress_free.poses(ElementCells(s).places)
+    poses = scene.rod.stress_free.poses(ElementCells(s).arclengths)
     q, positions = poses.quaternions, poses.positions[:, ::2]
     if of_joints:
         q = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1)
@@ -318,8 +322,8 @@ def first_frames(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> Frame
     assert isinstance(start, Held)
     assert isinstance(end, Held)
     missed = resting.nodes[-1] - end.position + resting.nodes[0] - start.position
-    places = jnp.linspace(0.0, 1.0, 65, dtype=s.dtype)
-    curvature = rest.at(places, *_neighbours(places))[:2]
+    arclengths = jnp.linspace(0.0, 1.0, 65, dtype=s.dtype)
+    curvature = rest.at(arclengths, *_neighbours(arclengths))[:2]
     angle = jnp.mean(jnp.sqrt(dot(curvature, curvature)))
     is_near = (jnp.sqrt(jnp.sum(missed**2)) < NEAR_REST) | (angle > COILED)
     return jax.tree.map(lambda a, b: jnp.where(is_near, a, b), resting, bent)

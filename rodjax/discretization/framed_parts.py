@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
 from rodjax.discretization.layout import SpanForces
-from rodjax.discretization.rest_ways import RestWays
+from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.model.along import Along
 from rodjax.model.loads import DistributedForce, length_before, loaded_length
 from rodjax.model.scene import Scene, dead_forces
@@ -17,13 +17,13 @@ from rodjax.model.supports import Free, Held
 def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
     """The fields of a `framed.FrameForm`."""
     sections = field.sections(scene.rod)
-    rest_strains, rest_ways = _at_rest(scene, field, sections.rest_axial)
+    rest_strains, rest_correction = _at_rest(scene, field, sections.rest_axial)
     return {
         "scene": scene,
         "field": field,
         "sections": sections,
         "rest_strains": rest_strains,
-        "rest_ways": rest_ways,
+        "rest_correction": rest_correction,
         "loads": _dead_loads(scene, field),
         "layout": SpanForces.of(scene, field.clip_nodes, field.lengths.shape[1]),
     }
@@ -31,26 +31,26 @@ def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
 
 def _at_rest(
     scene: Scene, cells: Cells, rest_axial: Float[Array, "k n"] | None
-) -> tuple[Float[Array, "3 k n"] | None, RestWays | None]:
-    """The strains of the rod at rest by the formula of the cells, and what its ways have beyond those of its frames."""
+) -> tuple[Float[Array, "3 k n"] | None, RestCorrection | None]:
+    """The strains of the rod at rest by the formula of the cells, and the correction of its segment vectors."""
     rest = scene.rod.rest_shape
     if rest is None:
         return None, None
     # At the nodes and between them, so that both are at hand: of finite differences the frames of the inner nodes are
     # left out.
-    poses = rest.poses(ElementCells(cells.s).places)
+    poses = rest.poses(ElementCells(cells.s).arclengths)
     is_joints = isinstance(cells, JointCells)
     q = poses.quaternions
     frames = jnp.concatenate([q[:, :1], q[:, 1::2], q[:, -1:]], axis=1) if is_joints else q
     strains = strains_between(cells, frames)
     edges = jnp.diff(poses.positions[:, ::2], axis=1)
-    return strains, RestWays.of(cells, frames, strains, edges, q[:, 1::2], rest_axial)
+    return strains, RestCorrection.of(cells, frames, strains, edges, q[:, 1::2], rest_axial)
 
 
 def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
     """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
     starts_held = isinstance(scene.start, Held)
-    s = cells.strain_places
+    s = cells.strain_arclengths
     forces, one = jnp.zeros((3, *s.shape), s.dtype), jnp.ones((), s.dtype)
     if scene.gravity is not None:
         mass = scene.rod.mass_per_length

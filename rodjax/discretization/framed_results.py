@@ -18,7 +18,7 @@ from rodjax.discretization.error import (
 )
 from rodjax.discretization.framed import FrameForm, FramePoint
 from rodjax.discretization.nonconservative import point_couples
-from rodjax.discretization.rest_ways import RestWays
+from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.rotations import columns, inverse, product, rotated, tangent, unit
@@ -139,7 +139,7 @@ def strains_beside_nodes(
 ) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
     """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
     strains, axial = _strains_at_ends(form, point, end_moments(form, point))
-    s = form.field.strain_places[::2]
+    s = form.field.strain_arclengths[::2]
     return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
 
 
@@ -161,7 +161,7 @@ def _strains_at_ends(
     strains, axial = sections.strains_under(rotated(inverse(q), moments), tension)
     rest = form.scene.rod.rest_shape
     if rest is not None:
-        s = field.strain_places[::2]
+        s = field.strain_arclengths[::2]
         strains += rest.at(s, *(jnp.broadcast_to(end[None], s.shape) for end in (field.s[:-1], field.s[1:])))
     return strains, sections.stretched(axial)
 
@@ -251,16 +251,16 @@ def positions_between_frames(
             t = (1 + at_nodes.axial)[None] * t + short_sum(columns(frames)[:, :2] * at_nodes.shear[None], axis=1)
         return cubic(field.s, nodes, t.T, s)
     a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
-    ways = field.h[None] * (5 * a + 8 * b - c) / 24
-    if form.rest_ways is not None:
+    half_vectors = field.h[None] * (5 * a + 8 * b - c) / 24
+    if form.rest_correction is not None:
         whole = short_sum(field.lengths[None] * slopes, axis=1)
-        ways += (form.edges(point).T - whole) / 2
-    middles = nodes[:-1] + ways.T
-    places = jnp.stack([field.s[:-1], (field.s[:-1] + field.s[1:]) / 2], axis=1).reshape(-1)
+        half_vectors += (form.edges(point).T - whole) / 2
+    middles = nodes[:-1] + half_vectors.T
+    arclengths = jnp.stack([field.s[:-1], (field.s[:-1] + field.s[1:]) / 2], axis=1).reshape(-1)
     points = jnp.stack([nodes[:-1], middles], axis=1).reshape(-1, 3)
     bends = jnp.stack([a.T, b.T], axis=1).reshape(-1, 3)
     return cubic(
-        jnp.concatenate([places, field.s[-1:]]),
+        jnp.concatenate([arclengths, field.s[-1:]]),
         jnp.concatenate([points, nodes[-1:]]),
         jnp.concatenate([bends, c.T[-1:]]),
         s,
@@ -279,7 +279,7 @@ class Pose(eqx.Module):
 
 
 def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]) -> Errors:
-    """As `error.errors_of_elements`: what the elements lack enters as strains at rest, couples and ways at rest."""
+    """As `error.errors_of_elements`: what the elements lack enters as strains, couples and segment vectors at rest."""
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point, axis)
@@ -300,24 +300,30 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     couple = last.moment - ends[:, 1] + cross(last.way - edges, force)
 
     strains = jnp.broadcast_to((rotated(inverse(middles), turn) / field.h[None])[:, None], form.loads.shape)
-    ways = rotated(inverse(middles), gap)
+    corrections = rotated(inverse(middles), gap)
     rest_strains = jnp.zeros_like(strains) if form.rest_strains is None else form.rest_strains
-    rest_ways = RestWays(jnp.zeros_like(ways), None) if form.rest_ways is None else form.rest_ways
+    rest_correction = (
+        RestCorrection(jnp.zeros_like(corrections), None) if form.rest_correction is None else form.rest_correction
+    )
 
     def lacking(amount: Float[Array, ""] | float) -> FrameForm:
-        more = rest_ways._replace(turning=rest_ways.turning + amount * ways)
+        more = rest_correction._replace(turning=rest_correction.turning + amount * corrections)
         values = rest_strains + amount * strains, more
-        return eqx.tree_at(lambda form: (form.rest_strains, form.rest_ways), form, values, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            lambda form: (form.rest_strains, form.rest_correction), form, values, is_leaf=lambda x: x is None
+        )
 
     zero, one = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
-    _, (gradient, closure) = jax.jvp(lambda amount: lacking(amount).unbalanced(point), (zero,), (one,))
+    _, (gradient, constraint_residual) = jax.jvp(
+        lambda amount: lacking(amount).residual_vectors(point), (zero,), (one,)
+    )
     gradient += jnp.zeros_like(gradient).at[:, 2::2].set(rotated(inverse(nodes[:, 1:]), couple)) * form.is_free
     here = form.linearized(point)
-    motion, is_soft = correction(form, point, here, gradient, closure, axis)
-    change = form.layout.forces(form.closure(motion.multipliers))
+    motion, is_soft = correction(form, point, here, gradient, constraint_residual, axis)
+    change = form.layout.forces(form.force_components(motion.multipliers))
 
     def reached(amount: Float[Array, ""]) -> Float[Array, "3 n"]:
-        there = form.moved(point, here.bases, amount * motion.rotation, amount * change)
+        there = form.retract(point, here.bases, amount * motion.rotation, amount * change)
         return lacking(amount).edges(there).T
 
     _, way_changes = jax.jvp(reached, (zero,), (one,))
@@ -326,7 +332,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
 
     # A difference, as a derivative of these would be a third one of the energy.
-    there = form.moved(point, here.bases, motion.rotation, change)
+    there = form.retract(point, here.bases, motion.rotation, change)
     before = section_forces(form, point), ends, _strains_at_ends(form, point, ends)[0][:2]
     moments = end_moments(lacking(1.0), there).at[:, 1].add(couple)
     after = section_forces(form, there), moments, _strains_at_ends(form, there, moments)[0][:2]
@@ -403,9 +409,9 @@ def _errors_of_joints(form: FrameForm, point: FramePoint, axis: Float[Array, "3"
     """The way to the elements between the same nodes by one step of Newton's method."""
     elements, begin = framed_on_elements(form, point)
     here = elements.linearized(begin)
-    motion, is_soft = correction(elements, begin, here, here.gradient, here.closure, axis)
-    change = elements.layout.forces(elements.closure(motion.multipliers))
-    end = elements.moved(begin, here.bases, motion.rotation, change)
+    motion, is_soft = correction(elements, begin, here, here.gradient, here.constraint_residual, axis)
+    change = elements.layout.forces(elements.force_components(motion.multipliers))
+    end = elements.retract(begin, here.bases, motion.rotation, change)
     found, better = resultants_of_frames(form, point), resultants_of_frames(elements, end)
     moments = [better.start_moment - found.start_moment, better.end_moment - found.end_moment]
     curvature = jnp.max(jnp.abs(better.curvature - found.curvature))

@@ -22,10 +22,10 @@ def tangential(vectors: Float[Array, "#f n+1 3"], normals: Float[Array, "f n+1 3
 
 
 def pulled(
-    forces: Float[Array, "f n+1 3"], ways: Float[Array, "n+1 3"], normals: Float[Array, "f n+1 3"]
+    forces: Float[Array, "f n+1 3"], displacements: Float[Array, "n+1 3"], normals: Float[Array, "f n+1 3"]
 ) -> tuple[Float[Array, "f n+1 3"], Float[Array, "f n+1 3"]]:
     """What would hold nodes where they were, q - W s, without bounds; and the slips."""
-    slips = tangential(ways[None], normals)
+    slips = tangential(displacements[None], normals)
     return tangential(forces, normals) - SLIP_WEIGHT * slips, slips
 
 

@@ -54,10 +54,10 @@ class QuadraticRotationElements(eqx.Module):
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "QuadraticRotationElements":
         """On these nodes, moved so that one lies at each clip and point force: the moment has a kink there."""
-        places = [load.at for load in scene.point_forces]
+        arclengths = [load.at for load in scene.point_forces]
         if scene.clips:
-            return QuadraticRotationElements(*with_nodes_at_clips(scene, s, places))
-        return QuadraticRotationElements(with_nodes_at(s, jnp.sort(jnp.stack(places))) if places else s)
+            return QuadraticRotationElements(*with_nodes_at_clips(scene, s, arclengths))
+        return QuadraticRotationElements(with_nodes_at(s, jnp.sort(jnp.stack(arclengths))) if arclengths else s)
 
     @property
     def points(self) -> int:
@@ -72,7 +72,7 @@ class QuadraticRotationElements(eqx.Module):
         return scatter_add(*(weight * self.h for weight in SIMPSON))
 
     @property
-    def places(self) -> Float[Array, "m"]:
+    def arclengths(self) -> Float[Array, "m"]:
         """Arclengths of the points."""
         return interleaved(self.s, (self.s[:-1] + self.s[1:]) / 2)
 
@@ -228,8 +228,8 @@ class QuadraticRotationElements(eqx.Module):
         starts_held = isinstance(scene.start, Held)
         forces = jnp.zeros((3, 3, len(self.h)), self.s.dtype)
         if scene.gravity is not None:
-            places = jnp.stack(of_elements(self.places))
-            forces += scene.gravity[:, None, None] * (1.0 - places if starts_held else -places)[None]
+            arclengths = jnp.stack(of_elements(self.arclengths))
+            forces += scene.gravity[:, None, None] * (1.0 - arclengths if starts_held else -arclengths)[None]
         for load in scene.point_forces:
             before = parts_before(self.s, load.at)
             forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
@@ -285,32 +285,32 @@ class Curve(Shape):
 
     def on(self, s: Float[Array, "n+1"]) -> "Curve":
         """The same on other nodes, to begin a solve with."""
-        places = interleaved(s, (s[:-1] + s[1:]) / 2)
-        cell = jnp.clip(jnp.searchsorted(self.s, places, side="right") - 1, 0, len(self.s) - 2)
-        x = ((places - self.s[cell]) / (self.s[cell + 1] - self.s[cell]))[None]
+        arclengths = interleaved(s, (s[:-1] + s[1:]) / 2)
+        cell = jnp.clip(jnp.searchsorted(self.s, arclengths, side="right") - 1, 0, len(self.s) - 2)
+        x = ((arclengths - self.s[cell]) / (self.s[cell + 1] - self.s[cell]))[None]
         a, b, c = (part[:, cell] for part in of_elements(self.tangents))
         tangents = (1 - x) * (1 - 2 * x) * a + 4 * x * (1 - x) * b + x * (2 * x - 1) * c
         nodes = jax.vmap(lambda coordinate: jnp.interp(s, self.s, coordinate), 1, 1)(self.nodes)
         return Curve(nodes, tangents / jnp.sqrt(dot(tangents, tangents))[None], s)
 
-    def turned_to_ends(self, scene: Scene, places: Float[Array, "m"]) -> Float[Array, "3 m"]:
+    def turned_to_ends(self, scene: Scene, arclengths: Float[Array, "m"]) -> Float[Array, "3 m"]:
         """The tangents turned to those that the supports hold, by less and less away from them."""
         tangents = self.tangents
-        ends = [(0, scene.start, 1.0 - places), (-1, scene.end, places)]
+        ends = [(0, scene.start, 1.0 - arclengths), (-1, scene.end, arclengths)]
         for k, end, part in ends:
             if isinstance(end, Directed):
                 tangents = _turned(tangents, tangents[:, k], end.tangent, part)
-        return _turned_in_clips(scene, tangents, places) if scene.clips else tangents
+        return _turned_in_clips(scene, tangents, arclengths) if scene.clips else tangents
 
 
-def _turned_in_clips(scene: Scene, tangents: Float[Array, "3 m"], places: Float[Array, "m"]) -> Float[Array, "3 m"]:
+def _turned_in_clips(scene: Scene, tangents: Float[Array, "3 m"], s: Float[Array, "m"]) -> Float[Array, "3 m"]:
     """The tangents turned to those that clips hold, by less and less towards the supports on both sides of each."""
-    arclengths = [jnp.zeros_like(places[0]), *(clip.at for clip in scene.clips), jnp.ones_like(places[0])]
+    arclengths = [jnp.zeros_like(s[0]), *(clip.at for clip in scene.clips), jnp.ones_like(s[0])]
     for k, clip in enumerate(scene.clips):
         if clip.tangent is not None:
             before, at, after = arclengths[k : k + 3]
-            near = jnp.minimum((places - before) / (at - before), (after - places) / (after - at))
-            held = tangents[:, jnp.argmin(jnp.abs(places - at))]
+            near = jnp.minimum((s - before) / (at - before), (after - s) / (after - at))
+            held = tangents[:, jnp.argmin(jnp.abs(s - at))]
             tangents = _turned(tangents, held, clip.tangent, jnp.maximum(near, 0.0))
     return tangents
 
@@ -331,13 +331,13 @@ def _turned(
 
 def _turns_along(tangents: Float[Array, "3 m"], bases: Float[Array, "3 2 m"]) -> Float[Array, "n"]:
     """The angles by which the bases turn about the curve along each element [rad]."""
-    of_points = turns_of_bases(tangents, bases)
+    point_turns = turns_of_bases(tangents, bases)
     # A polygon lags behind the curve by a third of the area between whole and half elements.
     a, b, c = of_elements(tangents)
     straight = a + c
     straight *= 1 / jnp.sqrt(dot(straight, straight))[None]
     bulge = swept_angle(a, b, a, straight) + swept_angle(b, c, straight, c)
-    return of_points[::2] + of_points[1::2] + bulge / 3
+    return point_turns[::2] + point_turns[1::2] + bulge / 3
 
 
 def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:

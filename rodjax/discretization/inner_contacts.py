@@ -34,7 +34,7 @@ class Middles(NamedTuple):
 
     @staticmethod
     def of(
-        places: Float[Array, "n+1 3"],
+        positions: Float[Array, "n+1 3"],
         tangents: Float[Array, "3 n+1"],
         axes: Float[Array, "3 b n+1"],
         held: Float[Array, "n+1"],
@@ -53,9 +53,9 @@ class Middles(NamedTuple):
         turned = cross(about, jnp.broadcast_to(ends[:, :, None], about.shape))
         turned = turned * jnp.array([1.0, -1.0], h.dtype)[None, :, None, None]
         by_rotation = jnp.einsum("cdn,debn->cebn", by_difference, turned)
-        by_place = jnp.stack([held[:-1], held[1:]])[None, :, None] * identity[:, None] / 2
-        points = (places[:-1] + places[1:]) / 2 + (factor[None] * bulge).T
-        rates = jnp.concatenate([by_rotation, by_place], axis=2)
+        by_position = jnp.stack([held[:-1], held[1:]])[None, :, None] * identity[:, None] / 2
+        points = (positions[:-1] + positions[1:]) / 2 + (factor[None] * bulge).T
+        rates = jnp.concatenate([by_rotation, by_position], axis=2)
         return Middles(points, rates, bulge, turned, by_difference, ends, about)
 
     def second(self, forces: Float[Array, "3 n"]) -> Float[Array, "2b+6 2b+6 n"]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rodjax.linalg.blocks import partial_sums
-from rodjax.model.scene import Scene, has_node_places
+from rodjax.model.scene import Scene, has_node_positions
 from rodjax.model.supports import Held
 
 
@@ -141,7 +141,7 @@ class CellForces(eqx.Module):
 ForceLayout = SpanForces | CellForces
 
 
-def held_places(
+def held_positions(
     scene: Scene, s: Float[Array, "n+1"], clip_nodes: Int[Array, "clips"] | None
 ) -> tuple[Float[Array, "3 h"], Int[Array, "h"]]:
     """The positions that are held along the rod, and the numbers of the nodes there."""
@@ -159,7 +159,7 @@ def nodes_along(
     scene: Scene, s: Float[Array, "n+1"], clip_nodes: Int[Array, "clips"] | None, edges: Float[Array, "n 3"]
 ) -> Float[Array, "n+1 3"]:
     """Nodes at the arclengths `s` along the edges, at held places to the last digit."""
-    positions, held = held_places(scene, s, clip_nodes)
+    positions, held = held_positions(scene, s, clip_nodes)
     nodes = partial_sums(edges.T)
     missing = positions - jnp.stack([nodes[:, held[k]] for k in range(len(held))], axis=1)
     if len(held) == 1:
@@ -177,7 +177,7 @@ def nodes_along(
 
 def force_parts(scene: Scene, segments: int) -> int:
     """How many forces the layout of a scene has on a mesh."""
-    return segments if has_node_places(scene) else len(scene.clips) + 1
+    return segments if has_node_positions(scene) else len(scene.clips) + 1
 
 
 def in_parts(forces: Float[Array, "3 parts"], parts: int) -> Float[Array, "3 others"]:

@@ -1,7 +1,7 @@
 """The finite differences in other unknowns: unit tangents of the edges, and the force that runs through the rod.
 
 Under dead loads the force through the rod is known up to one vector F in each span between held places, which follows
-from the closure of the span (`layout`). So an equilibrium is a saddle point of
+from the closure constraint of the span (`layout`). So an equilibrium is a saddle point of
 
     L(t, F) = bending(t) + torsion(t) + sum h [w(e) - n . t (1 + e)] + sum F . span,    n_i = F + loads beyond edge i,
 
@@ -72,20 +72,20 @@ class MixedPoint(eqx.Module):
 class Elastic(NamedTuple):
     """Bending and torsion of a `Linearization`.
 
-    `torque_column`: by the torque, by the points of each cell; `softness`: of the rod against it where the total twist
-    is given; else `None`.
+    `torque_column`: by the torque, by the points of each cell; `torsional_compliance`: 1/GJ where the total twist is
+    given; else `None`.
     """
 
     bases: Float[Array, "3 b m"]
     energy: Float[Array, ""]
     blocks: Blocks
     torque_column: Float[Array, "b 1 p n"] | None
-    softness: Float[Array, ""] | None
+    torsional_compliance: Float[Array, ""] | None
 
 
 class ByCells(NamedTuple):
-    """Parts of a `Linearization`, and by the p points of n cells their lengths, tangents and softness against tension;
-    `by_force`: the derivatives of what a cell lacks of its way, by rotations of its points.
+    """Parts of a `Linearization`, and by the p points of n cells their lengths, tangents and compliance under tension;
+    `by_force`: the derivatives of minus the segment vector by the rotations of the points of its cell.
     """
 
     energy: Float[Array, ""]
@@ -93,13 +93,13 @@ class ByCells(NamedTuple):
     diagonal: Float[Array, "b b p n"]
     lengths: Float[Array, "p n"]
     along: Float[Array, "3 p n"]
-    softness: Float[Array, "p n"]
+    axial_compliance: Float[Array, "p n"]
     by_force: Float[Array, "b 3 p n"]
 
     @property
     def compliance(self) -> Float[Array, "3 3 n"]:
-        """By which the way of each cell grows with the force through it."""
-        softer = self.softness[None] * self.along
+        """The derivative of each segment vector by the force through it."""
+        softer = self.axial_compliance[None] * self.along
         return short_sum(softer[:, None] * self.along[None], axis=2)
 
 
@@ -210,21 +210,21 @@ class MixedForm(Form):
         strain = axial_strain_under(self.scene.rod, self.edge_tension(point))
         return (1 + strain)[None] * point.tangents
 
-    def ways(self, point: MixedPoint) -> Float[Array, "3 p n"]:
-        """What the points of each cell add to the way from node to node."""
+    def weighted_slopes(self, point: MixedPoint) -> Float[Array, "3 p n"]:
+        """What the points of each cell add to its segment vector."""
         _, tension = self.forces_and_tensions(point)
         lengths = self.field.quadrature_weights * (1 + axial_strain_under(self.scene.rod, tension))
         return lengths[None] * self.field.gather(point.tangents)
 
     def edges(self, point: MixedPoint) -> Float[Array, "n 3"]:
         """From node to node."""
-        return short_sum(self.ways(point), axis=1).T
+        return short_sum(self.weighted_slopes(point), axis=1).T
 
     @property
     def spans(self) -> Float[Array, "3 parts"]:
         """Between held places."""
         assert isinstance(self.layout, SpanForces)
-        return self.layout.spans(self.held_places[0])
+        return self.layout.spans(self.held_positions[0])
 
     def tangents_in_clips(self, point: MixedPoint) -> Float[Array, "3 clips"]:
         return self.field.tangents_in_clips(self.scene, point.tangents)
@@ -233,7 +233,7 @@ class MixedForm(Form):
 
     def load_energy(self, point: MixedPoint) -> Float[Array, ""]:
         """The potential of gravity and dead forces, zero at the origin, where the rod is held."""
-        return -jnp.sum(self.loads_beyond * self.ways(point))
+        return -jnp.sum(self.loads_beyond * self.weighted_slopes(point))
 
     def elastic_energy(self, point: MixedPoint) -> Float[Array, ""]:
         rod = self.scene.rod
@@ -258,7 +258,7 @@ class MixedForm(Form):
             return twist_on(self.scene, self.field, begin, tangents, first)
         return self.twist_near(tangents, first.total_twist)
 
-    def moved(
+    def retract(
         self,
         point: MixedPoint,
         bases: Float[Array, "3 b n"],
@@ -272,7 +272,7 @@ class MixedForm(Form):
             twist += self.field.swept(self.scene, point.tangents, tangents)
         elif not self.has_potential:
             twist = twist_under_moment(self.scene, tangents)
-        return MixedPoint(tangents, point.end_force + force_change, twist, self.nodal_moved(point, others))
+        return MixedPoint(tangents, point.end_force + force_change, twist, self.retracted_nodal(point, others))
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
@@ -301,7 +301,7 @@ class MixedForm(Form):
         """With the tangents held that supports and clips of a scene hold."""
         scene, tangents = self.scene, point.tangents
         assert isinstance(self.layout, SpanForces)
-        bases, energy, blocks, torque_column, softness = self._elastic(point, holding)
+        bases, energy, blocks, torque_column, torsional_compliance = self._elastic(point, holding)
         cells = self._by_cells(point, bases, blocks)
         border = [self.layout.columns(cells.by_force)] if self.layout.size else []
         if torque_column is not None:
@@ -309,9 +309,9 @@ class MixedForm(Form):
         by_point = map(self.field.scatter_add, (cells.gradient, cells.diagonal, cells.lengths, *border))
         gradient, diagonal, lengths, *border = by_point
         energy += cells.energy
-        columns, closure, compliance, rows = border, [], [], None
-        if softness is not None:
-            closure, compliance = [jnp.zeros(1, energy.dtype)], [softness[None, None]]
+        columns, constraint_residual, compliance, rows = border, [], [], None
+        if torsional_compliance is not None:
+            constraint_residual, compliance = [jnp.zeros(1, energy.dtype)], [torsional_compliance[None, None]]
         moment = dead_end_moment(scene)
         if moment is not None:
             n = tangents.shape[1]
@@ -326,12 +326,12 @@ class MixedForm(Form):
             columns = [border[0], at_edge.set(spin), *border[1:]]
             torque_row = jnp.zeros((2, 1, n), energy.dtype).at[:, 0, edge].set(sign * moment @ basis)
             rows = [torque_row, at_edge.set(jnp.array([[0.0, 1.0], [1.0, 0.0]], energy.dtype))]
-            closure, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
+            constraint_residual, compliance = [jnp.zeros(3, energy.dtype)], [jnp.eye(3, dtype=energy.dtype)]
         if self.layout.size:
             energy += jnp.sum(point.end_force * self.spans)
-            ways = short_sum(cells.lengths[None] * cells.along, axis=1)
-            lacking = self.layout.components(self.spans - self.layout.sums(ways))
-            closure = [*closure, lacking]
+            segment_vectors = short_sum(cells.lengths[None] * cells.along, axis=1)
+            lacking = self.layout.components(self.spans - self.layout.sums(segment_vectors))
+            constraint_residual = [*constraint_residual, lacking]
             compliance.append(self.layout.compliance(cells.compliance))
             rows = None if rows is None else [*rows, border[-1]]
         nothing = jnp.zeros((*gradient.shape[:1], 0, gradient.shape[1]), energy.dtype)
@@ -339,7 +339,9 @@ class MixedForm(Form):
         return Linearization(
             bases=bases,
             gradient=gradient,
-            closure=jnp.concatenate(closure) if closure else jnp.zeros(0, energy.dtype),
+            constraint_residual=jnp.concatenate(constraint_residual)
+            if constraint_residual
+            else jnp.zeros(0, energy.dtype),
             system=SaddlePointSystem(
                 self.field.held(holding, diagonal),
                 blocks.lower,
@@ -373,20 +375,20 @@ class MixedForm(Form):
         rod, field = self.scene.rod, self.field
         weights = field.quadrature_weights
         forces, tension = self.forces_and_tensions(point)
-        strain, softness = jax.jvp(
+        strain, axial_compliance = jax.jvp(
             lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
         )
-        lengths, softness = weights * (1 + strain), weights * softness
+        lengths, axial_compliance = weights * (1 + strain), weights * axial_compliance
         along, directions = field.gather(point.tangents), field.gather(bases)
         across = short_sum(directions * forces[:, None], axis=0)
         gradient = blocks.gradient - lengths[None] * across
         identity = np.eye(bases.shape[1], dtype=gradient.dtype)[..., None, None]
         diagonal = blocks.diagonal + (lengths * tension)[None, None] * identity
-        diagonal -= softness[None, None] * across[:, None] * across[None]
+        diagonal -= axial_compliance[None, None] * across[:, None] * across[None]
         by_force = -lengths[None, None] * jnp.swapaxes(directions, 0, 1)
-        by_force -= softness[None, None] * across[:, None] * along[None]
+        by_force -= axial_compliance[None, None] * across[:, None] * along[None]
         energy = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
-        return ByCells(energy, gradient, diagonal, lengths, along, softness, by_force)
+        return ByCells(energy, gradient, diagonal, lengths, along, axial_compliance, by_force)
 
     def lagrangian(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         rod, layout = self.scene.rod, self.layout
@@ -401,8 +403,8 @@ class MixedForm(Form):
             energy += density(rod, twist=point.total_twist)
         if not layout.size:
             return energy, jnp.zeros(0, energy.dtype)
-        closure = layout.components(self.spans - layout.sums(self.edges(point).T))
-        return energy + jnp.sum(point.end_force * self.spans), closure
+        constraint_residual = layout.components(self.spans - layout.sums(self.edges(point).T))
+        return energy + jnp.sum(point.end_force * self.spans), constraint_residual
 
     def regular(self, system: AnySystem) -> AnySystem:
         """The system of a linearisation, neutral modes held."""
@@ -438,11 +440,13 @@ class MixedForm(Form):
 
         strain, strain_rate, added, rate = stretched(point.end_force + change)
         _, _, added_before, rate_before = stretched(point.end_force)
-        ways = short_sum((weights * (1 + strain))[None] * along, axis=1)
-        way_rates = short_sum((weights * (1 + strain))[None] * turning + (weights * strain_rate)[None] * along, axis=1)
+        segment_vectors = short_sum((weights * (1 + strain))[None] * along, axis=1)
+        segment_rates = short_sum(
+            (weights * (1 + strain))[None] * turning + (weights * strain_rate)[None] * along, axis=1
+        )
         return (
-            layout.components(spans - layout.sums(ways)),
-            -layout.components(layout.sums(way_rates)),
+            layout.components(spans - layout.sums(segment_vectors)),
+            -layout.components(layout.sums(segment_rates)),
             jnp.sum(weights * (added - added_before)) + jnp.sum(change * spans),
             jnp.sum(weights * (rate - rate_before)),
         )

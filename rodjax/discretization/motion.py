@@ -64,7 +64,7 @@ class Neutral(eqx.Module):
 
 def neutral_motions(form: Form, point: Point, here: Linearization) -> Neutral:
     """Without a potential no turn is looked for: the system has no symmetry, and its transpose another one."""
-    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.constraint_residual))
     turn = neutral_turn(form, point, here) if form.has_potential else nothing
     rotation = form.spin(here.bases)
     if rotation is None:
@@ -88,7 +88,7 @@ def neutral_turn(form: Form, point: Point, here: Linearization) -> Motion:
 def turn_about(form: Form, point: Point, here: Linearization, axis: Float[Array, "3"]) -> Motion:
     """The turn of the whole rod about an axis, none where that is zero."""
     rotation = form.turn(point, here.bases, axis)
-    return Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.closure)))
+    return Motion(rotation, form.multipliers_turned(point, axis, jnp.zeros_like(here.constraint_residual)))
 
 
 def neutral_axis(form: Form, point: Point, here: Linearization) -> Float[Array, "3"]:

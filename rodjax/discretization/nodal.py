@@ -1,7 +1,7 @@
 """Rods whose nodes have positions of their own, and a force in each element: beside obstacles, or under loads without a
 potential, where what acts on the rod depends on where it is or how it turns.
 
-The force F through an element is the multiplier of its way from node to node, and the positions of the nodes are
+The force F through an element is the multiplier of its vector from node to node, and the positions of the nodes are
 unknowns of their own: so what acts on an element depends on what is local, the system is a chain, and a step of
 Newton's method moves nodes along straight lines. `nodal_forms.NodalFrames` has loads without a potential.
 
@@ -9,11 +9,11 @@ No node is nearer to an obstacle than the rod is thick: gap g >= 0, and no middl
 an obstacle without friction. The pressure p >= 0 [a force, for each obstacle and node or middle] is the multiplier of
 that:
 
-    L = L of the elements + sum F . (way between the nodes - way of the element) - sum p g
+    L = L of the elements + sum F . (x_after - x_before - segment vector of the element) - sum p g
 
 With friction the multiplier of the slip s, what a node has gone along the obstacle since the last equilibrium, is the
 tangential force q, |q| <= mu p. In the model of a step the bound has the pressure as it is, so that the model has a
-minimum and is symmetric; both agree in the end. `friction` has what friction is as a function of places and pressures.
+minimum and is symmetric; both agree in the end. `friction` has it as a function of positions and pressures.
 
 A step is the minimum of a model, L to second order with each gap to first: every node stays on its side of the
 tangent plane of each obstacle, which of a convex one separates, so that no step, nor a part of it, leads through. Which
@@ -54,7 +54,7 @@ from rodjax.geometry.vectors import dot
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
-from rodjax.mechanics.passage import PLACES
+from rodjax.mechanics.passage import SAMPLES
 from rodjax.model.along import Value, largest_beside, value_at
 from rodjax.model.obstacles import InUnits, Obstacle, least
 from rodjax.model.scene import Scene, has_contacts
@@ -62,13 +62,13 @@ from rodjax.model.supports import Clamp, Held
 
 # Of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change, times some
 # 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
-SOFTNESS = 1e-5
+CONTACT_COMPLIANCE = 1e-5
 # And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
 # one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
-LEAST_SOFTNESS = 5e4
+LEAST_COMPLIANCE = 5e4
 # Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
 # would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
-FAR_SOFTNESS = 1e-6
+FAR_COMPLIANCE = 1e-6
 # In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
 # would say the same, and who bears it would be undetermined: so nodes do.
 THINNER = 1e-5
@@ -99,16 +99,16 @@ TOUCHES = 1e-2
 
 class Contacts(NamedTuple):
     """At a point: gaps at nodes, below them those within elements; their gradients with those of slips below, and the
-    second derivatives of what L has of gaps by the places of nodes; with friction the ways of nodes since the last
-    equilibrium. Of contacts within and between elements, `None` without such: the moments of their pressures, out of
-    balance at the points; of the former the second derivatives by the rotation and the place of the first node of each
-    element, then of the last one; of the latter those by the rotations of each node.
+    second derivatives of what L has of gaps by the positions of nodes; with friction the displacements of nodes since
+    the last equilibrium. Of contacts within and between elements, `None` without such: the moments of their pressures,
+    out of balance at the points; of the former the second derivatives by the rotation and the place of the first node
+    of each element, then of the last one; of the latter those by the rotations of each node.
     """
 
     gaps: Float[Array, "k n+1"]
     rows: ContactRows
     stiffness: Float[Array, "n+1 3 3"]
-    ways: Float[Array, "n+1 3"] | None
+    reference_displacements: Float[Array, "n+1 3"] | None
     gradient: Float[Array, "b m"] | None
     inner: Float[Array, "2b+6 2b+6 n"] | None
     by_rotations: Float[Array, "b b n+1"] | None
@@ -145,13 +145,13 @@ class NodalForm(Form):
 
     @abstractmethod
     def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
-        """What stretch and forces add to L under other forces, and the ways of the elements; `elements`: as of
+        """What stretch and forces add to L under other forces, and the segment vectors; `elements`: as of
         `turning_elements`.
         """
 
     @abstractmethod
     def in_cells_at(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        """What the cells add to L, all of it, and their ways."""
+        """What the cells add to L, all of it, and their segment vectors."""
 
     @abstractmethod
     def turning_elements(self, point: Any, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]) -> Any:
@@ -162,8 +162,8 @@ class NodalForm(Form):
     def multipliers_turned(
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
-        places, _ = self.held_places
-        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.places - places[:, 0][None])
+        positions, _ = self.held_positions
+        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.positions - positions[:, 0][None])
         by_node = jnp.cross(axis[None], arms).reshape(-1)
         of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
@@ -174,8 +174,8 @@ class NodalForm(Form):
         along = dot(self.applied(point)[:, nodes], self.tangents_in_clips(point))
         return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
-    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
-        return super().is_closed(self.closure(closure), tolerance)
+    def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        return super().is_closed(self.force_components(constraint_residual), tolerance)
 
     def others(self, multipliers: Float[Array, "k"]) -> NodalChange:
         nodes, rows = len(self.field.s), pressure_rows(self.scene) + 3 * len(self.rough)
@@ -184,24 +184,26 @@ class NodalForm(Form):
         )
         return NodalChange(displacements.reshape(nodes, 3), pressures.reshape(rows, nodes))
 
-    def nodal_moved(self, point: Any, others: NodalChange | None) -> Nodal:
+    def retracted_nodal(self, point: Any, others: NodalChange | None) -> Nodal:
         nodal = point.nodal
         if others is None:
             return nodal
-        moved = nodal.with_contact_forces(nodal.places + others.displacements, nodal.contact_forces + others.pressures)
-        return moved if nodal.friction is None else self._on_surfaces(nodal, others, moved)
+        retracted = nodal.with_contact_forces(
+            nodal.positions + others.displacements, nodal.contact_forces + others.pressures
+        )
+        return retracted if nodal.friction is None else self._on_surfaces(nodal, others, retracted)
 
-    def _on_surfaces(self, nodal: Nodal, others: NodalChange, moved: Nodal) -> Nodal:
+    def _on_surfaces(self, nodal: Nodal, others: NodalChange, retracted: Nodal) -> Nodal:
         """With nodes that press on obstacles as far from them as their tangent planes have it: these go along them.
 
         A taut cable slides over a cylinder in whole steps so; along straight lines it would gain length.
         """
-        gaps, normals = self.gaps_and_normals(nodal.places)
-        beyond, there = self.gaps_and_normals(moved.places)
+        gaps, normals = self.gaps_and_normals(nodal.positions)
+        beyond, there = self.gaps_and_normals(retracted.positions)
         beyond -= gaps + jnp.einsum("knc,nc->kn", normals, others.displacements)
-        pushes = (moved.pressures[: len(gaps)] > 0) & ~self.is_held[None]
-        places = moved.places - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
-        return dataclasses.replace(moved, places=places)
+        pushes = (retracted.pressures[: len(gaps)] > 0) & ~self.is_held[None]
+        positions = retracted.positions - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
+        return dataclasses.replace(retracted, positions=positions)
 
     def led_out(self, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
         """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
@@ -227,8 +229,8 @@ class NodalForm(Form):
     def nodal_held(self, nodal: Nodal | None) -> Nodal | None:
         if nodal is None:
             return None
-        positions, held = self.held_places
-        return dataclasses.replace(nodal, places=nodal.places.at[held].set(positions.T))
+        positions, held = self.held_positions
+        return dataclasses.replace(nodal, positions=nodal.positions.at[held].set(positions.T))
 
     def begun(
         self,
@@ -248,7 +250,7 @@ class NodalForm(Form):
             point = dataclasses.replace(point, end_force=self._in_elements(point))
         if not has_contacts(self.scene):
             return point
-        gaps, normals = self.gaps_and_normals(nodal.places)
+        gaps, normals = self.gaps_and_normals(nodal.positions)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
         pushing = jnp.concatenate([pushing, nothing[len(pushing) :]])
@@ -275,16 +277,16 @@ class NodalForm(Form):
             return forces + jnp.cumsum(loads[:, :0:-1], axis=1)[:, ::-1]
         return forces - jnp.cumsum(loads[:, :-1], axis=1)
 
-    # --- places and contacts -----------------------------------------------------------------------------------------
+    # --- contacts ----------------------------------------------------------------------------------------------------
 
     def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
         """By which the forces of two elements differ, beside what is applied to the node between; `None` for none."""
         if not self.scene.potentials:
             return None
-        return -potentials.by_place(self.scene, self.field.s, *self._node_lines(point)).T
+        return -potentials.by_position(self.scene, self.field.s, *self._node_lines(point)).T
 
     def _node_lines(self, point: Any) -> tuple[Float[Array, "n+1 3"], Float[Array, "3 n+1"]]:
-        return point.nodal.places, point.tangents[:, ::2]
+        return point.nodal.positions, point.tangents[:, ::2]
 
     def at_nodes(self, point: Any) -> NodeEnergy | None:
         """What fields are at the nodes, by the rotations that are unknown; `None` without fields."""
@@ -305,8 +307,8 @@ class NodalForm(Form):
     def shares(self, point: Any) -> Float[Array, "n+1 3"]:
         """What contacts within elements apply to the rod, by parts at both nodes."""
         if not self.has_inner_contacts:
-            return jnp.zeros_like(point.nodal.places)
-        halves = -self.contacts_on_elements(point).by_place
+            return jnp.zeros_like(point.nodal.positions)
+        halves = -self.contacts_on_elements(point).by_position
         return (jnp.pad(halves[:, 0], ((0, 0), (0, 1))) + jnp.pad(halves[:, 1], ((0, 0), (1, 0)))).T
 
     @property
@@ -317,8 +319,8 @@ class NodalForm(Form):
     def contacts_on_elements(self, point: Any) -> OnElements:
         if not self.scene.self_contact:
             return self._middles_on_elements(point)
-        on_places, on_tangents = on_elements(self.curve(point), self.far_unit * point.nodal.pressures[-1])
-        contacts = OnElements(-on_places, -on_tangents, jnp.zeros_like(on_places))
+        on_positions, on_tangents = on_elements(self.curve(point), self.far_unit * point.nodal.pressures[-1])
+        contacts = OnElements(-on_positions, -on_tangents, jnp.zeros_like(on_positions))
         return OnElements(*map(jnp.add, contacts, self._middles_on_elements(point))) if self.smooth else contacts
 
     def _middles_on_elements(self, point: Any) -> OnElements:
@@ -345,7 +347,7 @@ class NodalForm(Form):
             return start, end
         loads = self.shares(point)
         if self.scene.potentials:
-            loads = loads - potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
+            loads = loads - potentials.by_position(self.scene, self.field.s, *self._node_lines(point))
         # Of those that are held; a given force is one.
         start = start + loads[0] if isinstance(self.scene.start, Held) else start
         return start, end - loads[-1] if isinstance(self.scene.end, Held) else end
@@ -363,7 +365,7 @@ class NodalForm(Form):
 
     @property
     def is_at_support(self) -> Bool[Array, "n+1"]:
-        _, nodes = self.held_places
+        _, nodes = self.held_positions
         return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
 
     @property
@@ -391,28 +393,34 @@ class NodalForm(Form):
         return radius
 
     @property
-    def softness(self) -> Float[Array, ""]:
+    def contact_compliance(self) -> Float[Array, ""]:
         """Of the contacts in the model of a step [L^3/EI]."""
         h = jnp.diff(self.field.s)
-        softness = SOFTNESS * h[jnp.argmin(h)] ** 3
-        return jnp.maximum(softness, LEAST_SOFTNESS * jnp.finfo(h.dtype).eps) if self.smooth else softness
+        contact_compliance = CONTACT_COMPLIANCE * h[jnp.argmin(h)] ** 3
+        return (
+            jnp.maximum(contact_compliance, LEAST_COMPLIANCE * jnp.finfo(h.dtype).eps)
+            if self.smooth
+            else contact_compliance
+        )
 
     def distances_and_normals(
-        self, places: Float[Array, "n+1 3"]
+        self, positions: Float[Array, "n+1 3"]
     ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """From the obstacles to the nodes."""
-        found = [jax.vmap(jax.value_and_grad(obstacle.at))(places) for obstacle in self.scene.obstacles]
+        found = [jax.vmap(jax.value_and_grad(obstacle.at))(positions) for obstacle in self.scene.obstacles]
         return jnp.stack([distance for distance, _ in found]), jnp.stack([normals for _, normals in found])
 
-    def curvatures(self, places: Float[Array, "p 3"]) -> Float[Array, "k p 3 3"]:
+    def curvatures(self, positions: Float[Array, "p 3"]) -> Float[Array, "k p 3 3"]:
         """The second derivatives of the distances from the obstacles."""
-        return jnp.stack([jax.vmap(jax.hessian(obstacle.at))(places) for obstacle in self.scene.obstacles])
+        return jnp.stack([jax.vmap(jax.hessian(obstacle.at))(positions) for obstacle in self.scene.obstacles])
 
-    def gaps_and_normals(self, places: Float[Array, "n+1 3"]) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
+    def gaps_and_normals(
+        self, positions: Float[Array, "n+1 3"]
+    ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
         """Gaps of L at nodes that are held, whose place is given."""
         if not self.scene.obstacles:
-            return jnp.zeros((0, len(places)), places.dtype), jnp.zeros((0, *places.shape), places.dtype)
-        distances, normals = self.distances_and_normals(places)
+            return jnp.zeros((0, len(positions)), positions.dtype), jnp.zeros((0, *positions.shape), positions.dtype)
+        distances, normals = self.distances_and_normals(positions)
         return jnp.where(self.is_at_support[None], 1.0, distances - self.radius[None]), normals
 
     @property
@@ -424,7 +432,7 @@ class NodalForm(Form):
         """The middles of the elements, their gaps, and the directions in which these grow."""
         s = self.field.s
         free = jnp.where(self.is_held, 0.0, 1.0).astype(s.dtype)
-        middles = Middles.of(point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, jnp.diff(s))
+        middles = Middles.of(point.nodal.positions, point.tangents[:, ::2], self.node_axes(point), free, jnp.diff(s))
         if not self.smooth:
             return middles, jnp.zeros((0, len(s)), s.dtype), jnp.zeros((0, len(s) - 1, 3), s.dtype)
         distances, normals = self.distances_and_normals(middles.points)
@@ -443,13 +451,13 @@ class NodalForm(Form):
         """The numbers of the obstacles with friction."""
         return tuple(k for k, obstacle in enumerate(self.scene.obstacles) if _friction(obstacle) is not None)
 
-    def travelled(self, places: Float[Array, "n+1 3"], friction: Friction) -> Float[Array, "n+1 3"]:
+    def travelled(self, positions: Float[Array, "n+1 3"], friction: Friction) -> Float[Array, "n+1 3"]:
         """Of the nodes since the last equilibrium; none from rest, and of nodes that are held."""
         (obstacle, *_) = self.scene.obstacles
         assert isinstance(obstacle, InUnits)
         is_still = jnp.isnan(friction.reference) | self.is_held[:, None]
         before = (jnp.where(is_still, 0.0, friction.reference) - obstacle.origin[None]) / obstacle.length
-        return jnp.where(is_still, 0.0, places - before)
+        return jnp.where(is_still, 0.0, positions - before)
 
     def bounds(self, pressures: Float[Array, "k n+1"], friction: Friction) -> Float[Array, "f n+1"]:
         """Of the tangential forces; 0 from rest."""
@@ -460,10 +468,10 @@ class NodalForm(Form):
 
     def contacts(self, point: Any) -> Contacts:
         nodal = point.nodal
-        gaps, normals = self.gaps_and_normals(nodal.places)
+        gaps, normals = self.gaps_and_normals(nodal.positions)
         is_free = jnp.where(self.is_at_support, 0.0, 1.0).astype(normals.dtype)[:, None]
         normals *= is_free[None]
-        curving = is_free[..., None] * self._curving(nodal.places, nodal.pressures[: len(gaps)])
+        curving = is_free[..., None] * self._curving(nodal.positions, nodal.pressures[: len(gaps)])
         inner, inner_rows, across = None, None, self._across(normals) if nodal.friction is not None else None
         by_rotations, far_rows = None, None
         if self.smooth:
@@ -474,19 +482,19 @@ class NodalForm(Form):
             far_rows, by_rotations = found.rows, found.by_rotations
             gaps = jnp.concatenate([gaps, found.gaps[None]])
         normals = jnp.pad(normals, ((0, len(gaps) - len(normals)), (0, 0), (0, 0)))
-        is_closed, ways = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]), None
+        is_closed, displacements = nodal.pressures > GAP_WEIGHT * (gaps + self.led_out(gaps)[:, None]), None
         if nodal.friction is not None and across is not None:
-            ways = self.travelled(nodal.places, nodal.friction)
-            sticks = self.sticks(nodal, normals, ways)
+            displacements = self.travelled(nodal.positions, nodal.friction)
+            sticks = self.sticks(nodal, normals, displacements)
             is_closed = jnp.concatenate([is_closed, jnp.repeat(sticks, 3, axis=0)])
             normals = jnp.concatenate([normals, across])
-        rows = ContactRows(normals, self.softness, is_closed, inner=inner_rows, far=far_rows)
+        rows = ContactRows(normals, self.contact_compliance, is_closed, inner=inner_rows, far=far_rows)
         gradient = None
         if inner is not None or far_rows is not None:
             # What pressures do to the rotations.
             nothing = jnp.zeros((self.node_axes(point).shape[1], 2 * len(self.field.s) - 1), gaps.dtype)
             gradient = -rows.turned(nodal.contact_forces, nothing)
-        return Contacts(gaps, rows, curving, ways, gradient, inner, by_rotations)
+        return Contacts(gaps, rows, curving, displacements, gradient, inner, by_rotations)
 
     def self_contacts(self, point: Any, pressures: Float[Array, "n+1"]) -> SelfContacts:
         """Of a rod with these forces between its elements."""
@@ -498,8 +506,8 @@ class NodalForm(Form):
 
     @property
     def far_unit(self) -> Float[Array, ""]:
-        """In which pressures between elements count, so that all contacts have one softness in numbers."""
-        return jnp.sqrt(self.softness / FAR_SOFTNESS)
+        """In which pressures between elements count, so that all contacts have the same compliance in numbers."""
+        return jnp.sqrt(self.contact_compliance / FAR_COMPLIANCE)
 
     def curve(self, point: Any) -> Curve:
         s = self.field.s
@@ -507,7 +515,7 @@ class NodalForm(Form):
         radius = self.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
         assert isinstance(self.layout, CellForces)
         normal = self.layout.normal  # of the plane of the rod
-        return Curve(s, point.nodal.places, point.tangents[:, ::2], self.node_axes(point), free, radius, normal)
+        return Curve(s, point.nodal.positions, point.tangents[:, ::2], self.node_axes(point), free, radius, normal)
 
     def _inner(
         self, point: Any, pressures: Float[Array, "q n"]
@@ -532,48 +540,48 @@ class NodalForm(Form):
         return jnp.swapaxes(projections, 1, 2).reshape(-1, *normals.shape[1:])
 
     def sticks(
-        self, nodal: Nodal, normals: Float[Array, "k n+1 3"], ways: Float[Array, "n+1 3"]
+        self, nodal: Nodal, normals: Float[Array, "k n+1 3"], displacements: Float[Array, "n+1 3"]
     ) -> Bool[Array, "f n+1"]:
         """Whether contacts with friction stick: nodes that have not slipped, and where less than the bound holds."""
         assert nodal.friction is not None
-        exerted, slips = pulled(nodal.friction.forces, ways, normals[np.array(self.rough)])
+        exerted, slips = pulled(nodal.friction.forces, displacements, normals[np.array(self.rough)])
         bounds = self.bounds(nodal.pressures, nodal.friction)
         has_slipped = lengths(slips)[..., 0] > LEAST_SLIP
         return (bounds > 0) & ((lengths(exerted)[..., 0] < bounds) | ~has_slipped)
 
-    def model(self, point: Any, gaps: Float[Array, "k n+1"], ways: Float[Array, "n+1 3"] | None) -> Unilateral:
-        """The contacts of the model of a step from a point, to gaps and ways."""
+    def model(self, point: Any, gaps: Float[Array, "k n+1"], displacements: Float[Array, "n+1 3"] | None) -> Unilateral:
+        """The contacts of the model of a step from a point, with these gaps and displacements."""
         nodal = point.nodal
         gaps = gaps + nodal.relaxed[:, None]
-        if nodal.friction is None or ways is None:
+        if nodal.friction is None or displacements is None:
             return Unilateral(gaps, nodal.pressures)
-        _, normals = self.gaps_and_normals(nodal.places)
-        slips = jnp.einsum("knc,nc->kn", self._across(normals), ways)
+        _, normals = self.gaps_and_normals(nodal.positions)
+        slips = jnp.einsum("knc,nc->kn", self._across(normals), displacements)
         bounds = self.bounds(nodal.pressures, nodal.friction)
         return Unilateral(jnp.concatenate([gaps, slips]), nodal.contact_forces, bounds)
 
     def _curving(
-        self, places: Float[Array, "p 3"], pressures: Float[Array, "k p"], which: tuple[int, ...] | None = None
+        self, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"], which: tuple[int, ...] | None = None
     ) -> Float[Array, "p 3 3"]:
-        """Second derivatives of what L has of the contacts, by the places of nodes or middles; `which`: obstacles, if
-        not all.
+        """Second derivatives of what L has of the contacts, by the positions of nodes or middles; `which`: obstacles,
+        if not all.
         """
-        total = jnp.zeros((len(places), 3, 3), places.dtype)
+        total = jnp.zeros((len(positions), 3, 3), positions.dtype)
         obstacles = self.scene.obstacles if which is None else [self.scene.obstacles[k] for k in which]
         for obstacle, pressure in zip(obstacles, pressures, strict=True):
             # Where the rod touches nothing of an obstacle, its curvature is not computed.
             total = jax.lax.cond(
                 jnp.any(pressure != 0),
                 lambda total, obstacle=obstacle, pressure=pressure: (
-                    total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(places)
+                    total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(positions)
                 ),
                 lambda total: total,
                 total,
             )
         return total
 
-    def unbalanced_contacts(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
-        """The closure of contacts and nodes, and the most that is out of balance there."""
+    def contact_residuals(self, point: Any, contacts: Contacts) -> tuple[Array, Array, Array]:
+        """The residuals of contacts and of the balance of nodes, and the largest component of both."""
         nodal, gaps = point.nodal, contacts.gaps
         pressures, forces = nodal.pressures, nodal.contact_forces
         balance = self.applied(point).T - contacts.rows.pushed(forces)
@@ -582,9 +590,9 @@ class NodalForm(Form):
         # Of a gap and a pressure one is zero, none is negative.
         weighted = GAP_WEIGHT * gaps
         amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
-        if nodal.friction is not None and contacts.ways is not None:
+        if nodal.friction is not None and contacts.reference_displacements is not None:
             normals = contacts.rows.normals[np.array(self.rough)]
-            exerted, slips = pulled(nodal.friction.forces, contacts.ways, normals)
+            exerted, slips = pulled(nodal.friction.forces, contacts.reference_displacements, normals)
             off = tangential(nodal.friction.forces, normals)
             off -= within(exerted, self.bounds(pressures, nodal.friction))
             off = jnp.max(jnp.abs(off))
@@ -595,15 +603,15 @@ class NodalForm(Form):
 
     def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         """Without contacts."""
-        energy, ways = self.in_cells_at(point)
-        energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0))
+        energy, segment_vectors = self.in_cells_at(point)
+        energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0))
         if self.scene.potentials:
             energy += jnp.sum(potentials.node_energies(self.scene, self.field.s, *self._node_lines(point)))
-        return energy, self.gap_of_elements(point, ways).reshape(-1)
+        return energy, self.gap_of_elements(point, segment_vectors).reshape(-1)
 
-    def gap_of_elements(self, point: Any, ways: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """What the elements lack of the ways between their nodes."""
-        return jnp.diff(point.nodal.places, axis=0) - ways
+    def gap_of_elements(self, point: Any, segment_vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """The vectors between nodes minus the segment vectors of the elements."""
+        return jnp.diff(point.nodal.positions, axis=0) - segment_vectors
 
     # --- friction ----------------------------------------------------------------------------------------------------
 
@@ -612,7 +620,7 @@ class NodalForm(Form):
         within an element each of its nodes has half.
         """
         nodal = point.nodal
-        _, normals = self.distances_and_normals(nodal.places)
+        _, normals = self.distances_and_normals(nodal.positions)
         k = len(normals)
         pushes = nodal.pressures[:k, :, None] * normals
         pressures = nodal.pressures[:k]
@@ -629,12 +637,12 @@ class NodalForm(Form):
         drags, _ = self._friction_at(nodal)
         # What sticks may be beyond its bound by what the search has left.
         drags = within(drags, self.bounds(nodal.pressures, nodal.friction))
-        sticks = self.sticks(nodal, normals, self.travelled(nodal.places, nodal.friction))
+        sticks = self.sticks(nodal, normals, self.travelled(nodal.positions, nodal.friction))
         states = states.at[rough].set(jnp.where(sticks, STICKS, states[rough]))
         return pushes, jnp.zeros_like(pushes).at[rough].set(drags), states
 
     def by_law(self, point: Any) -> Any:
-        """The point with the tangential forces of what slips as pressures, places and scene make them."""
+        """The point with the tangential forces of what slips as pressures, positions and scene make them."""
         if point.nodal is None or point.nodal.friction is None:
             return point
         forces, _ = self._friction_at(point.nodal)
@@ -645,16 +653,16 @@ class NodalForm(Form):
         """Tangential forces, and slips. What slips and what sticks, and the forces of the latter, are those given."""
         friction = nodal.friction
         assert friction is not None
-        _, normals = self.gaps_and_normals(nodal.places)
+        _, normals = self.gaps_and_normals(nodal.positions)
         normals, bounds = normals[np.array(self.rough)], self.bounds(nodal.pressures, friction)
-        ways = self.travelled(nodal.places, friction)
-        held, slips = tangential(friction.forces, normals), tangential(ways[None], normals)
-        exerted, _ = jax.lax.stop_gradient(pulled(friction.forces, ways, normals))
-        sticks = jax.lax.stop_gradient(self.sticks(nodal, self.gaps_and_normals(nodal.places)[1], ways))
+        displacements = self.travelled(nodal.positions, friction)
+        held, slips = tangential(friction.forces, normals), tangential(displacements[None], normals)
+        exerted, _ = jax.lax.stop_gradient(pulled(friction.forces, displacements, normals))
+        sticks = jax.lax.stop_gradient(self.sticks(nodal, self.gaps_and_normals(nodal.positions)[1], displacements))
         return jnp.where(sticks[..., None], held, bounds[..., None] * directions(exerted, slips)), slips
 
     def coupled(self, point: Any, system: AnySystem) -> AnySystem:
-        """With friction as it depends on pressures and places, without symmetry."""
+        """With friction as it depends on pressures and positions, without symmetry."""
         nodal = point.nodal
         if nodal is None or nodal.friction is None:
             return system
@@ -662,21 +670,23 @@ class NodalForm(Form):
         rough, contacts = np.array(self.rough), system.contacts
         k = len(nodal.pressures)
 
-        def friction_at(places: Array, pressures: Array) -> tuple[Array, Array]:
-            return self._friction_at(dataclasses.replace(nodal, places=places, pressures=pressures))
+        def friction_at(positions: Array, pressures: Array) -> tuple[Array, Array]:
+            return self._friction_at(dataclasses.replace(nodal, positions=positions, pressures=pressures))
 
-        def by_places(axis: Float[Array, "3"]) -> tuple[Array, Array]:
-            turned = jnp.broadcast_to(axis[None], nodal.places.shape)
-            return jax.jvp(lambda places: friction_at(places, nodal.pressures), (nodal.places,), (turned,))[1]
+        def by_positions(axis: Float[Array, "3"]) -> tuple[Array, Array]:
+            turned = jnp.broadcast_to(axis[None], nodal.positions.shape)
+            return jax.jvp(lambda positions: friction_at(positions, nodal.pressures), (nodal.positions,), (turned,))[1]
 
         def by_pressures(pressures: Array) -> Array:
-            return friction_at(nodal.places, pressures)[0]
+            return friction_at(nodal.positions, pressures)[0]
 
-        forces, slips = jax.vmap(by_places)(jnp.eye(3, dtype=nodal.places.dtype))  # [direction, f, node, component]
+        forces, slips = jax.vmap(by_positions)(
+            jnp.eye(3, dtype=nodal.positions.dtype)
+        )  # [direction, f, node, component]
         _, dragging = jax.jvp(by_pressures, (nodal.pressures,), (jnp.ones_like(nodal.pressures),))
         free = jnp.where(self.is_held, 0.0, 1.0).astype(forces.dtype)[:, None]
         pushes = contacts.normals.at[rough].add(dragging * free[None])
-        rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.places.shape) * free[None]
+        rows = slips.transpose(1, 3, 2, 0).reshape(-1, *nodal.positions.shape) * free[None]
         normals = jnp.concatenate([contacts.normals[:k], rows])
         rows = dataclasses.replace(contacts, normals=normals, pushes=pushes)
         stiffness = system.stiffness - free[..., None] * jnp.einsum("dfnc->ncd", forces)
@@ -688,20 +698,23 @@ class NodalForm(Form):
         """L with the contacts as of the model, with the pressures of a point."""
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        softness, model = here.system.contacts.softness, self.model(point, here.gaps, here.ways)
-        return here.energy + model.energy(model.pressures - model.gaps / softness, softness)
+        contact_compliance, model = (
+            here.system.contacts.contact_compliance,
+            self.model(point, here.gaps, here.reference_displacements),
+        )
+        return here.energy + model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
 
     def contact_energy(self, there: Any, point: Any) -> Float[Array, ""]:
         """That of `objective`, on the way of a step from a point."""
-        gaps, _ = self.gaps_and_normals(there.nodal.places)
+        gaps, _ = self.gaps_and_normals(there.nodal.positions)
         if self.smooth:
             gaps = jnp.concatenate([gaps, self.within_elements(there)[1]])
-        softness, model = self.softness, self.model(point, gaps, None)
-        return model.energy(model.pressures - model.gaps / softness, softness)
+        contact_compliance, model = self.contact_compliance, self.model(point, gaps, None)
+        return model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
-        _, _, balance, _ = here.system.parted(here.closure)
+        _, _, balance, _ = here.system.split(here.constraint_residual)
         return super().half_square(here) + jnp.sum(balance**2 / self.field.weights[::2, None]) / 2
 
     def sought(
@@ -713,14 +726,14 @@ class NodalForm(Form):
         if not has_contacts(self.scene):
             return super().sought(here, point, system, push)
         moments, c = self.without_contacts(here, nodal.contact_forces)
-        contacts = self.model(point, here.gaps, here.ways)
+        contacts = self.model(point, here.gaps, here.reference_displacements)
         is_closed = system.contacts.is_closed
         if nodal.friction is None:
             is_closed = self.first_closed(is_closed, contacts)
         else:
             k = len(here.gaps)
             # What slips, and by how much, is a matter of the model.
-            trial = contacts.pressures - contacts.gaps / system.contacts.softness
+            trial = contacts.pressures - contacts.gaps / system.contacts.contact_compliance
             sticks = contacts.is_closed(trial)[k:]
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
@@ -737,7 +750,7 @@ class NodalForm(Form):
         """What is out of balance without the forces of contacts, as right sides."""
         system = here.system
         assert isinstance(system, ChainSystem)
-        first, _, balance, gaps = system.parted(-here.closure)
+        first, _, balance, gaps = system.split(-here.constraint_residual)
         balance -= system.contacts.pushed(forces)
         moments = -system.contacts.turned(forces, here.gradient)
         parts = (first, jnp.zeros_like(forces), balance, gaps)
@@ -753,27 +766,27 @@ class NodalForm(Form):
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
         elements, rates = self.turning_elements(point, rotation, here.bases)
 
-        def parts(elements: Any, places: Float[Array, "n+1 3"], change: Float[Array, "3 n"]) -> tuple[Array, Array]:
-            value, ways = self.in_elements(point, elements, change)
-            gap = jnp.diff(places, axis=0) - ways
-            # Of L the elements have sum -F . way.
+        def parts(elements: Any, positions: Float[Array, "n+1 3"], change: Float[Array, "3 n"]) -> tuple[Array, Array]:
+            value, segment_vectors = self.in_elements(point, elements, change)
+            gap = jnp.diff(positions, axis=0) - segment_vectors
+            # Of L the elements have the sum of -F . segment vector.
             force = point.end_force + change
-            return value + jnp.sum(force.T * jnp.diff(places, axis=0)), gap
+            return value + jnp.sum(force.T * jnp.diff(positions, axis=0)), gap
 
-        places = point.nodal.places
+        positions = point.nodal.positions
         (energy, gaps), (rate, gap_rates) = jax.jvp(
-            lambda elements, places: parts(elements, places, change),
-            (elements, places),
+            lambda elements, positions: parts(elements, positions, change),
+            (elements, positions),
             (rates, others.displacements),
         )
         # The gradient by rotations has the forces as they are.
         (before, _), (counted, _) = jax.jvp(
-            lambda elements: parts(elements, places, jnp.zeros_like(change)), (elements,), (rates,)
+            lambda elements: parts(elements, positions, jnp.zeros_like(change)), (elements,), (rates,)
         )
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        model = self.model(point, here.gaps, here.ways)
-        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.softness)
+        model = self.model(point, here.gaps, here.reference_displacements)
+        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.contact_compliance)
         rows = here.system.contacts
         rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
         if rows.inner is not None or rows.far is not None:
@@ -781,8 +794,8 @@ class NodalForm(Form):
             at_rest = rows.rates(rotation, jnp.zeros_like(others.displacements))
             rate += jnp.sum(point.nodal.contact_forces * at_rest)
         if self.scene.potentials:
-            by_place = potentials.by_place(self.scene, self.field.s, *self._node_lines(point))
-            rate += jnp.sum(by_place * others.displacements)
+            by_position = potentials.by_position(self.scene, self.field.s, *self._node_lines(point))
+            rate += jnp.sum(by_position * others.displacements)
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
@@ -794,8 +807,8 @@ class NodalForm(Form):
         if not self.scene.obstacles:
             return is_better
         before, after = self._looked_at(point), self._looked_at(trial)
-        ways = after - before
-        distance = jnp.sqrt(jnp.sum(ways**2, axis=1))
+        displacements = after - before
+        distance = jnp.sqrt(jnp.sum(displacements**2, axis=1))
         radius = self.radius
         rim = jnp.concatenate([radius, *[least(radius[:-1], radius[1:])] * len(LOOKED_AT)])
 
@@ -827,7 +840,7 @@ class NodalForm(Form):
         def looked(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             gone, _, count = state
             parts = jnp.minimum(gone / jnp.where(distance > 0, distance, 1.0), 1.0)
-            gaps = distances(before + parts[:, None] * ways) - bound
+            gaps = distances(before + parts[:, None] * displacements) - bound
             return ahead(gone, gaps), jnp.any(gaps < 0), count + 1
 
         def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
@@ -839,7 +852,7 @@ class NodalForm(Form):
         return is_better & ~is_blocked & jnp.all(gone >= distance)
 
     def _looked_at(self, point: Any) -> Float[Array, "k 3"]:
-        nodes, slopes = point.nodal.places, point.tangents[:, ::2].T
+        nodes, slopes = point.nodal.positions, point.tangents[:, ::2].T
         s = self.field.s
         between = s[None, :-1] + jnp.asarray(LOOKED_AT, s.dtype)[:, None] * jnp.diff(s)[None]
         return jnp.concatenate([nodes, cubic(s, nodes, slopes, between.reshape(-1))])
@@ -849,12 +862,12 @@ class NodalForm(Form):
         distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in self.scene.obstacles])
         return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
 
-    def places(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
+    def samples(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
         """At steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
         beside a held node this, elsewhere not a number.
         """
         s = self.field.s
-        x = jnp.linspace(0.0, 1.0, PLACES, dtype=s.dtype)
+        x = jnp.linspace(0.0, 1.0, SAMPLES, dtype=s.dtype)
         x = x.at[1:-1].add(BESIDE * x[1])
         points = cubic(s, nodes, self.node_slopes(point), x)
         cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)

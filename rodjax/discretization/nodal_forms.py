@@ -63,14 +63,14 @@ class NodalTangents(NodalForm, MixedForm):
         field, tangents = self.field, point.tangents
         assert isinstance(field, QuadraticRotationElements)
         holding = self._held_by
-        bases, energy, blocks, torque_column, softness = self._elastic(point, holding)
+        bases, energy, blocks, torque_column, torsional_compliance = self._elastic(point, holding)
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         contacts = self.contacts(point)
         assert point.nodal is not None
-        rows, balance, amiss = self.unbalanced_contacts(point, contacts)
-        closure = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
+        rows, balance, amiss = self.contact_residuals(point, contacts)
+        constraint_residual = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
         columns = [] if torque_column is None else [torque_column]
         by_point = map(field.scatter_add, (cells.gradient, cells.diagonal, cells.lengths, *columns))
@@ -79,14 +79,14 @@ class NodalTangents(NodalForm, MixedForm):
         if fields is not None:
             gradient = gradient.at[:, ::2].add(fields.by_rotation)
             diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
-            stiffness += fields.by_places
+            stiffness += fields.by_positions
             energy += jnp.sum(fields.energy)
         gradient = contacts.added_to(gradient)
-        if softness is None:
+        if torsional_compliance is None:
             border, compliance = jnp.zeros((len(gradient), 0, tangents.shape[1]), dtype), jnp.zeros((0, 0), dtype)
         else:
-            border, compliance = columns[0], softness[None, None]
-            closure = [jnp.zeros(1, dtype), *closure]
+            border, compliance = columns[0], torsional_compliance[None, None]
+            constraint_residual = [jnp.zeros(1, dtype), *constraint_residual]
         free = field.basis(self.scene, bases) if self.ends_move else bases
         forces = short_sum(free * gradient[None], axis=1)
         residual = field.residual(self.scene, forces, lengths)
@@ -107,21 +107,23 @@ class NodalTangents(NodalForm, MixedForm):
         return Linearization(
             bases=bases,
             gradient=gradient,
-            closure=jnp.concatenate(closure),
+            constraint_residual=jnp.concatenate(constraint_residual),
             system=contacts.stiffened(system),
-            energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0)),
+            energy=energy + cells.energy + jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0)),
             residual=larger(amiss, residual),
             gaps=contacts.gaps,
-            ways=contacts.ways,
+            reference_displacements=contacts.reference_displacements,
         )
 
-    def unbalanced(self, point: MixedPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        return super().unbalanced(self.by_law(point))
+    def residual_vectors(self, point: MixedPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        return super().residual_vectors(self.by_law(point))
 
     def in_cells_at(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        energy, ways = self.in_elements(point, point.tangents, jnp.zeros_like(point.end_force))
+        energy, segment_vectors = self.in_elements(point, point.tangents, jnp.zeros_like(point.end_force))
         energy += self.field.bending_energy(self.scene, point.tangents)
-        return energy + density(self.scene.rod, twist=point.total_twist) if self.has_torsion else energy, ways
+        return energy + density(
+            self.scene.rod, twist=point.total_twist
+        ) if self.has_torsion else energy, segment_vectors
 
     def turning_elements(
         self, point: MixedPoint, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]
@@ -221,16 +223,16 @@ class NodalFrames(NodalForm, FrameForm):
             # By the virtual work in what turns the frames, of which only half is a turn of the couple beside its frame.
             moments = first_derivatives(cells._replace(forces=forces)) - cross(turn, couples) / 2
             moments -= nonconservative.couples(scene, field, there)
-            ways = short_sum(self._strained(kinematics, forces).ways, axis=1)
-            return moments, -ways, -nonconservative.on_nodes(scene, field, there)
+            segment_vectors = short_sum(self._strained(kinematics, forces).weighted_slopes, axis=1)
+            return moments, -segment_vectors, -nonconservative.on_nodes(scene, field, there)
 
         along = field.gather(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
         alone = jnp.eye(q.shape[1], dtype=q.dtype)[None, :, None, :, None]
         zero, turns = jnp.zeros_like(q[1:]), (along[:, None] * alone).reshape(-1, *q[1:].shape)
         derivatives = jax.vmap(lambda turn: jax.jvp(rows, (zero,), (turn,))[1])(turns)
-        moments, ways, balance = (rows.reshape(3, 3, *rows.shape[1:]) for rows in derivatives)
+        moments, segment_vectors, balance = (rows.reshape(3, 3, *rows.shape[1:]) for rows in derivatives)
         moments = jnp.einsum("xain,bjain->xibjn", along, moments)
-        return LoadRows(moments, jnp.einsum("bjan->abjn", ways), jnp.einsum("bjkan->kabjn", balance))
+        return LoadRows(moments, jnp.einsum("bjan->abjn", segment_vectors), jnp.einsum("bjkan->kabjn", balance))
 
     @property
     def _projections(self) -> Float[Array, "3 3 m"]:
@@ -252,7 +254,7 @@ class NodalFrames(NodalForm, FrameForm):
         contacts = self.contacts(point)
         gradient = contacts.added_to(gradient)
         assert point.nodal is not None
-        rows, balance, amiss = self.unbalanced_contacts(point, contacts)
+        rows, balance, amiss = self.contact_residuals(point, contacts)
         dtype = gradient.dtype
         system = ChainSystem(
             diagonal,
@@ -262,25 +264,25 @@ class NodalFrames(NodalForm, FrameForm):
             jnp.zeros((0, 0), dtype),
             self._by_force(cells),
             self.layout.compliance(cells.compliance),
-            contacts.stiffness if fields is None else contacts.stiffness + fields.by_places,
+            contacts.stiffness if fields is None else contacts.stiffness + fields.by_positions,
             contacts.rows,
             self.is_held,
             None if self.has_potential else self._load_rows(point),
             None if fields is None else fields.turning,
             is_backward=not isinstance(self.scene.start, Held),
         )
-        gaps = self.gap_of_elements(point, cells.way.T)
+        gaps = self.gap_of_elements(point, cells.segment_vectors.T)
         held = dataclasses.replace(self, ends_move=False)
-        energy = jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.places, axis=0))
+        energy = jnp.sum(cells.value) + jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0))
         return Linearization(
             bases=self.bases_at(point),
             gradient=gradient,
-            closure=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
+            constraint_residual=jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)]),
             system=contacts.stiffened(system),
             energy=energy if fields is None else energy + jnp.sum(fields.energy),
             residual=larger(amiss, self._residual(held.projected(gradient) if self.ends_move else gradient)),
             gaps=contacts.gaps,
-            ways=contacts.ways,
+            reference_displacements=contacts.reference_displacements,
         )
 
     def _by_force(self, cells: CellDerivatives) -> Float[Array, "3 3 3 n"]:
@@ -289,14 +291,14 @@ class NodalFrames(NodalForm, FrameForm):
             return by_force
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
-    def unbalanced(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
+    def residual_vectors(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
         point = self.by_law(point)
         gradient, fields = self._moments(point), self.at_nodes(point)
         if fields is not None:
             gradient = gradient.at[:, ::2].add(fields.by_rotation)
         contacts = self.contacts(point)
         gradient = contacts.added_to(gradient)
-        rows, balance, _ = self.unbalanced_contacts(point, contacts)
+        rows, balance, _ = self.contact_residuals(point, contacts)
         gaps = self.gap_of_elements(point, self.edges(point))
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 
@@ -312,5 +314,5 @@ class NodalFrames(NodalForm, FrameForm):
     def in_elements(
         self, point: FramePoint, elements: Kinematics, change: Float[Array, "3 n"]
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        value, ways = self.in_cells(elements, point.end_force + change)
-        return value, ways.T
+        value, segment_vectors = self.in_cells(elements, point.end_force + change)
+        return value, segment_vectors.T

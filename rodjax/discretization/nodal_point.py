@@ -28,7 +28,7 @@ class Nodal(eqx.Module):
     are seen larger in the next step; `friction`: where an obstacle has some.
     """
 
-    places: Float[Array, "n+1 3"]
+    positions: Float[Array, "n+1 3"]
     pressures: Float[Array, "k n+1"]
     relaxed: Float[Array, "k"]
     friction: Friction | None = None
@@ -38,28 +38,28 @@ class Nodal(eqx.Module):
         """The multipliers of the rows of contacts: pressures, then three components of each tangential force."""
         if self.friction is None:
             return self.pressures
-        components = jnp.swapaxes(self.friction.forces, 1, 2).reshape(-1, len(self.places))
+        components = jnp.swapaxes(self.friction.forces, 1, 2).reshape(-1, len(self.positions))
         return jnp.concatenate([self.pressures, components])
 
-    def with_contact_forces(self, places: Float[Array, "n+1 3"], forces: Float[Array, "r n+1"]) -> "Nodal":
-        """With other places, and multipliers as of `contact_forces`."""
+    def with_contact_forces(self, positions: Float[Array, "n+1 3"], forces: Float[Array, "r n+1"]) -> "Nodal":
+        """With other positions, and multipliers as of `contact_forces`."""
         if self.friction is None:
-            return dataclasses.replace(self, places=places, pressures=forces)
+            return dataclasses.replace(self, positions=positions, pressures=forces)
         k, nodes = self.pressures.shape
         friction = jnp.swapaxes(forces[k:].reshape(-1, 3, nodes), 1, 2)
         friction = dataclasses.replace(self.friction, forces=friction)
-        return dataclasses.replace(self, places=places, pressures=forces[:k], friction=friction)
+        return dataclasses.replace(self, positions=positions, pressures=forces[:k], friction=friction)
 
     def flattened(self, axes: Float[Array, "3 2"]) -> "Nodal":
         """With all nodes in the plane of two axes through the first one."""
-        first = self.places[:1]
-        places = first + (self.places - first) @ axes @ axes.T
-        return dataclasses.replace(self, places=places)
+        first = self.positions[:1]
+        positions = first + (self.positions - first) @ axes @ axes.T
+        return dataclasses.replace(self, positions=positions)
 
     def without(self, normal: Float[Array, "3"]) -> "Nodal":
         """The same, of the plane with this normal."""
-        ways = self.places - self.places[:1]
-        return dataclasses.replace(self, places=self.places - (ways @ normal)[:, None] * normal[None])
+        offsets = self.positions - self.positions[:1]
+        return dataclasses.replace(self, positions=self.positions - (offsets @ normal)[:, None] * normal[None])
 
 
 class NodalChange(NamedTuple):
@@ -70,4 +70,4 @@ class NodalChange(NamedTuple):
 
     @staticmethod
     def nothing(nodal: Nodal) -> "NodalChange":
-        return NodalChange(jnp.zeros_like(nodal.places), jnp.zeros_like(nodal.contact_forces))
+        return NodalChange(jnp.zeros_like(nodal.positions), jnp.zeros_like(nodal.contact_forces))

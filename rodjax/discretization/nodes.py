@@ -14,22 +14,22 @@ LEAST_ELEMENT = 0.05
 
 
 def with_nodes_at(
-    s: Float[Array, "n+1"], places: Float[Array, "k"], *, may_repeat: bool = False
+    s: Float[Array, "n+1"], arclengths: Float[Array, "k"], *, may_repeat: bool = False
 ) -> Float[Array, "n+1"]:
     """The nodes moved, with all between them and the next one fixed, so that one lies at each of the sorted places.
 
     Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none. `may_repeat`: several of
     them may be the same, so that there may be more of them than nodes.
     """
-    n, k = len(s) - 1, min(len(places), len(s) - 2)
+    n, k = len(s) - 1, min(len(arclengths), len(s) - 2)
     remaining: Iterable[Any] = range(k, 0, -1)
     if may_repeat:
-        k = len(places)
-        differ = jnp.concatenate([jnp.diff(places) * n >= LEAST_ELEMENT, jnp.array([True])])
+        k = len(arclengths)
+        differ = jnp.concatenate([jnp.diff(arclengths) * n >= LEAST_ELEMENT, jnp.array([True])])
         remaining = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
     index = jnp.arange(n + 1)
     fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
-    for nodes_left, place in zip(remaining, places[:k], strict=True):
+    for nodes_left, place in zip(remaining, arclengths[:k], strict=True):
         nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - nodes_left)
         moved = node_moved(s, index, (fixed, fixed_place), (nearest, place))
         is_apart = (place - fixed_place) * n >= LEAST_ELEMENT
@@ -51,22 +51,22 @@ def with_nodes_at_clips(
     """
     n = len(s) - 1
     clips = jnp.stack([clip.at for clip in scene.clips])
-    places = clips
+    arclengths = clips
     if loads:
         at = jnp.stack(loads)
         beside = clips[jnp.argmin(jnp.abs(at[:, None] - clips[None]), axis=1)]
-        places = jnp.concatenate([clips, jnp.where(jnp.abs(at - beside) * n < LEAST_ELEMENT, beside, at)])
-    order = jnp.argsort(places, stable=True)
-    places, is_clip = places[order], order < len(clips)
+        arclengths = jnp.concatenate([clips, jnp.where(jnp.abs(at - beside) * n < LEAST_ELEMENT, beside, at)])
+    order = jnp.argsort(arclengths, stable=True)
+    arclengths, is_clip = arclengths[order], order < len(clips)
     # So many nodes are wanted from each place on, and so many clips lie beyond it.
-    differ = jnp.concatenate([(jnp.diff(places) * n >= LEAST_ELEMENT) | is_clip[1:], jnp.array([True])])
+    differ = jnp.concatenate([(jnp.diff(arclengths) * n >= LEAST_ELEMENT) | is_clip[1:], jnp.array([True])])
     wanted = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
     beyond = jnp.sum(is_clip) - jnp.cumsum(is_clip)
     index = jnp.arange(n + 1)
     fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
     numbers = jnp.zeros(len(clips), index.dtype)
-    for k in range(len(places)):
-        place = places[k]
+    for k in range(len(arclengths)):
+        place = arclengths[k]
         last = jnp.minimum(
             jnp.where(is_clip[k], jnp.maximum(n - wanted[k], fixed + 1), n - wanted[k]), n - 1 - beyond[k]
         )

@@ -70,8 +70,8 @@ def _follower_force(
 
 def _at_points(load: DistributedForce | DistributedCouple, field: ElementCells) -> Float[Array, "3 3 n"]:
     """Per length at the points of elements, on which it is the same: a part has nodes where it ends."""
-    by_element = per_length(load, field.strain_places[1])
-    return jnp.broadcast_to(by_element[:, None], (3, *field.strain_places.shape))
+    by_element = per_length(load, field.strain_arclengths[1])
+    return jnp.broadcast_to(by_element[:, None], (3, *field.strain_arclengths.shape))
 
 
 def _whole(field: ElementCells, force: Float[Array, "3 3 n"]) -> Float[Array, "3 n"]:

@@ -26,7 +26,7 @@ class NodeEnergy(NamedTuple):
 
     energy: Float[Array, "n+1"]
     by_rotation: Float[Array, "b n+1"]
-    by_places: Float[Array, "n+1 3 3"]
+    by_positions: Float[Array, "n+1 3 3"]
     turning: Float[Array, "b 3 n+1"]
     by_rotations: Float[Array, "b b n+1"]
 
@@ -36,7 +36,7 @@ class OnElements(NamedTuple):
     its nodes, and the force per length there.
     """
 
-    by_place: Float[Array, "3 2 n"]
+    by_position: Float[Array, "3 2 n"]
     by_tangent: Float[Array, "3 2 n"]
     density: Float[Array, "3 2 n"]
 
@@ -67,23 +67,23 @@ def _weights(s: Float[Array, "n+1"]) -> tuple[Float[Array, "n+1"], Float[Array, 
 
 
 def node_energies(
-    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+    scene: Scene, s: Float[Array, "n+1"], positions: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
 ) -> Float[Array, "n+1"]:
     """Of a nondimensional scene."""
     weights = _weights(s)
-    return jax.vmap(lambda *node: _beside(scene, *node))(places, tangents.T, s, *weights)
+    return jax.vmap(lambda *node: _beside(scene, *node))(positions, tangents.T, s, *weights)
 
 
-def by_place(
-    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+def by_position(
+    scene: Scene, s: Float[Array, "n+1"], positions: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
 ) -> Float[Array, "n+1 3"]:
-    return jax.grad(lambda places: jnp.sum(node_energies(scene, s, places, tangents)))(places)
+    return jax.grad(lambda positions: jnp.sum(node_energies(scene, s, positions, tangents)))(positions)
 
 
 def at_nodes(
     scene: Scene,
     s: Float[Array, "n+1"],
-    places: Float[Array, "n+1 3"],
+    positions: Float[Array, "n+1 3"],
     tangents: Float[Array, "3 n+1"],
     axes: Float[Array, "3 b n+1"],
 ) -> NodeEnergy:
@@ -99,7 +99,7 @@ def at_nodes(
         nothing = jnp.zeros(3 + axes.shape[1], position.dtype)
         return *jax.value_and_grad(energy)(nothing), jax.hessian(energy)(nothing)
 
-    energy, first, second = jax.vmap(of_node)(places, tangents.T, axes.transpose(2, 0, 1), s, *_weights(s))
+    energy, first, second = jax.vmap(of_node)(positions, tangents.T, axes.transpose(2, 0, 1), s, *_weights(s))
     return NodeEnergy(
         energy,
         first[:, 3:].T,
@@ -110,7 +110,7 @@ def at_nodes(
 
 
 def on_elements(
-    scene: Scene, s: Float[Array, "n+1"], places: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
+    scene: Scene, s: Float[Array, "n+1"], positions: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
 ) -> OnElements:
     h = jnp.diff(s)
 
@@ -124,7 +124,7 @@ def on_elements(
             density = jax.grad(lambda position: _density(scene, position, s))(position)
             return *jax.grad(energy, argnums=(0, 1))(position, tangent), -density
 
-        return jax.vmap(of_node)(places[nodes], tangents.T[nodes], s[nodes], h)
+        return jax.vmap(of_node)(positions[nodes], tangents.T[nodes], s[nodes], h)
 
     ends = zip(at_end(0, 1), at_end(1, -1), strict=True)
     return OnElements(*(jnp.stack([start.T, end.T], axis=1) for start, end in ends))
@@ -132,6 +132,6 @@ def on_elements(
 
 def section_forces(forces: Float[Array, "3 3 n"], fields: OnElements, h: Float[Array, "n"]) -> Float[Array, "3 3 n"]:
     """The forces through start, middle and end of the elements, of those without the fields: parabolas."""
-    start, end = -fields.by_place[:, 0], fields.by_place[:, 1]
+    start, end = -fields.by_position[:, 0], fields.by_position[:, 1]
     mean = h[None] / 12 * (fields.density[:, 0] - fields.density[:, 1])
     return forces + jnp.stack([start, 3 / 2 * mean - (start + end) / 4, end], axis=1)

@@ -187,7 +187,7 @@ def _on_edges(
     """Of a polyline with these unit tangents and tensions, under the forces at s = 0 and s = L."""
     rod = scene.rod
     n = tangents.shape[1]
-    is_equal = field.places is None
+    is_equal = field.arclengths is None
     h, last_h = (1 / n, 1 / n) if is_equal else (field.weights[0], field.weights[-1])
     start_moment = _end_moment(scene.start, rod, tangents[:, 0], h, torque_at(rod, twist), at_start=True)
     end_moment = _end_moment(scene.end, rod, tangents[:, -1], last_h, torque_at(rod, twist), at_start=False)
@@ -208,7 +208,7 @@ def _on_edges(
     end_tensions = [jnp.sum(force * t)[None] for force, t in zip(end_forces, (start_tangent, end_tangent), strict=True)]
     tension = jnp.concatenate([end_tensions[0], (edge_tension[:-1] + edge_tension[1:]) / 2, end_tensions[1]])
     return Resultants(
-        frames=_frames(scene, tangents, at_nodes, twist, field.places),
+        frames=_frames(scene, tangents, at_nodes, twist, field.arclengths),
         curvature=root(jnp.concatenate(squared_curvatures)),
         twist=jnp.full(n + 1, twist),
         tension=tension,

@@ -1,6 +1,6 @@
 """Contact of a rod with itself: where each element comes nearest to the rod beyond it.
 
-The centerline is the cubic through the places and tangents of the nodes. Of each element the contact point is that
+The centerline is the cubic through the positions and tangents of the nodes. Of each element the contact point is that
 place s of it, and that place s' further along the rod, where
 
     g = |x(s) - x(s')| + edge sin^2(pi (s - s_3/4)/h) - r(s) - r(s')
@@ -46,7 +46,7 @@ class Curve(NamedTuple):
     """
 
     s: Float[Array, "n+1"]
-    places: Float[Array, "n+1 3"]
+    positions: Float[Array, "n+1 3"]
     tangents: Float[Array, "3 n+1"]
     axes: Float[Array, "3 b n+1"]
     free: Float[Array, "n+1"]
@@ -69,13 +69,13 @@ class Nearest(NamedTuple):
 
 class _Side(NamedTuple):
     """A place of the curve: position, its first two derivatives by arclength, and the weights in the position and the
-    first derivative of both nodes' places and tangents.
+    first derivative of both nodes' positions and tangents.
     """
 
     x: Float[Array, "3 k"]
     slope: Float[Array, "3 k"]
     curvature: Float[Array, "3 k"]
-    of_places: Float[Array, "2 2 k"]  # [derivative, node]
+    of_positions: Float[Array, "2 2 k"]  # [derivative, node]
     of_tangents: Float[Array, "2 2 k"]
 
 
@@ -96,8 +96,8 @@ def nearest(curve: Curve) -> Nearest:
     h, element = jnp.diff(s), jnp.arange(n)
     least, most = _range(curve)
     begin, of_element = _samples(s)
-    ways = [c[:, None] - c[None] for c in _at(curve, of_element, begin).x]
-    squares = functools.reduce(jnp.add, map(jnp.square, ways))
+    differences = [c[:, None] - c[None] for c in _at(curve, of_element, begin).x]
+    squares = functools.reduce(jnp.add, map(jnp.square, differences))
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
     squares = jnp.where(allowed, squares, jnp.inf).reshape(n, -1)
     best = jnp.argmin(squares, axis=1)
@@ -105,8 +105,8 @@ def nearest(curve: Curve) -> Nearest:
     here, there = best // len(begin), best % len(begin)
     first = begin.reshape(n, -1)[element, here], begin[there]
 
-    def nearer(_, places: tuple[Array, Array]) -> tuple[Array, Array]:
-        a, b = places
+    def nearer(_, pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        a, b = pair
         other = _element_at(s, b)
         _, (of_a, of_b), (aa, ab, bb) = _distance(curve, element, other, a, b)
         bb = jnp.where(bb > 0, bb, 1.0)
@@ -163,8 +163,8 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     distance, normal = _between(here, there)
     way = _at(after, found.element, found.s).x - _at(after, found.other, found.beyond).x
     along = dot(normal, way)
-    touching = before.radius[found.element] + before.radius[found.other]
-    is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, touching)))
+    contact_distance = before.radius[found.element] + before.radius[found.other]
+    is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, contact_distance)))
     begin, of_element = _samples(before.s)
     least, most = _range(before)
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
@@ -201,12 +201,12 @@ def on_elements(curve: Curve, pressures: Float[Array, "n+1"]) -> tuple[Array, Ar
     """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both."""
     found = nearest(curve)
     a, b, _, forces = _exerted(curve, pressures, found)
-    on_places = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
+    on_positions = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
     for s, element, sign in ((a, found.element, 1), (b, found.other, -1)):
         side = _at(curve, element, s)
-        on_places = on_places.at[..., element].add(sign * forces[:, None] * side.of_places[0][None])
+        on_positions = on_positions.at[..., element].add(sign * forces[:, None] * side.of_positions[0][None])
         on_tangents = on_tangents.at[..., element].add(sign * forces[:, None] * side.of_tangents[0][None])
-    return on_places, on_tangents
+    return on_positions, on_tangents
 
 
 def _gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array, "k"], Float[Array, "k"]]:
@@ -229,8 +229,8 @@ def _gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array,
 def _rows(
     curve: Curve, found: Nearest, pressures: Float[Array, "p"]
 ) -> tuple[Float[Array, "5 b+3 4 p"], Int[Array, "4 p"], Float[Array, "b b n+1"]]:
-    """The gradient of each gap and the vectors of its curvature, by the rotations and places of its nodes; these; and
-    what of the curvature is by the rotations of one node.
+    """The gradient of each gap and the vectors of its curvature, by the rotations and positions of its nodes; these;
+    and what of the curvature is by the rotations of one node.
     """
     _, a, b = _gaps(curve, found)
     here, there = _at(curve, found.element, a), _at(curve, found.other, b)
@@ -240,15 +240,17 @@ def _rows(
     turned = cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape))
     signs = jnp.array([1.0, 1.0, -1.0, -1.0], d.dtype)[:, None]
     is_free = signs * curve.free[nodes]
-    on_places = jnp.concatenate([here.of_places, there.of_places], axis=1) * is_free[None]  # [derivative, node, p]
+    on_positions = (
+        jnp.concatenate([here.of_positions, there.of_positions], axis=1) * is_free[None]
+    )  # [derivative, node, p]
     on_tangents = jnp.concatenate([here.of_tangents, there.of_tangents], axis=1) * signs[None]
 
     def along(v: Float[Array, "3 p"], derivative: int = 0) -> Array:
-        """The rate of v . way, or of v . the slopes on both sides, by rotations and places of the nodes."""
+        """The rate of v . way, or of v . the slopes on both sides, by rotations and positions of the nodes."""
         if curve.normal is not None:
             v = v - curve.normal[:, None] * (curve.normal @ v)[None]
         by_rotation = jnp.einsum("cp,cbkp->bkp", v, turned) * on_tangents[derivative][None]
-        return jnp.concatenate([by_rotation, v[:, None] * on_places[derivative][None]])
+        return jnp.concatenate([by_rotation, v[:, None] * on_positions[derivative][None]])
 
     _, _, (aa, ab, bb) = _distance(curve, found.element, found.other, a, b)
     is_own = jnp.array([1.0, 1.0, 0.0, 0.0], d.dtype)[None, :, None]
@@ -295,25 +297,25 @@ def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
     t = (s - begin) / h
     u = 1 - t
     zero = jnp.zeros_like(t)
-    of_places = jnp.stack(
+    of_positions = jnp.stack(
         [jnp.stack([(1 + 2 * t) * u**2, t**2 * (3 - 2 * t)]), jnp.stack([-6 * t * u / h, 6 * t * u / h])]
     )
     of_tangents = jnp.stack(
         [jnp.stack([h * t * u**2, -h * t**2 * u]), jnp.stack([u * (1 - 3 * t), t * (3 * t - 2)]) + zero[None]]
     )
-    second_of_places = jnp.stack([(12 * t - 6) / h**2, (6 - 12 * t) / h**2])
+    second_of_positions = jnp.stack([(12 * t - 6) / h**2, (6 - 12 * t) / h**2])
     second_of_tangents = jnp.stack([(6 * t - 4) / h, (6 * t - 2) / h])
     nodes = jnp.stack([element, element + 1])
-    places, tangents = curve.places.T[:, nodes], curve.tangents[:, nodes]
+    positions, tangents = curve.positions.T[:, nodes], curve.tangents[:, nodes]
 
-    def weighted(of_places: Float[Array, "2 k"], of_tangents: Float[Array, "2 k"]) -> Float[Array, "3 k"]:
-        return jnp.sum(places * of_places[None] + tangents * of_tangents[None], axis=1)
+    def weighted(of_positions: Float[Array, "2 k"], of_tangents: Float[Array, "2 k"]) -> Float[Array, "3 k"]:
+        return jnp.sum(positions * of_positions[None] + tangents * of_tangents[None], axis=1)
 
     return _Side(
-        weighted(of_places[0], of_tangents[0]),
-        weighted(of_places[1], of_tangents[1]),
-        weighted(second_of_places, second_of_tangents),
-        of_places,
+        weighted(of_positions[0], of_tangents[0]),
+        weighted(of_positions[1], of_tangents[1]),
+        weighted(second_of_positions, second_of_tangents),
+        of_positions,
         of_tangents,
     )
 
@@ -363,15 +365,15 @@ def _range(curve: Curve) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """
     s = curve.s
     apart = jnp.pi * jnp.max(curve.radius)
-    ends = curve.places[0] - curve.places[-1]
+    ends = curve.positions[0] - curve.positions[-1]
     is_ring = jnp.sum(ends**2) < 4 * jnp.max(curve.radius) ** 2
     least = jnp.maximum(s[1:] + apart, jnp.append(s[2:], jnp.inf))
     most = jnp.minimum(1 + s[:-1] - jnp.maximum(apart, jnp.diff(s)), 1.0)
     return least, jnp.where(is_ring, most, 1.0)
 
 
-def _element_at(s: Float[Array, "n+1"], places: Float[Array, "k"]) -> Int[Array, "k"]:
-    return jnp.clip(jnp.searchsorted(s, places, side="right") - 1, 0, len(s) - 2).astype(int)
+def _element_at(s: Float[Array, "n+1"], arclengths: Float[Array, "k"]) -> Int[Array, "k"]:
+    return jnp.clip(jnp.searchsorted(s, arclengths, side="right") - 1, 0, len(s) - 2).astype(int)
 
 
 def _perpendicular(normal: Float[Array, "3 p"]) -> Float[Array, "3 p"]:

@@ -32,7 +32,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
 from rodjax.model.along import Along
-from rodjax.model.scene import Scene, has_contacts, slid, sliding_places
+from rodjax.model.scene import Scene, has_contacts, slid, sliding_arclengths
 
 # The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
 # pass, as it then has a node of its own no more.
@@ -56,14 +56,14 @@ class SlidingPoint(eqx.Module):
     """
 
     inner: Any
-    places: Float[Array, "j"]
+    arclengths: Float[Array, "j"]
     slides: Bool[Array, ""]
     excess: Float[Array, "j"]
 
     @staticmethod
-    def settled_at(point: Any, places: Float[Array, "j"]) -> "SlidingPoint":
+    def settled_at(point: Any, arclengths: Float[Array, "j"]) -> "SlidingPoint":
         """An equilibrium of a rod that slides."""
-        return SlidingPoint(point, places, jnp.array(True), jnp.zeros_like(places))
+        return SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
 
     @property
     def tangents(self) -> Float[Array, "3 m"]:
@@ -85,24 +85,24 @@ class SlidingPoint(eqx.Module):
 class SlidingChange(NamedTuple):
     """Of a step; `others`: as of the form at given arclengths."""
 
-    places: Float[Array, "j"]
+    arclengths: Float[Array, "j"]
     others: Any
 
 
 class SlidingLinearization(Linearization):
     """With the arclengths, whether they change, and the slope of the energy by them beyond -R . t."""
 
-    places: Float[Array, "j"] = eqx.field(kw_only=True)
+    arclengths: Float[Array, "j"] = eqx.field(kw_only=True)
     slides: Bool[Array, ""] = eqx.field(kw_only=True)
     excess: Float[Array, "j"] = eqx.field(kw_only=True)
 
     @property
-    def at_places(self) -> Linearization:
+    def at_arclengths(self) -> Linearization:
         """That of the form at given arclengths."""
         assert isinstance(self.system, BorderedSystem)
-        closure = self.closure[len(self.places) :]
-        parts = (self.bases, self.gradient, closure, self.system.inner, self.energy, self.residual)
-        return Linearization(*parts, self.gaps, self.ways)
+        constraint_residual = self.constraint_residual[len(self.arclengths) :]
+        parts = (self.bases, self.gradient, constraint_residual, self.system.inner, self.energy, self.residual)
+        return Linearization(*parts, self.gaps, self.reference_displacements)
 
 
 class SlidingForm(Form):
@@ -124,21 +124,21 @@ class SlidingForm(Form):
         """The clips of the scene where they are to begin with."""
         return SlidingForm(scene=scene, made=scene, shape=shape, first=form_of(scene, shape))  # pyright: ignore
 
-    def at(self, places: Float[Array, "j"]) -> Form:
+    def at(self, arclengths: Float[Array, "j"]) -> Form:
         """The form at these arclengths."""
-        scene, field = slid(self.made, places), self.field
-        s = field.s + jnp.interp(field.s, *self._fixed(places))
+        scene, field = slid(self.made, arclengths), self.field
+        s = field.s + jnp.interp(field.s, *self._fixed(arclengths))
         s = s.at[field.clip_nodes].set(jnp.stack([clip.at for clip in scene.clips]))
         if isinstance(field, EdgeTangents):
             field = EdgeTangents(jnp.diff(s), s, field.clip_nodes)
         else:
             field = dataclasses.replace(field, s=s)
         form = form_on(scene, field).in_plane_of(self.first)
-        return dataclasses.replace(form, scene=slid(self.scene, places))
+        return dataclasses.replace(form, scene=slid(self.scene, arclengths))
 
-    def _fixed(self, places: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
+    def _fixed(self, arclengths: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
         """Arclengths that have nodes, in turn, and how far those go along."""
-        at, change = self._clips, self._spread(places - self._begin)
+        at, change = self._clips, self._spread(arclengths - self._begin)
         ends = jnp.array([0.0, 1.0], at.dtype)
         loads, beside = self._loads
         # A load so near to a clip that it shares its node goes along.
@@ -154,9 +154,9 @@ class SlidingForm(Form):
 
     @property
     def _begin(self) -> Float[Array, "j"]:
-        places = sliding_places(self.made)
-        assert places is not None
-        return places
+        arclengths = sliding_arclengths(self.made)
+        assert arclengths is not None
+        return arclengths
 
     def _spread(self, of_sliding: Float[Array, "j"]) -> Float[Array, "clips"]:
         """Zero for clips that do not slide."""
@@ -169,9 +169,9 @@ class SlidingForm(Form):
     @property
     def _loads(self) -> tuple[Float[Array, "k"], Int[Array, "k"]]:
         """Other arclengths with nodes, and the nearest clip to each."""
-        places = [] if isinstance(self.shape, Polyline) else [load.at for load in self.made.point_forces]
-        places = [jnp.atleast_1d(place) for place in (*places, *varying(self.made))]
-        loads = jnp.concatenate([jnp.zeros(0, self._clips.dtype), *places])
+        arclengths = [] if isinstance(self.shape, Polyline) else [load.at for load in self.made.point_forces]
+        arclengths = [jnp.atleast_1d(place) for place in (*arclengths, *varying(self.made))]
+        loads = jnp.concatenate([jnp.zeros(0, self._clips.dtype), *arclengths])
         return loads, jnp.argmin(jnp.abs(loads[:, None] - self._clips[None]), axis=1)
 
     def _is_near(self, loads: Float[Array, "k"], clips: Float[Array, "k"]) -> Bool[Array, "k"]:
@@ -184,17 +184,17 @@ class SlidingForm(Form):
         loads, beside = self._loads
         if not len(loads):
             return None
-        now = self._clips + self._spread(point.places - self._begin)
+        now = self._clips + self._spread(point.arclengths - self._begin)
         return jnp.any(self._is_near(loads, now[beside]) & ~self._is_near(loads, self._clips[beside]))
 
     def is_misplaced(self, point: SlidingPoint) -> Bool[Array, ""]:
         """Whether the mesh is not, or should not be, the one that belongs to these arclengths."""
-        form = self.at(point.places)
-        ends = jnp.array([0.0, 1.0], point.places.dtype)
-        now = self._clips + self._spread(point.places - self._begin)
+        form = self.at(point.arclengths)
+        ends = jnp.array([0.0, 1.0], point.arclengths.dtype)
+        now = self._clips + self._spread(point.arclengths - self._begin)
         before, after = (jnp.diff(jnp.concatenate([ends[:1], at, ends[1:]])) for at in (self._clips, now))
         is_stretched = jnp.any(jnp.maximum(before / after, after / before) > STRETCHED)
-        anew = form_of(slid(self.made, point.places), self.shape.reached(form, point.inner))
+        anew = form_of(slid(self.made, point.arclengths), self.shape.reached(form, point.inner))
         return is_stretched | jnp.any(jnp.abs(anew.field.s - form.field.s) > SAME_NODE)
 
     # --- what is of the form at given arclengths ---------------------------------------------------------------------
@@ -225,10 +225,10 @@ class SlidingForm(Form):
         return self.first.spin(bases)
 
     def holding(self, point: SlidingPoint) -> SlidingPoint:
-        return dataclasses.replace(point, inner=self.at(point.places).holding(point.inner))
+        return dataclasses.replace(point, inner=self.at(point.arclengths).holding(point.inner))
 
     def settled(self, point: SlidingPoint) -> SlidingPoint:
-        return dataclasses.replace(point, inner=self.at(point.places).settled(point.inner))
+        return dataclasses.replace(point, inner=self.at(point.arclengths).settled(point.inner))
 
     def in_plane(
         self, point: SlidingPoint, normal: Float[Array, "3"], axes: Float[Array, "3 2"]
@@ -243,29 +243,29 @@ class SlidingForm(Form):
         return dataclasses.replace(self, first=self.first.out_of_plane(normal))
 
     def edges(self, point: SlidingPoint) -> Float[Array, "segments 3"]:
-        return self.at(point.places).edges(point.inner)
+        return self.at(point.arclengths).edges(point.inner)
 
     def elastic_energy(self, point: SlidingPoint) -> Float[Array, ""]:
-        return self.at(point.places).elastic_energy(point.inner)
+        return self.at(point.arclengths).elastic_energy(point.inner)
 
     def load_energy(self, point: SlidingPoint) -> Float[Array, ""]:
-        return self.at(point.places).load_energy(point.inner)
+        return self.at(point.arclengths).load_energy(point.inner)
 
     def tangents_in_clips(self, point: SlidingPoint) -> Float[Array, "3 clips"]:
-        return self.at(point.places).tangents_in_clips(point.inner)
+        return self.at(point.arclengths).tangents_in_clips(point.inner)
 
     def multipliers_turned(
         self, point: SlidingPoint, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
-        j = len(point.places)
-        of_inner = self.at(point.places).multipliers_turned(point.inner, axis, multipliers[j:])
+        j = len(point.arclengths)
+        of_inner = self.at(point.arclengths).multipliers_turned(point.inner, axis, multipliers[j:])
         return jnp.concatenate([multipliers[:j], of_inner])
 
-    def is_closed(self, closure: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
-        return self.first.is_closed(closure[len(self._numbers) :], tolerance)
+    def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        return self.first.is_closed(constraint_residual[len(self._numbers) :], tolerance)
 
     def rounding_floor(self, point: SlidingPoint) -> Float[Array, ""]:
-        return self.at(point.places).rounding_floor(point.inner)
+        return self.at(point.arclengths).rounding_floor(point.inner)
 
     # --- steps -------------------------------------------------------------------------------------------------------
 
@@ -274,9 +274,9 @@ class SlidingForm(Form):
         return SlidingChange(multipliers[:j], self.first.others(multipliers[j:]))
 
     def no_others(self, point: SlidingPoint) -> SlidingChange:
-        return SlidingChange(jnp.zeros_like(point.places), self.first.no_others(point.inner))
+        return SlidingChange(jnp.zeros_like(point.arclengths), self.first.no_others(point.inner))
 
-    def moved(
+    def retract(
         self,
         point: SlidingPoint,
         bases: Float[Array, "3 b m"],
@@ -284,72 +284,78 @@ class SlidingForm(Form):
         force_change: Float[Array, "3 parts"],
         others: Any = None,
     ) -> SlidingPoint:
-        inner = self.at(point.places).moved(point.inner, bases, rotation, force_change, others.others)
-        return dataclasses.replace(point, inner=inner, places=point.places + others.places)
+        inner = self.at(point.arclengths).retract(point.inner, bases, rotation, force_change, others.others)
+        return dataclasses.replace(point, inner=inner, arclengths=point.arclengths + others.arclengths)
 
     def longest_step(self, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
-        change = self._spread(others.places)
+        change = self._spread(others.arclengths)
         ends = jnp.array([0.0, 1.0], change.dtype)
-        clips = jnp.concatenate([ends[:1], self._clips + self._spread(point.places - self._begin), ends[1:]])
+        clips = jnp.concatenate([ends[:1], self._clips + self._spread(point.arclengths - self._begin), ends[1:]])
         gaps = LARGEST_STEP * jnp.minimum(jnp.diff(clips)[:-1], jnp.diff(clips)[1:])
         loads, beside = self._loads
         if len(loads):
-            ways = (loads[None] - clips[1:-1, None]) * jnp.sign(change)[:, None]
-            is_passed = (ways <= 0) | self._is_near(loads, self._clips[beside])[None]
-            ways = jnp.where(is_passed, jnp.inf, NEAR_LOADS * ways)
-            gaps = jnp.minimum(gaps, jnp.min(ways, axis=1))
+            distances = (loads[None] - clips[1:-1, None]) * jnp.sign(change)[:, None]
+            is_passed = (distances <= 0) | self._is_near(loads, self._clips[beside])[None]
+            distances = jnp.where(is_passed, jnp.inf, NEAR_LOADS * distances)
+            gaps = jnp.minimum(gaps, jnp.min(distances, axis=1))
         return jnp.min(gaps / jnp.maximum(jnp.abs(change), 1e-300))
 
     def accepts(self, point: SlidingPoint, trial: SlidingPoint, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        return self.at(point.places).accepts(point.inner, trial.inner, is_better)
+        return self.at(point.arclengths).accepts(point.inner, trial.inner, is_better)
 
     def accepted(self, point: SlidingPoint, here: Any) -> SlidingPoint:
-        inner = self.at(point.places).accepted(point.inner, here.at_places)
-        return SlidingPoint(inner, point.places, here.slides, here.excess)
+        inner = self.at(point.arclengths).accepted(point.inner, here.at_arclengths)
+        return SlidingPoint(inner, point.arclengths, here.slides, here.excess)
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
-    def _rows(self, inner: Any, places: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
-        """The gradient and the closure at an inner point, L, and -R . t."""
-        form = self.at(places)
-        gradient, closure = form.unbalanced(inner)
+    def _rows(self, inner: Any, arclengths: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+        """The gradient and the constraint residual at an inner point, L, and -R . t."""
+        form = self.at(arclengths)
+        gradient, constraint_residual = form.residual_vectors(inner)
         force = form.layout.components(inner.end_force)
-        energy = form.elastic_energy(inner) + form.load_energy(inner) + jnp.sum(force * form.closure(closure))
-        return gradient, closure, energy, -form.axial_forces(inner)
+        energy = (
+            form.elastic_energy(inner)
+            + form.load_energy(inner)
+            + jnp.sum(force * form.force_components(constraint_residual))
+        )
+        return gradient, constraint_residual, energy, -form.axial_forces(inner)
 
-    def unbalanced(self, point: SlidingPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        gradient, closure, _, axial = self._rows(point.inner, point.places)
-        return gradient, jnp.concatenate([axial, closure])
+    def residual_vectors(self, point: SlidingPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+        gradient, constraint_residual, _, axial = self._rows(point.inner, point.arclengths)
+        return gradient, jnp.concatenate([axial, constraint_residual])
 
     def linearized(self, point: SlidingPoint) -> SlidingLinearization:
-        form, inner, places = self.at(point.places), point.inner, point.places
+        form, inner, arclengths = self.at(point.arclengths), point.inner, point.arclengths
         here = form.linearized(inner)
 
-        def by_place(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
-            return jax.jvp(lambda places: self._rows(inner, places), (places,), (direction,))[1]
+        def by_arclength(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+            return jax.jvp(lambda arclengths: self._rows(inner, arclengths), (arclengths,), (direction,))[1]
 
-        gradient, closure, energy, corner = jax.vmap(by_place)(jnp.eye(len(places), dtype=places.dtype))
+        gradient, constraint_residual, energy, corner = jax.vmap(by_arclength)(
+            jnp.eye(len(arclengths), dtype=arclengths.dtype)
+        )
 
         def axial(rotation: Float[Array, "b m"], multipliers: Float[Array, "k"]) -> Float[Array, "j"]:
-            force_change, others = form.layout.forces(form.closure(multipliers)), form.others(multipliers)
-            return -form.axial_forces(form.moved(inner, here.bases, rotation, force_change, others))
+            force_change, others = form.layout.forces(form.force_components(multipliers)), form.others(multipliers)
+            return -form.axial_forces(form.retract(inner, here.bases, rotation, force_change, others))
 
-        nothing = jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure)
+        nothing = jnp.zeros_like(here.gradient), jnp.zeros_like(here.constraint_residual)
         pulls, pulled = jax.vjp(axial, *nothing)
-        rows = jax.vmap(pulled)(jnp.eye(len(places), dtype=places.dtype))
-        system = BorderedSystem(here.system, Vectors(gradient, closure), Vectors(*rows), corner.T)
+        rows = jax.vmap(pulled)(jnp.eye(len(arclengths), dtype=arclengths.dtype))
+        system = BorderedSystem(here.system, Vectors(gradient, constraint_residual), Vectors(*rows), corner.T)
         rounding = PLACE_ROUNDINGS * jnp.finfo(pulls.dtype).eps * _axial_stiffness(self.made)
         largest = jnp.max(jnp.abs(pulls))
         return SlidingLinearization(
             here.bases,
             here.gradient,
-            jnp.concatenate([pulls, here.closure]),
+            jnp.concatenate([pulls, here.constraint_residual]),
             system,
             here.energy,
             jnp.where((largest > here.residual) & (largest > rounding), largest, here.residual),
             here.gaps,
-            here.ways,
-            places=places,
+            here.reference_displacements,
+            arclengths=arclengths,
             slides=point.slides | (here.residual <= SETTLED),
             excess=energy - pulls,
         )
@@ -359,15 +365,15 @@ class SlidingForm(Form):
 
     def coupled(self, point: SlidingPoint, system: AnySystem) -> AnySystem:
         assert isinstance(system, BorderedSystem)
-        return dataclasses.replace(system, inner=self.at(point.places).coupled(point.inner, system.inner))
+        return dataclasses.replace(system, inner=self.at(point.arclengths).coupled(point.inner, system.inner))
 
     def objective(self, here: Any, point: SlidingPoint) -> Float[Array, ""]:
-        of_inner = self.at(here.places).objective(here.at_places, point.inner)
-        return of_inner - jnp.sum(point.excess * (here.places - point.places))
+        of_inner = self.at(here.arclengths).objective(here.at_arclengths, point.inner)
+        return of_inner - jnp.sum(point.excess * (here.arclengths - point.arclengths))
 
     def half_square(self, here: Any) -> Float[Array, ""]:
-        axial = here.closure[: len(here.places)]
-        of_inner = self.at(here.places).half_square(here.at_places)
+        axial = here.constraint_residual[: len(here.arclengths)]
+        of_inner = self.at(here.arclengths).half_square(here.at_arclengths)
         return of_inner + jnp.where(here.slides, jnp.sum(axial**2) / 2, 0.0)
 
     def sought(
@@ -376,17 +382,17 @@ class SlidingForm(Form):
         assert isinstance(system, BorderedSystem)
         descends = self.descends and self.has_potential
         system = dataclasses.replace(system.held_unless(here.slides), descends=descends)
-        j = len(point.places)
-        axial = jnp.where(here.slides, here.closure[:j], 0.0)
+        j = len(point.arclengths)
+        axial = jnp.where(here.slides, here.constraint_residual[:j], 0.0)
         if has_contacts(self.scene):
             # Which contacts are closed is sought at given arclengths; those go along with the ones that were.
-            is_minimum, x, y = self.at(point.places).sought(here.at_places, point.inner, system.inner, push)
+            is_minimum, x, y = self.at(point.arclengths).sought(here.at_arclengths, point.inner, system.inner, push)
             factors = factor(system)
             assert isinstance(factors, BorderedFactors)
             x, y = factors.joined(x, y, -axial)
         else:
-            closure = jnp.concatenate([axial, here.closure[j:]])
-            factors, x, y = factor_and_solve(system, push - here.gradient, -closure, is_regularized=True)
+            constraint_residual = jnp.concatenate([axial, here.constraint_residual[j:]])
+            factors, x, y = factor_and_solve(system, push - here.gradient, -constraint_residual, is_regularized=True)
             assert isinstance(factors, BorderedFactors)
             is_minimum = factors.inner.is_minimum
         # What pulls along the rod leads away from a largest energy, and no shift is needed.
@@ -401,12 +407,17 @@ class SlidingForm(Form):
         change: Float[Array, "3 parts"],
         others: SlidingChange,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        form, columns = self.at(point.places), here.system.columns
-        found = form.under_force(point.inner, here.at_places, rotation, change, others.others)
-        closure, closure_rate, more, along = found
-        by_place = jax.vmap(form.closure)(columns.y)
-        slope = here.closure[: len(point.places)] + by_place @ form.layout.components(change)
-        return closure, closure_rate + others.places @ by_place, more, along + jnp.sum(slope * others.places)
+        form, columns = self.at(point.arclengths), here.system.columns
+        found = form.under_force(point.inner, here.at_arclengths, rotation, change, others.others)
+        constraint_residual, constraint_rate, more, along = found
+        by_arclength = jax.vmap(form.force_components)(columns.y)
+        slope = here.constraint_residual[: len(point.arclengths)] + by_arclength @ form.layout.components(change)
+        return (
+            constraint_residual,
+            constraint_rate + others.arclengths @ by_arclength,
+            more,
+            along + jnp.sum(slope * others.arclengths),
+        )
 
 
 def _axial_stiffness(scene: Scene) -> Float[Array, ""]:

@@ -14,17 +14,17 @@ def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3
     ends = (2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1])
     extended = jnp.concatenate([ends[0], points, ends[1]])
     slopes = (extended[2:] - extended[:-2]) / 2
-    places = jnp.arange(m + 1, dtype=points.dtype)
-    return cubic(places, points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
+    knots = jnp.arange(m + 1, dtype=points.dtype)
+    return cubic(knots, points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
 
 
 def cubic(
-    places: Float[Array, "m"], points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Array, "k"]
+    knots: Float[Array, "m"], points: Float[Array, "m 3"], slopes: Float[Array, "m 3"], x: Float[Array, "k"]
 ) -> Float[Array, "k 3"]:
     """Cubic Hermite interpolation: `points` and `slopes` are value and derivative at the increasing `places`."""
-    cell = jnp.clip(jnp.searchsorted(places, x, side="right") - 1, 0, len(points) - 2)
-    width = places[cell + 1] - places[cell]
-    t, h = ((x - places[cell]) / width)[:, None], width[:, None]
+    cell = jnp.clip(jnp.searchsorted(knots, x, side="right") - 1, 0, len(points) - 2)
+    width = knots[cell + 1] - knots[cell]
+    t, h = ((x - knots[cell]) / width)[:, None], width[:, None]
     weights = ((1 + 2 * t) * (1 - t) ** 2, h * t * (1 - t) ** 2, t**2 * (3 - 2 * t), h * t**2 * (t - 1))
     values = (points[cell], slopes[cell], points[cell + 1], slopes[cell + 1])
     return functools.reduce(jnp.add, (weight * value for weight, value in zip(weights, values, strict=True)))

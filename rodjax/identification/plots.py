@@ -203,11 +203,11 @@ def has_centerlines(fit: Fit) -> bool:
 def _worst(fit: Fit, most: int) -> tuple[list[_Seen], str]:
     """So many centerlines, those with the largest deviations, and a note where there are more."""
     instance(fit, "fit", Fit)
-    places = _drawn(fit)
-    if not places:
+    drawn = _drawn(fit)
+    if not drawn:
         raise ValueError("fit must have an experiment with a Centerline that was solved, got none")
-    worst = sorted(sorted(places, key=lambda place: -_rms(fit, place))[:most])
-    note = f"the {most} of {len(places)} centerlines with the largest deviations" if len(places) > most else ""
+    worst = sorted(sorted(drawn, key=lambda place: -_rms(fit, place))[:most])
+    note = f"the {most} of {len(drawn)} centerlines with the largest deviations" if len(drawn) > most else ""
     return [_seen(fit, place) for place in worst], note
 
 

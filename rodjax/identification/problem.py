@@ -99,7 +99,7 @@ class Problem(eqx.Module):
     critical: "Critical"
 
     @property
-    def places(self) -> list[slice]:
+    def slices(self) -> list[slice]:
         """Of the experiments of each group among all."""
         ends = np.cumsum([0, *(group.weights.shape[0] for group in self.groups)]).tolist()
         return [slice(first, end) for first, end in itertools.pairwise(ends)]
@@ -191,8 +191,8 @@ def evaluation(
     structure: Structure, problem: Problem, z: Coordinates, guesses: tuple[Equilibrium, ...], is_used: Bool[Array, "e"]
 ) -> Evaluation:
     """At unknowns by their sizes, on the scale on which they are sought."""
-    ways = jnp.eye(z.shared.shape[0] + z.own.shape[1], dtype=z.shared.dtype)
-    of_shared, of_own = ways[:, : z.shared.shape[0]], ways[:, z.shared.shape[0] :]
+    directions = jnp.eye(z.shared.shape[0] + z.own.shape[1], dtype=z.shared.dtype)
+    of_shared, of_own = directions[:, : z.shared.shape[0]], directions[:, z.shared.shape[0] :]
 
     def one(experiment: Experiment, own: Float[Array, "q"], guess: Equilibrium) -> Any:
         def rows(shared: Float[Array, "p"], own: Float[Array, "q"]) -> tuple[list[Float[Array, "k d"]], Equilibrium]:
@@ -206,7 +206,7 @@ def evaluation(
 
     parts = [
         in_lanes(one, (group.experiments, z.own[here], guess))
-        for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
+        for group, here, guess in zip(problem.groups, problem.slices, guesses, strict=True)
     ]
     found, changes, results = zip(*parts, strict=True)
     changes = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), changes)
@@ -216,7 +216,7 @@ def evaluation(
 def _laid_out(problem: Problem, rows: tuple[Rows, ...], own: Float[Array, "e j"]) -> Float[Array, "e m"]:
     """The deviations of each experiment in one row, with `own` behind them."""
     parts = []
-    for group, here in zip(rows, problem.places, strict=True):
+    for group, here in zip(rows, problem.slices, strict=True):
         count = here.stop - here.start
         parts.append(jnp.concatenate([*(x.reshape(count, -1) for x in group), own[here]], axis=1))
     width = max(part.shape[1] for part in parts)
@@ -227,7 +227,7 @@ def _used(problem: Problem, rows: tuple[Rows, ...], is_used: Bool[Array, "e"]) -
     """Rows by the scale, 0 of experiments that do not count."""
     return tuple(
         [jnp.where(is_used[here][:, None, None], x / problem.scale, 0.0) for x in group]
-        for group, here in zip(rows, problem.places, strict=True)
+        for group, here in zip(rows, problem.slices, strict=True)
     )
 
 
@@ -238,7 +238,7 @@ def _normal_equations(
     transform: Callable[[Float[Array, "k d"]], Float[Array, "k d"]],
 ) -> tuple[NormalEquations, Residuals]:
     """Of deviations so transformed and of priors and critical values, by the unknowns that a solver varies."""
-    ways = found.changes
+    changes = found.changes
 
     def counted(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
         return jax.tree.map(jax.vmap(transform), _used(problem, rows, found.is_used))
@@ -254,21 +254,21 @@ def _normal_equations(
     units = jnp.eye(p + q, dtype=at.shared.dtype)
     bases = Coordinates(units[:, :p], jnp.broadcast_to(units[:, None, p:], (p + q, e, q)))
 
-    def column(base: Coordinates, way: tuple[Rows, ...]) -> Residuals:
+    def column(base: Coordinates, change_of_rows: tuple[Rows, ...]) -> Residuals:
         base = jax.tree.map(lambda x, free: jnp.where(free, x, 0.0), base, problem.is_free)
         _, rates = jax.jvp(within, (at,), (base,))
         # Of unknowns in common the same rate for all, of the others that of each experiment.
         rate = jnp.sum(rates.shared) + jnp.sum(rates.own, axis=1)
-        _, change = jax.jvp(counted, (found.rows,), (way,))
+        _, change = jax.jvp(counted, (found.rows,), (change_of_rows,))
         scaled = tuple(
-            [x * rate[here][:, None, None] for x in group] for group, here in zip(change, problem.places, strict=True)
+            [x * rate[here][:, None, None] for x in group] for group, here in zip(change, problem.slices, strict=True)
         )
         _, (own, alone) = jax.jvp(beyond, (at,), (base,))
         return Residuals(_laid_out(problem, scaled, own), alone)
 
     own, alone = beyond(at)
     residuals = Residuals(_laid_out(problem, counted(found.rows), own), alone)
-    return NormalEquations.of(jax.vmap(column)(bases, ways), residuals, p), residuals
+    return NormalEquations.of(jax.vmap(column)(bases, changes), residuals, p), residuals
 
 
 class Found(eqx.Module):
@@ -350,7 +350,7 @@ def _information(
     counts = tuple([count for count, _ in group] for group in pairs)
     squares = sum((jnp.sum(x**2) for group in counts for x in group), jnp.zeros_like(problem.scale))
     slopes, numbers = jnp.zeros_like(squares), jnp.zeros_like(squares)
-    for of_group, group, here in zip(pairs, problem.groups, problem.places, strict=True):
+    for of_group, group, here in zip(pairs, problem.groups, problem.slices, strict=True):
         for (_, slope), measured in zip(of_group, group.experiments.measured, strict=True):
             weight = (measured.weights > 0) & found.is_used[here][:, None]
             slopes += jnp.sum(jnp.where(weight, slope, 0.0))

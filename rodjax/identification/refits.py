@@ -73,7 +73,7 @@ def leave_one_out(setup: Setup, structure: Structure, problem: Problem, found: F
         is_left = np.array([label != cluster for label in labels], problem.scale.dtype)
         weights = [
             np.asarray(group.weights) * is_left[here]
-            for group, here in zip(problem.groups, problem.places, strict=True)
+            for group, here in zip(problem.groups, problem.slices, strict=True)
         ]
         return eqx.tree_at(lambda problem: [group.weights for group in problem.groups], problem, weights)
 

@@ -159,8 +159,8 @@ def stacked(setup: Setup) -> tuple[tuple[Group, ...], tuple[Guess | None, ...]]:
     """The experiments of each kind as one, in the order of `setup.order`, and their first shapes."""
     groups, guesses = [], []
     kinds = [_kind(setup.experiments[k]) for k in setup.order]
-    for _, places in itertools.groupby(range(len(kinds)), key=lambda place: kinds[place]):
-        chosen = [setup.experiments[setup.order[place]] for place in places]
+    for _, members in itertools.groupby(range(len(kinds)), key=lambda place: kinds[place]):
+        chosen = [setup.experiments[setup.order[place]] for place in members]
         most = [max(len(m.weights) for m in same) for same in zip(*(one.measured for one in chosen), strict=True)]
         measured = [tuple(m.with_rows(rows) for m, rows in zip(one.measured, most, strict=True)) for one in chosen]
         bare = Experiment(chosen[0].scene, chosen[0].measured)
@@ -341,7 +341,7 @@ def beginnings(
 
     return tuple(
         jax.vmap(one)(group.experiments, own[here], guess)
-        for group, here, guess in zip(problem.groups, problem.places, guesses, strict=True)
+        for group, here, guess in zip(problem.groups, problem.slices, guesses, strict=True)
     )
 
 

@@ -32,7 +32,7 @@ from rodjax.model.along import Smooth, Steps
 from rodjax.model.harness import ENDS, Body, Harness
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
-from rodjax.model.scene import Scene, has_node_places
+from rodjax.model.scene import Scene, has_node_positions
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Pin, Slider, Spring, Swivel
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -54,7 +54,10 @@ SELF_CONTACT_FORMAT = 16
 # What files of harnesses lack until format 14, which had no obstacles.
 _OF_CONTACTS = ("contact_forces", "end_pressures")
 
-# Units and meaning of each field, by its place under /rodjax.
+# The name in files of a field that the code names otherwise.
+STORED_AS = {"arclengths": "places"}
+
+# Units and meaning of each field, by its path under /rodjax.
 FIELDS = {
     "s": ("m", "arclength of the nodes"),
     "nodes": ("m", "centerline"),
@@ -328,7 +331,7 @@ def _read_rod(group: h5py.Group, path: Path) -> Equilibrium:
     if forces.ndim == equilibrium.s.ndim:  # of a rod without clips, until format 8: of its one span
         equilibrium = eqx.tree_at(lambda result: result.state.end_force, equilibrium, forces[..., None])
     shape = equilibrium.state.shape
-    if isinstance(shape, FramedCurve) and shape.is_of_joints and has_node_places(equilibrium.scene):
+    if isinstance(shape, FramedCurve) and shape.is_of_joints and has_node_positions(equilibrium.scene):
         raise ValueError(
             f"{path} is a result by finite differences under loads without a potential, of a rod by frames, which this "
             "rodjax has no longer: solve its scene again"
@@ -377,7 +380,8 @@ def _write(group: h5py.Group, module: eqx.Module, place: str = "") -> None:
         if field.metadata.get("static"):
             group.attrs[field.name] = value
         else:
-            _write_value(group, field.name, value, f"{place}{field.name}")
+            name = STORED_AS.get(field.name, field.name)
+            _write_value(group, name, value, f"{place}{name}")
 
 
 def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
@@ -416,7 +420,8 @@ def _read(
         elif field.name in LATER and field.name not in group:
             value = ()
         else:
-            value = _read_value(group, field.name, field.type, path, shape, kinds)
+            name = STORED_AS.get(field.name, field.name)
+            value = _read_value(group, name, field.type, path, shape, kinds)
         object.__setattr__(module, field.name, value)
     return module
 

@@ -50,11 +50,11 @@ class BorderedSystem(eqx.Module):
         """M is symmetric."""
         return dataclasses.replace(self, columns=self.rows, rows=self.columns, corner=self.corner.T)
 
-    def parted(self, y: Float[Array, "j+k"]) -> tuple[Float[Array, "j"], Float[Array, "k"]]:
+    def split(self, y: Float[Array, "j+k"]) -> tuple[Float[Array, "j"], Float[Array, "k"]]:
         return y[: len(self.corner)], y[len(self.corner) :]
 
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j+k"]) -> tuple[Float[Array, "b m"], Float[Array, "j+k"]]:
-        z, y = self.parted(y)
+        z, y = self.split(y)
         f, c = self.inner.times(x, y)
         of_x, of_y = self.columns.times(z)
         return f + of_x, jnp.concatenate([self.rows.dots(x, y) + self.corner @ z, c + of_y])

@@ -2,7 +2,7 @@
 
 The rotations of tangents or frames, b at each point, and the force in each element are the unknowns, as in
 `saddle_point`, and the positions of the nodes, and the pressures of contacts at nodes and within elements. The force of
-an element is the multiplier of its way from node to node, the pressure that of a gap. Pressures are eliminated first,
+an element is the multiplier of its segment vector, the pressure that of a gap. Pressures are eliminated first,
 each by itself, then the points in the middle of elements; then a node has b + 6 unknowns, rotation, force of the
 element before it and displacement, coupled with those of its neighbours only: O(n).
 
@@ -10,10 +10,11 @@ element before it and displacement, coupled with those of its neighbours only: O
     gap          B^T theta - C F + u_after - u_before = gap,       for each element
     balance      S u + T^T theta - N p - K q + F_before - F_after = balance,   for each node that is not held
     border       border^T theta - compliance y = c
-    pressure     -N^T u - softness p = d  where a contact is closed; else  -p = d, and p pushes at nothing
-    within       -M^T theta - K^T u - softness q = d, the same
+    pressure     -N^T u - c p = d  where a contact is closed; else  -p = d, and p pushes at nothing
+    within       -M^T theta - K^T u - c q = d, the same
 
-Loads without a potential add rows of their own to the first three, without symmetry (`LoadRows`).
+with the contact compliance c. Loads without a potential add rows of their own to the first three, without symmetry
+(`LoadRows`).
 """
 
 import dataclasses
@@ -29,36 +30,39 @@ from rodjax.linalg.far_rows import FarRows
 
 # Solutions with soft contacts, after the first one.
 HARDENINGS = 5
-# In these, contacts between elements have this part of their softness.
+# In these, contacts between elements have this part of their compliance.
 HARD = 1e-4
 
 
 class InnerRows(eqx.Module):
-    """The gradients of q gaps within each element, by the rotations (M) and the places (K) of its first and last node.
+    """The gradients of q gaps within each element, by the rotations (M) and the positions (K) of its first and last
+    node.
 
     `first`: the number of the first of q rows among those of all contacts; a row has the elements in turn, and a last
     number that stands for nothing.
     """
 
     by_rotation: Float[Array, "q b 2 n"]
-    by_place: Float[Array, "q 3 2 n"]
+    by_position: Float[Array, "q 3 2 n"]
     first: int = eqx.field(static=True)
 
     @property
     def rows(self) -> slice:
-        return slice(self.first, self.first + len(self.by_place))
+        return slice(self.first, self.first + len(self.by_position))
 
     def holding(self, turns: Float[Array, "n+1"], moves: Float[Array, "n+1"]) -> "InnerRows":
         """`turns`, `moves`: 0 at nodes whose rotation or place is held, else 1."""
         return dataclasses.replace(
             self,
             by_rotation=self.by_rotation * _at_ends(turns[None])[None],
-            by_place=self.by_place * _at_ends(moves[None])[None],
+            by_position=self.by_position * _at_ends(moves[None])[None],
         )
 
     def rates(self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "q n+1"]:
-        nodes, places = _at_ends(x[:, ::2]), _at_ends(u.T)
-        rates = jnp.einsum("qben,ben->qn", self.by_rotation, nodes) + jnp.einsum("qcen,cen->qn", self.by_place, places)
+        nodes, displacements = _at_ends(x[:, ::2]), _at_ends(u.T)
+        rates = jnp.einsum("qben,ben->qn", self.by_rotation, nodes) + jnp.einsum(
+            "qcen,cen->qn", self.by_position, displacements
+        )
         return jnp.pad(rates, ((0, 0), (0, 1)))
 
     def turned(self, pressures: Float[Array, "q n+1"]) -> Float[Array, "b m"]:
@@ -69,27 +73,27 @@ class InnerRows(eqx.Module):
 
     def pushed(self, pressures: Float[Array, "q n+1"]) -> Float[Array, "n+1 3"]:
         """The forces on the nodes."""
-        start, end = jnp.einsum("qcen,qn->enc", self.by_place, pressures[:, :-1])
+        start, end = jnp.einsum("qcen,qn->enc", self.by_position, pressures[:, :-1])
         return _on_nodes(start, end)
 
     def condensed(self, weights: Float[Array, "q n"]) -> Float[Array, "2b+6 2b+6 n"]:
         """What contacts of these stiffnesses add, by rotation and place of the first node of each element, then of the
         last one.
         """
-        rates = jnp.concatenate([self.by_rotation, self.by_place], axis=1)
+        rates = jnp.concatenate([self.by_rotation, self.by_position], axis=1)
         rates = jnp.swapaxes(rates, 1, 2).reshape(len(rates), -1, rates.shape[-1])
         return jnp.einsum("qin,qn,qjn->ijn", rates, weights, rates)
 
 
 class ContactRows(eqx.Module):
-    """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held. `softness`: of the
-    pressures; `is_closed`: where there is one. `pushes`: along what a pressure pushes, where that is not N, as where it
-    brings friction with it, without symmetry then. `inner`: of the rows that belong to elements, whose N are zero;
-    `far`: of the row between elements; `None` without such.
+    """The gradients N of the gaps between nodes and k obstacles, zero at nodes that are held.
+    `contact_compliance`: penetration by pressure; `is_closed`: where there is a pressure. `pushes`: along what a
+    pressure pushes, where that is not N, as where it brings friction with it, without symmetry then. `inner`: of the
+    rows that belong to elements, whose N are zero; `far`: of the row between elements; `None` without such.
     """
 
     normals: Float[Array, "k n+1 3"]
-    softness: Float[Array, ""]
+    contact_compliance: Float[Array, ""]
     is_closed: Bool[Array, "k n+1"]
     pushes: Float[Array, "k n+1 3"] | None = None
     inner: InnerRows | None = None
@@ -117,7 +121,7 @@ class ContactRows(eqx.Module):
 
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
         """The system with what closed contacts add to its stiffness, but for those between elements."""
-        weights = jnp.where(self.is_closed, 1 / self.softness, 0.0)
+        weights = jnp.where(self.is_closed, 1 / self.contact_compliance, 0.0)
         stiffness = jnp.einsum("knc,kne,kn->nce", self._pushes, self.normals, weights)
         system = dataclasses.replace(system, stiffness=system.stiffness + stiffness)
         if self.inner is None:
@@ -133,17 +137,19 @@ class LoadRows(eqx.Module):
     """What loads without a potential add, of each element by the rotations of its start, middle and end: [.., c, j, n]
     by component c of point j.
 
-    `rotation`: [a, i, ..] to the row of component a of point i; `way`: to those of the gap; `balance`: [k, ..] to those
-    of the node at its start and its end.
+    `rotation`: [a, i, ..] to the row of component a of point i; `segment_vectors`: to those of the gap; `balance`: [k,
+    ..] to those of the node at its start and its end.
     """
 
     rotation: Float[Array, "b 3 b 3 n"]
-    way: Float[Array, "3 b 3 n"]
+    segment_vectors: Float[Array, "3 b 3 n"]
     balance: Float[Array, "2 3 b 3 n"]
 
     def mirrored(self) -> "LoadRows":
         return LoadRows(
-            self.rotation[:, ::-1, :, ::-1, ::-1], -self.way[:, :, ::-1, ::-1], self.balance[::-1, ..., ::-1, ::-1]
+            self.rotation[:, ::-1, :, ::-1, ::-1],
+            -self.segment_vectors[:, :, ::-1, ::-1],
+            self.balance[::-1, ..., ::-1, ::-1],
         )
 
 
@@ -201,7 +207,7 @@ class ChainSystem(eqx.Module):
         return eqx.tree_at(lambda system: system.diagonal, self, self.diagonal + shift[None, None] * identity)
 
     def holding(self, turns: Float[Array, "m"], moves: Float[Array, "n+1"]) -> "ChainSystem":
-        """With the rotations of points, and the places of nodes, held where these are 0, else 1."""
+        """With the rotations of points, and the positions of nodes, held where these are 0, else 1."""
         identity = jnp.eye(len(self.diagonal), dtype=turns.dtype)[..., None]
         of_elements = jnp.stack([turns[:-1:2], turns[1::2], turns[2::2]])
         b, contacts = len(self.diagonal), self.contacts
@@ -232,56 +238,60 @@ class ChainSystem(eqx.Module):
 
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
-        first, pressures, u, force = self.parted(y)
-        moved = jnp.where(self.held[:, None], 0.0, u)
+        first, pressures, u, force = self.split(y)
+        displacements = jnp.where(self.held[:, None], 0.0, u)
         f = jnp.einsum("ijm,jm->im", self.diagonal, x) + jnp.einsum("ikm,k->im", self.border, first)
         f = f.at[:, 1:].add(jnp.einsum("ijm,jm->im", self.lower, x[:, :-1]))
         f = f.at[:, :-1].add(jnp.einsum("jim,jm->im", self.lower, x[:, 1:]))
         f = f.at[:, 2::2].add(jnp.einsum("ijm,jm->im", self.across, x[:, :-1:2]))
         f = f.at[:, :-1:2].add(jnp.einsum("jim,jm->im", self.across, x[:, 2::2]))
-        gap = jnp.diff(moved, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
+        gap = jnp.diff(displacements, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
         for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
             f = f.at[:, at].add(jnp.einsum("icn,nc->in", self.by_force[:, :, point], force))
             gap += jnp.einsum("icn,in->nc", self.by_force[:, :, point], x[:, at])
         is_closed = self.contacts.is_closed
-        pushed = jnp.einsum("nij,nj->ni", self.stiffness, moved)
+        pushed = jnp.einsum("nij,nj->ni", self.stiffness, displacements)
         pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
         if self.contacts.inner is not None or self.contacts.far is not None:
             f -= self.contacts.turned(jnp.where(is_closed, pressures, 0.0), jnp.zeros_like(f))
         if self.contacts.far is not None:
-            moments, forces = self.contacts.far.curved(x, moved)
+            moments, forces = self.contacts.far.curved(x, displacements)
             f += moments
             pushed += forces
         none = jnp.zeros_like(force[:1])
         balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
         if self.loads is not None:
             ends = jnp.stack([x[:, :-1:2], x[:, 1::2], x[:, 2::2]], axis=1)
-            of_points = jnp.einsum("aicjn,cjn->ain", self.loads.rotation, ends)
+            by_points = jnp.einsum("aicjn,cjn->ain", self.loads.rotation, ends)
             for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
-                f = f.at[:, at].add(of_points[:, point])
-            gap += jnp.einsum("acjn,cjn->na", self.loads.way, ends)
+                f = f.at[:, at].add(by_points[:, point])
+            gap += jnp.einsum("acjn,cjn->na", self.loads.segment_vectors, ends)
             of_nodes = jnp.einsum("kacjn,cjn->kna", self.loads.balance, ends)
             balance += _on_nodes(*of_nodes)
         if self.turning is not None:
-            f = f.at[:, ::2].add(jnp.einsum("icn,nc->in", self.turning, moved))
+            f = f.at[:, ::2].add(jnp.einsum("icn,nc->in", self.turning, displacements))
             balance += jnp.einsum("icn,in->nc", self.turning, x[:, ::2])
         if self.between is not None:
             b = len(f)
-            at_nodes = jnp.concatenate([x[:, ::2], moved.T])
+            at_nodes = jnp.concatenate([x[:, ::2], displacements.T])
             after = jnp.einsum("ijn,jn->in", self.between, at_nodes[:, :-1])
             before = jnp.einsum("jin,jn->in", self.between, at_nodes[:, 1:])
             f = f.at[:, 2::2].add(after[:b]).at[:, :-1:2].add(before[:b])
             balance += _on_nodes(before[b:].T, after[b:].T)
         balance = jnp.where(self.held[:, None], u, balance)
-        gaps = -jnp.where(is_closed, self.contacts.rates(x, moved) + self.contacts.softness * pressures, pressures)
+        gaps = -jnp.where(
+            is_closed, self.contacts.rates(x, displacements) + self.contacts.contact_compliance * pressures, pressures
+        )
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
         return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
 
-    def parted(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+    def split(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
         """What belongs to the border (k,), the contacts (k, p), the nodes (n+1, 3) and the elements (n, 3)."""
         nodes, is_closed = len(self.held), self.contacts.is_closed
-        first, contacts, places, forces = jnp.split(y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes]))
-        return first, contacts.reshape(is_closed.shape), places.reshape(nodes, 3), forces.reshape(nodes - 1, 3)
+        first, contacts, displacements, forces = jnp.split(
+            y, np.cumsum([len(self.compliance), is_closed.size, 3 * nodes])
+        )
+        return first, contacts.reshape(is_closed.shape), displacements.reshape(nodes, 3), forces.reshape(nodes - 1, 3)
 
     def with_elements(self, blocks: Float[Array, "2b+6 2b+6 n"]) -> "ChainSystem":
         """With what elements have beside H and S by rotation and place of their first node, then of their last one."""
@@ -313,7 +323,7 @@ class _Middles(eqx.Module):
     inverse: Float[Array, "n b b"]
     left: Float[Array, "n 2b+9 b"] | None
 
-    def moved(self, of_middles: Float[Array, "n b r"]) -> Float[Array, "n rows r"]:
+    def reduction(self, of_middles: Float[Array, "n b r"]) -> Float[Array, "n rows r"]:
         """What the right sides of the other rows lose."""
         if self.left is None:
             return jnp.einsum("npq,npr->nqr", self.solved, of_middles)
@@ -327,7 +337,7 @@ class _Border(eqx.Module):
     """
 
     by_rotation: Float[Array, "b k m"]
-    by_place: Float[Array, "k n+1 3"] | None
+    by_position: Float[Array, "k n+1 3"] | None
     compliance: Float[Array, "k k"]
     positive: int = eqx.field(static=True)
 
@@ -337,21 +347,21 @@ class _Border(eqx.Module):
         far = contacts.far
         if far is None:
             return _Border(system.border, None, system.compliance, len(system.compliance))
-        columns = far.columns(contacts.is_closed[far.row], contacts.softness, system.diagonal.shape[-1])
-        by_rotation, by_place, compliances = columns
+        columns = far.columns(contacts.is_closed[far.row], contacts.contact_compliance, system.diagonal.shape[-1])
+        by_rotation, by_position, compliances = columns
         if system.is_backward:
-            by_rotation, by_place = by_rotation[..., ::-1], by_place[:, ::-1]
+            by_rotation, by_position = by_rotation[..., ::-1], by_position[:, ::-1]
         k = len(system.compliance)
         compliance = jnp.zeros((k + len(compliances),) * 2, compliances.dtype)
         compliance = compliance.at[:k, :k].set(system.compliance).at[k:, k:].set(jnp.diag(compliances))
-        by_place = jnp.concatenate([jnp.zeros((k, *by_place.shape[1:]), by_place.dtype), by_place])
+        by_position = jnp.concatenate([jnp.zeros((k, *by_position.shape[1:]), by_position.dtype), by_position])
         by_rotation = jnp.concatenate([system.border, by_rotation], axis=1)
-        return _Border(by_rotation, by_place, compliance, k + far.positive)
+        return _Border(by_rotation, by_position, compliance, k + far.positive)
 
     def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "k r"]:
         """Transposed, times columns."""
         product = jnp.einsum("ikm,irm->kr", self.by_rotation, x)
-        return product if self.by_place is None else product + jnp.einsum("knc,rnc->kr", self.by_place, u)
+        return product if self.by_position is None else product + jnp.einsum("knc,rnc->kr", self.by_position, u)
 
 
 class ChainFactors(eqx.Module):
@@ -380,12 +390,12 @@ class ChainFactors(eqx.Module):
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        """As if no contact were softer than it is: what the softness of the model gives way by is asked for again, by
-        which it becomes less by softness times stiffness of the rod each time, and with it what rounding has left.
+        """With rigid contacts, by iterative refinement: each correction reduces the penetration by the contact
+        compliance times the stiffness of the rod, and with it what rounding has left.
         """
         if not self.contacts.is_closed.size:
             return self.solve_softly(f, c)
-        hard = dataclasses.replace(self.contacts, softness=jnp.zeros_like(self.contacts.softness))
+        hard = dataclasses.replace(self.contacts, contact_compliance=jnp.zeros_like(self.contacts.contact_compliance))
         hard = dataclasses.replace(self.whole, contacts=hard)
         complement = self._hard_complement()
 
@@ -403,13 +413,13 @@ class ChainFactors(eqx.Module):
             return self.complement
         at = np.arange(k, k + len(far.elements))
         is_closed = self.contacts.is_closed[far.row, far.elements]
-        harder = jnp.where(is_closed, (1 - HARD) * self.contacts.softness, 0.0)
+        harder = jnp.where(is_closed, (1 - HARD) * self.contacts.contact_compliance, 0.0)
         return jnp.linalg.inv(self.bordered.at[at, at].add(harder))
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
-        """With the softness of the contacts. Those within elements couple their nodes so stiffly that elimination loses
+        """With the contact compliance. Contacts within elements couple their nodes so stiffly that elimination loses
         half of the digits; what is left is asked for again.
         """
         found = self._solved_once(f, c, self.complement)
@@ -422,8 +432,8 @@ class ChainFactors(eqx.Module):
         self, f: Float[Array, "b m"], c: Float[Array, "j"], complement: Float[Array, "k k"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         system, contacts = self.system, self.contacts
-        first, given, nodes, gaps = system.parted(c)
-        pulling = -jnp.where(contacts.is_closed, given / contacts.softness, 0.0)
+        first, given, nodes, gaps = system.split(c)
+        pulling = -jnp.where(contacts.is_closed, given / contacts.contact_compliance, 0.0)
         if contacts.far is not None:
             # These are columns of the border.
             pulling = pulling.at[contacts.far.row].set(0.0)
@@ -443,7 +453,7 @@ class ChainFactors(eqx.Module):
         if system.is_backward:
             x, displacements, forces = x[:, ::-1], displacements[::-1], -forces[::-1]
         rates = contacts.rates(x, displacements)
-        pressures = jnp.where(contacts.is_closed, -(given + rates) / contacts.softness, -given)
+        pressures = jnp.where(contacts.is_closed, -(given + rates) / contacts.contact_compliance, -given)
         if contacts.far is not None:
             far, k = contacts.far, len(system.compliance)
             here = contacts.is_closed[far.row, far.elements]
@@ -459,14 +469,16 @@ class ChainFactors(eqx.Module):
     ) -> tuple[Float[Array, "b r m"], Float[Array, "r n+1 3"], Float[Array, "r n 3"]]:
         middles, b = self.middles, len(f)
         of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
-        moved = middles.moved(of_middles)
+        reduction = middles.reduction(of_middles)
         none = jnp.zeros_like(of_nodes[:1])
-        rotations = of_nodes - jnp.concatenate([moved[:, :b], none]) - jnp.concatenate([none, moved[:, b : 2 * b]])
-        forces = gaps.transpose(1, 2, 0) - moved[:, 2 * b : 2 * b + 3]
-        of_places = nodes.transpose(1, 2, 0)
+        rotations = (
+            of_nodes - jnp.concatenate([reduction[:, :b], none]) - jnp.concatenate([none, reduction[:, b : 2 * b]])
+        )
+        forces = gaps.transpose(1, 2, 0) - reduction[:, 2 * b : 2 * b + 3]
+        of_positions = nodes.transpose(1, 2, 0)
         if middles.left is not None:
-            of_places -= _on_nodes(moved[:, 2 * b + 3 : 2 * b + 6], moved[:, 2 * b + 6 :])
-        right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_places], axis=1)
+            of_positions -= _on_nodes(reduction[:, 2 * b + 3 : 2 * b + 6], reduction[:, 2 * b + 6 :])
+        right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_positions], axis=1)
 
         right = jnp.einsum("npq,nqr->npr", self.inverses, right)
 
@@ -568,8 +580,8 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     factors = ChainFactors(*chain, border, blank, no_complement, no_complement, negative)
     if not k:
         return factors
-    by_place = nothing[0] if border.by_place is None else border.by_place
-    solution = factors._without_border(border.by_rotation, by_place, nothing[1])
+    by_position = nothing[0] if border.by_position is None else border.by_position
+    solution = factors._without_border(border.by_rotation, by_position, nothing[1])
     matrix = -border.compliance - border.times(*solution[:2])
     if is_symmetric:
         negative += negative_count(jax.lax.stop_gradient(matrix)[None]) - border.positive
@@ -598,17 +610,19 @@ def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+
         inverse = inverse.transpose(2, 0, 1)
         solved = inverse @ of_middle
         return _Middles(solved, inverse, None), direct - of_middle.transpose(0, 2, 1) @ solved, negative
-    of_points, of_ways = loads.rotation.transpose(4, 1, 0, 3, 2), loads.way.transpose(3, 0, 2, 1)
+    of_rotations, of_gaps = loads.rotation.transpose(4, 1, 0, 3, 2), loads.segment_vectors.transpose(3, 0, 2, 1)
     free = jnp.where(system.held, 0.0, 1.0).astype(none.dtype)
     of_nodes = loads.balance.transpose(4, 0, 1, 3, 2) * jnp.stack([free[:-1], free[1:]], 1)[:, :, None, None, None]
     of_nodes = of_nodes.reshape(-1, 6, 3, b)
 
     def of_point(j: int) -> Float[Array, "n rows b"]:
         """What the rows have of the loads by the rotation of a point."""
-        return jnp.concatenate([of_points[:, 0, :, j], of_points[:, 2, :, j], of_ways[:, :, j], of_nodes[:, :, j]], 1)
+        return jnp.concatenate(
+            [of_rotations[:, 0, :, j], of_rotations[:, 2, :, j], of_gaps[:, :, j], of_nodes[:, :, j]], 1
+        )
 
-    inverse = jnp.linalg.inv(system.diagonal[..., 1::2].transpose(2, 0, 1) + of_points[:, 1, :, 1])
-    columns = of_middle.at[..., :b].add(of_points[:, 1, :, 0]).at[..., b : 2 * b].add(of_points[:, 1, :, 2])
+    inverse = jnp.linalg.inv(system.diagonal[..., 1::2].transpose(2, 0, 1) + of_rotations[:, 1, :, 1])
+    columns = of_middle.at[..., :b].add(of_rotations[:, 1, :, 0]).at[..., b : 2 * b].add(of_rotations[:, 1, :, 2])
     rows = of_point(1).at[:, : 2 * b + 3].add(of_middle.transpose(0, 2, 1))
     direct = jnp.pad(direct, ((0, 0), (0, 6), (0, 0)))
     direct = direct.at[..., :b].add(of_point(0)).at[..., b : 2 * b].add(of_point(2))

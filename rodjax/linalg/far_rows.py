@@ -1,7 +1,7 @@
 """Contacts between elements that are far from one another along the rod, as rows and columns of a chain's border.
 
-Each of p contacts has the gradient of its gap by the rotations and places of four nodes, those of its two elements. Its
-curvature couples both elements too: it is kept as four more vectors v, the first two of which take v v^T from the
+Each of p contacts has the gradient of its gap by the rotations and positions of four nodes, those of its two elements.
+Its curvature couples both elements too: it is kept as four more vectors v, the first two of which take v v^T from the
 stiffness, while the others add it (`SIGNS`).
 """
 
@@ -21,7 +21,7 @@ class FarRows(eqx.Module):
     """
 
     by_rotation: Float[Array, "5 b 4 p"]
-    by_place: Float[Array, "5 3 4 p"]
+    by_position: Float[Array, "5 3 4 p"]
     nodes: Int[Array, "4 p"]
     elements: Int[Array, "p"]
     row: int = eqx.field(static=True)
@@ -48,19 +48,21 @@ class FarRows(eqx.Module):
         return moments, forces
 
     def columns(
-        self, is_closed: Bool[Array, "n+1"], softness: Float[Array, ""], points: int
+        self, is_closed: Bool[Array, "n+1"], contact_compliance: Float[Array, ""], points: int
     ) -> tuple[Float[Array, "b 5p m"], Float[Array, "5p n+1 3"], Float[Array, "5p"]]:
-        """Of the border: by rotations, by places, and compliances."""
+        """Of the border: by rotations, by positions, and compliances."""
         p, nodes = len(self.elements), len(is_closed)
-        is_there = (self.nodes[..., None] == np.arange(nodes)[None, None]).astype(softness.dtype)
+        is_there = (self.nodes[..., None] == np.arange(nodes)[None, None]).astype(contact_compliance.dtype)
         here = is_closed[self.elements]
-        factors = jnp.concatenate([here.astype(softness.dtype)[None], jnp.ones((4, p), softness.dtype)])
+        factors = jnp.concatenate(
+            [here.astype(contact_compliance.dtype)[None], jnp.ones((4, p), contact_compliance.dtype)]
+        )
         by_node = jnp.einsum("rbkp,rp,kpn->brpn", self.by_rotation, factors, is_there)
-        by_point = jnp.zeros((*by_node.shape[:-1], points), softness.dtype).at[..., ::2].set(by_node)
-        by_place = jnp.einsum("rckp,rp,kpn->rpnc", self.by_place, factors, is_there)
+        by_point = jnp.zeros((*by_node.shape[:-1], points), contact_compliance.dtype).at[..., ::2].set(by_node)
+        by_position = jnp.einsum("rckp,rp,kpn->rpnc", self.by_position, factors, is_there)
         # An open contact is a number by itself.
-        compliances = jnp.concatenate([jnp.where(here, softness, 1.0), jnp.repeat(jnp.asarray(SIGNS), p)])
-        return by_point.reshape(len(by_point), 5 * p, points), by_place.reshape(5 * p, nodes, 3), compliances
+        compliances = jnp.concatenate([jnp.where(here, contact_compliance, 1.0), jnp.repeat(jnp.asarray(SIGNS), p)])
+        return by_point.reshape(len(by_point), 5 * p, points), by_position.reshape(5 * p, nodes, 3), compliances
 
     @property
     def positive(self) -> int:
@@ -69,11 +71,11 @@ class FarRows(eqx.Module):
 
     def _along(self, k: int, x: Float[Array, "b m"], u: Float[Array, "n+1 3"]) -> Float[Array, "p"]:
         turns, moves = x[:, 2 * self.nodes], u.T[:, self.nodes]
-        return jnp.sum(self.by_rotation[k] * turns, axis=(0, 1)) + jnp.sum(self.by_place[k] * moves, axis=(0, 1))
+        return jnp.sum(self.by_rotation[k] * turns, axis=(0, 1)) + jnp.sum(self.by_position[k] * moves, axis=(0, 1))
 
     def _on_points(self, k: int, along: Float[Array, "p"], points: int) -> Float[Array, "b m"]:
         by_rotation = self.by_rotation[k] * along[None, None]
         return jnp.zeros((len(by_rotation), points), along.dtype).at[:, 2 * self.nodes].add(by_rotation)
 
     def _on_nodes(self, k: int, along: Float[Array, "p"], nodes: int) -> Float[Array, "n+1 3"]:
-        return jnp.zeros((3, nodes), along.dtype).at[:, self.nodes].add(self.by_place[k] * along[None, None]).T
+        return jnp.zeros((3, nodes), along.dtype).at[:, self.nodes].add(self.by_position[k] * along[None, None]).T

@@ -139,7 +139,7 @@ def factor_and_solve(
         factors = factor(system)
         return factors, *factors.solve(f, c)
     if isinstance(system, BorderedSystem):
-        g, c = system.parted(c)
+        g, c = system.split(c)
         all_f, all_c = (jnp.concatenate([part, last[None]]) for part, last in zip(system.columns, (f, c), strict=True))
         inner, found = _factor_and_solve_all(system.inner, all_f, all_c, is_regularized)
         factors = system.factored(inner, Vectors(found.x[:-1], found.y[:-1]))
@@ -189,7 +189,7 @@ class _Level(eqx.Module):
     after: Float[Array, "b b m"]
     first: int = eqx.field(static=True)
 
-    def parted(self, x: Float[Array, "*c n"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c k"]]:
+    def split(self, x: Float[Array, "*c n"]) -> tuple[Float[Array, "*c m"], Float[Array, "*c k"]]:
         """What goes, and what stays."""
         return x[..., self.first :: 2], x[..., 1 - self.first :: 2]
 
@@ -220,7 +220,7 @@ class _Elimination(eqx.Module):
         """H^-1 f for j right sides."""
         eliminated = []
         for level in self.levels:
-            goes, f = level.parted(f)
+            goes, f = level.split(f)
             eliminated.append(product(level.inverse, goes))
             beside = transpose_product(level.before, goes), transpose_product(level.after, goes)
             f -= level.added(*beside, f.shape[-1])

@@ -2,21 +2,21 @@
 
 With u the motion of the nodes, a contact of the pressure p0 and the gap g has in the model the pressure
 
-    p(u) = max(0, p0 - (g + N^T u)/softness)
+    p(u) = max(0, p0 - (g + N^T u)/c)
 
-and the energy softness p(u)^2/2, so that the model is convex where its stiffness is positive, and piecewise quadratic.
-Each step of a semismooth Newton method is one factorisation, with the contacts closed that are so at the last iterate.
-The first ones are taken whole, as that most often ends soonest; later ones are followed by a line search on the model
-itself, so that the method cannot cycle; under loads without a potential, where the model has no value, all are whole
-without friction, and with it the slope of a model of the same symmetric part is looked for along the line.
-It ends where a whole step closes and opens no contact. Where many contacts close or open, it would advance by one or
-two at a time: then much softer contacts are sought first, and from these harder ones.
+with the contact compliance c, and the energy c p(u)^2/2, so that the model is convex where its stiffness is positive,
+and piecewise quadratic. Each step of a semismooth Newton method is one factorisation, with the contacts closed that are
+so at the last iterate. The first ones are taken whole, as that most often ends soonest; later ones are followed by a
+line search on the model itself, so that the method cannot cycle; under loads without a potential, where the model has
+no value, all are whole without friction, and with it the slope of a model of the same symmetric part is looked for
+along the line. It ends where a whole step closes and opens no contact. Where many contacts close or open, it would
+advance by one or two at a time: then much softer contacts are sought first, and from these harder ones.
 
 Coulomb friction with bounds that are given stays within that: with s the slip, tangential, the force on the node is
 
-    q(u) = q0 - (s + P u)/softness, no longer than its bound
+    q(u) = q0 - (s + P u)/c, no longer than its bound
 
-of the energy softness |q|^2/2, and beyond the bound one that is linear in |q0 - (s + P u)/softness|: convex as well.
+of the energy c |q|^2/2, and beyond the bound one that is linear in |q0 - (s + P u)/c|: convex as well.
 A contact that sticks is three closed rows, P; what one that slips does as it turns is in the stiffness of its node.
 """
 
@@ -29,11 +29,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem, ContactRows, factor_chain
 
-# The most factorisations; those before softer contacts are tried, of SOFTEST [L^3/EI] and then harder by HARDENING at
-# a time; with each softness the first so many are followed by whole steps; steps of each line search.
+# The most factorisations; those before softer contacts are tried, of MOST_COMPLIANT [L^3/EI] and then harder by
+# HARDENING at a time; with each compliance the first so many are followed by whole steps; steps of each line search.
 MOST_FACTORS = 60
 FIRST_FACTORS = 6
-SOFTEST = 1e-4
+MOST_COMPLIANT = 1e-4
 HARDENING = 1e4
 WHOLE_STEPS = 12
 LINE_STEPS = 12
@@ -56,72 +56,76 @@ class Unilateral(eqx.Module):
         """What the contacts exert where they would exert `trial`, if they could pull, and had no bounds."""
         if self.bounds is None:
             return jnp.where(trial > 0, trial, 0.0)
-        normal, tangential = self._parted(trial)
+        normal, tangential = self._split(trial)
         return self._joined(jnp.where(normal > 0, normal, 0.0), _clipped(tangential, self.bounds))
 
     def is_closed(self, trial: Float[Array, "r n+1"]) -> Bool[Array, "r n+1"]:
         """Whether a contact closes, or sticks."""
         if self.bounds is None:
             return trial > 0
-        normal, tangential = self._parted(trial)
+        normal, tangential = self._split(trial)
         sticks = _lengths(tangential) < self.bounds
         return self._joined(normal > 0, jnp.broadcast_to(sticks[:, None], tangential.shape))
 
-    def energy(self, trial: Float[Array, "r n+1"], softness: Float[Array, ""]) -> Float[Array, ""]:
-        return softness / 2 * self._squares(trial)
+    def energy(self, trial: Float[Array, "r n+1"], contact_compliance: Float[Array, ""]) -> Float[Array, ""]:
+        return contact_compliance / 2 * self._squares(trial)
 
     def _squares(self, trial: Float[Array, "r n+1"]) -> Float[Array, ""]:
         if self.bounds is None:
             return jnp.sum(jnp.where(trial > 0, trial, 0.0) ** 2)
-        normal, tangential = self._parted(trial)
+        normal, tangential = self._split(trial)
         lengths, bounds = _lengths(tangential), self.bounds
         of_friction = jnp.where(lengths < bounds, lengths**2, bounds * (2 * lengths - bounds))
         return jnp.sum(jnp.where(normal > 0, normal, 0.0) ** 2) + jnp.sum(of_friction)
 
-    def slope(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], softness: Array) -> Float[Array, ""]:
+    def slope(
+        self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], contact_compliance: Array
+    ) -> Float[Array, ""]:
         """The derivative of that along -falls."""
-        return -softness * jnp.sum(self.allowed(trial) * falls)
+        return -contact_compliance * jnp.sum(self.allowed(trial) * falls)
 
-    def growth(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], softness: Array) -> Float[Array, ""]:
+    def growth(
+        self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"], contact_compliance: Array
+    ) -> Float[Array, ""]:
         """The second derivative of it."""
-        return softness * self._squares_of(trial, falls)
+        return contact_compliance * self._squares_of(trial, falls)
 
     def _squares_of(self, trial: Float[Array, "r n+1"], falls: Float[Array, "r n+1"]) -> Float[Array, ""]:
         if self.bounds is None:
             return jnp.sum(jnp.where(trial > 0, falls, 0.0) * falls)
-        normal, tangential = self._parted(trial)
-        of_normal, of_tangential = self._parted(falls)
+        normal, tangential = self._split(trial)
+        of_normal, of_tangential = self._split(falls)
         directions, parts = self._slipping(tangential)
         along = jnp.sum(directions * of_tangential, axis=1)
         of_friction = parts * (jnp.sum(of_tangential**2, axis=1) - along**2)
         return jnp.sum(jnp.where(normal > 0, of_normal, 0.0) * of_normal) + jnp.sum(of_friction)
 
     def slipping(
-        self, trial: Float[Array, "r n+1"], contacts: ContactRows, softness: Float[Array, ""]
+        self, trial: Float[Array, "r n+1"], contacts: ContactRows, contact_compliance: Float[Array, ""]
     ) -> tuple[Array, Array] | None:
         """The stiffness at the nodes of what slips there, and the forces there that do not depend on the motion."""
         if self.bounds is None:
             return None
         along = contacts.normals[len(self.gaps) - 3 * len(self.bounds) :].reshape(-1, 3, *contacts.normals.shape[1:])
-        _, tangential = self._parted(trial)
-        _, begin = self._parted(self.pressures - self.gaps / softness)
+        _, tangential = self._split(trial)
+        _, begin = self._split(self.pressures - self.gaps / contact_compliance)
         directions, parts = self._slipping(tangential)
         slips = (_lengths(tangential) >= self.bounds)[:, None]
         turning = jnp.where(slips[:, None], _across(directions) * parts[:, None, None], 0.0)
         force = jnp.where(slips, self.bounds[:, None] * directions, 0.0)
         force += jnp.einsum("fcdn,fdn->fcn", turning, begin)
-        stiffness = jnp.einsum("fcna,fcdn,fdnb->nab", along, turning / softness, along)
+        stiffness = jnp.einsum("fcna,fcdn,fdnb->nab", along, turning / contact_compliance, along)
         return stiffness, jnp.einsum("fcna,fcn->na", along, force)
 
     def turned(self, trial: Float[Array, "r n+1"], other: Float[Array, "r n+1"]) -> Bool[Array, ""]:
         """Whether a slip has another direction in one trial than in another."""
         if self.bounds is None:
             return jnp.array(False)
-        (here, _), (there, _) = (self._slipping(self._parted(each)[1]) for each in (trial, other))
+        (here, _), (there, _) = (self._slipping(self._split(each)[1]) for each in (trial, other))
         turned = jnp.max(jnp.abs(here - there), axis=1)
         return jnp.any(self.bounds * turned > SAME_DIRECTION * jnp.max(self.bounds))
 
-    def _parted(self, rows: Array) -> tuple[Array, Array]:
+    def _split(self, rows: Array) -> tuple[Array, Array]:
         """Of pressures (k, n+1), and of tangential forces (f, 3, n+1)."""
         assert self.bounds is not None
         count, nodes = self.bounds.shape
@@ -176,7 +180,9 @@ class Model(Protocol):
         """Without symmetry there is no model that could be least."""
         ...
 
-    def solved(self, is_closed: Array, trial: Array, softness: Array, memory: Any) -> tuple[Bool[Array, ""], Any, Any]:
+    def solved(
+        self, is_closed: Array, trial: Array, contact_compliance: Array, memory: Any
+    ) -> tuple[Bool[Array, ""], Any, Any]:
         """With these contacts closed, and what they would exert at the last iterate: whether that is a minimum, the
         motion to it, and what the next solution needs to know.
         """
@@ -201,9 +207,9 @@ class Contacts(Protocol):
 
     def allowed(self, trial: Array) -> Array: ...
     def is_closed(self, trial: Array) -> Array: ...
-    def energy(self, trial: Array, softness: Array) -> Float[Array, ""]: ...
-    def slope(self, trial: Array, falls: Array, softness: Array) -> Float[Array, ""]: ...
-    def growth(self, trial: Array, falls: Array, softness: Array) -> Float[Array, ""]: ...
+    def energy(self, trial: Array, contact_compliance: Array) -> Float[Array, ""]: ...
+    def slope(self, trial: Array, falls: Array, contact_compliance: Array) -> Float[Array, ""]: ...
+    def growth(self, trial: Array, falls: Array, contact_compliance: Array) -> Float[Array, ""]: ...
     def turned(self, trial: Array, other: Array) -> Bool[Array, ""]: ...
 
 
@@ -216,7 +222,7 @@ class Sought(eqx.Module):
     memory: Any
     trial: Array
     is_closed: Array
-    level: Float[Array, ""]  # the least softness
+    level: Float[Array, ""]  # the least compliance
     is_minimum: Bool[Array, ""]
     is_done: Bool[Array, ""]
     since: Int[Array, ""]  # factorisations with this level
@@ -224,12 +230,12 @@ class Sought(eqx.Module):
 
 
 def sought(
-    model: Model, contacts: Contacts, is_closed: Array, softness: Array, nowhere: Any, memory: Any = None
+    model: Model, contacts: Contacts, is_closed: Array, contact_compliance: Array, nowhere: Any, memory: Any = None
 ) -> Sought:
-    """The minimum of a model from the contacts that are closed first, with contacts of this softness."""
+    """The minimum of a model from the contacts that are closed first, with contacts of this compliance."""
 
     def improved(state: Sought) -> Sought:
-        here = jnp.maximum(softness, state.level)
+        here = jnp.maximum(contact_compliance, state.level)
         is_minimum, motion, memory = model.solved(state.is_closed, state.trial, here, state.memory)
         is_early = (state.since < WHOLE_STEPS) | (not model.is_symmetric)
         change = jax.tree.map(jnp.subtract, motion, state.motion)
@@ -259,7 +265,7 @@ def sought(
         is_closed = contacts.is_closed(trial)
         is_same = jnp.all(is_closed == state.is_closed) & ~contacts.turned(trial, state.trial) & is_whole
         # Where the contacts are not found at once, softer ones are, and harder ones from these.
-        hardest = jnp.min(softness)
+        hardest = jnp.min(contact_compliance)
         is_late = (state.count + 1 == FIRST_FACTORS) & ~is_same
         harder = jnp.where(state.level > HARDENING * hardest, state.level / HARDENING, 0.0)
         return Sought(
@@ -267,7 +273,7 @@ def sought(
             memory,
             trial,
             is_closed,
-            jnp.where(is_late & (hardest < SOFTEST), SOFTEST, jnp.where(is_same, harder, state.level)),
+            jnp.where(is_late & (hardest < MOST_COMPLIANT), MOST_COMPLIANT, jnp.where(is_same, harder, state.level)),
             is_minimum,
             (is_same & (state.level <= hardest)) | ~is_minimum,
             jnp.where(is_late | is_same, 0, state.since + 1),
@@ -275,7 +281,7 @@ def sought(
         )
 
     count, no = jnp.zeros((), int), jnp.array(False)
-    trial = contacts.pressures - contacts.gaps / softness
+    trial = contacts.pressures - contacts.gaps / contact_compliance
     level = jnp.zeros((), trial.dtype)
     begin = Sought(nowhere, memory, trial, is_closed, level, no, no, count, count)
     return jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
@@ -294,14 +300,18 @@ class _OfChain(eqx.Module):
         return self.system.loads is None or self.contacts.bounds is not None
 
     def solved(
-        self, is_closed: Bool[Array, "r n+1"], trial: Float[Array, "r n+1"], softness: Float[Array, ""], memory: None
+        self,
+        is_closed: Bool[Array, "r n+1"],
+        trial: Float[Array, "r n+1"],
+        contact_compliance: Float[Array, ""],
+        memory: None,
     ) -> tuple[Bool[Array, ""], tuple[Array, Array], None]:
-        here = closed_softly(self.system, is_closed, softness)
+        here = closed_softly(self.system, is_closed, contact_compliance)
         f, c = with_pressures(here, self.contacts, self.f, self.c)
-        slipping = self.contacts.slipping(trial, here.contacts, softness)
+        slipping = self.contacts.slipping(trial, here.contacts, contact_compliance)
         if slipping is not None:
             here = eqx.tree_at(lambda system: system.stiffness, here, here.stiffness + slipping[0])
-            first, rows, nodes, gaps = here.parted(c)
+            first, rows, nodes, gaps = here.split(c)
             nodes += jnp.where(here.held[:, None], 0.0, slipping[1])
             c = jnp.concatenate([part.reshape(-1) for part in (first, rows, nodes, gaps)])
         factors = factor_chain(here)
@@ -309,21 +319,25 @@ class _OfChain(eqx.Module):
 
     def opening(self, motion: tuple[Array, Array]) -> Float[Array, "r n+1"]:
         x, y = motion
-        return self.system.contacts.rates(x, self.system.parted(y)[2])
+        return self.system.contacts.rates(x, self.system.split(y)[2])
 
     def along(
         self, motion: tuple[Array, Array], change: tuple[Array, Array], memory: None
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         ahead, here = self.system.times(*change), self.system.times(*motion)
-        _, _, du, _ = self.system.parted(change[1])
-        _, _, of_nodes, _ = self.system.parted(self.c)
+        _, _, du, _ = self.system.split(change[1])
+        _, _, of_nodes, _ = self.system.split(self.c)
         slope = (work(self.system, motion, ahead) + work(self.system, change, here)) / 2
         slope -= jnp.sum(self.f * change[0]) + jnp.sum(of_nodes * du)
         return slope, work(self.system, change, ahead)
 
 
-def closed_softly(system: ChainSystem, is_closed: Bool[Array, "r n+1"], softness: Float[Array, ""]) -> ChainSystem:
-    return eqx.tree_at(lambda system: system.contacts.softness, system.closed_where(is_closed), softness)
+def closed_softly(
+    system: ChainSystem, is_closed: Bool[Array, "r n+1"], contact_compliance: Float[Array, ""]
+) -> ChainSystem:
+    return eqx.tree_at(
+        lambda system: system.contacts.contact_compliance, system.closed_where(is_closed), contact_compliance
+    )
 
 
 def with_pressures(
@@ -332,7 +346,7 @@ def with_pressures(
     """The right sides of a model with the pressures of the contacts that are closed."""
     is_closed = system.contacts.is_closed
     pressures = jnp.where(is_closed, contacts.pressures, 0.0)
-    first, _, nodes, elements = system.parted(c)
+    first, _, nodes, elements = system.split(c)
     nodes += jnp.where(system.held[:, None], 0.0, system.contacts.pushed(pressures))
     rows = jnp.where(is_closed, contacts.gaps, contacts.pressures)
     right = [part.reshape(-1) for part in (first, rows, nodes, elements)]
@@ -342,8 +356,8 @@ def with_pressures(
 def work(system: ChainSystem, motion: tuple[Array, Array], by: tuple[Array, Array]) -> Float[Array, ""]:
     """Of a motion on rows of the system, those of multipliers with the other sign."""
     (x, y), (moments, rows) = motion, by
-    first, _, u, force = system.parted(y)
-    border, _, balance, gap = system.parted(rows)
+    first, _, u, force = system.split(y)
+    border, _, balance, gap = system.split(rows)
     return jnp.sum(x * moments) + jnp.sum(u * balance) - jnp.sum(force * gap) - jnp.sum(first * border)
 
 
@@ -352,13 +366,13 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     the nodes. The contacts closed in the system are those of the first factorisation. The pressures in the result are
     what they change by.
     """
-    softness = system.contacts.softness
+    contact_compliance = system.contacts.contact_compliance
     open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
     model = _OfChain(open_system, f, c, contacts)
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c)
-    end = sought(model, contacts, system.contacts.is_closed, softness, nowhere)
+    end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y = end.motion
-    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / softness)
-    first, _, u, force = open_system.parted(y)
+    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
+    first, _, u, force = open_system.split(y)
     y = jnp.concatenate([part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force)])
     return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)

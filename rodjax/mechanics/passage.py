@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.model.obstacles import AT_ONCE, Obstacle
 
 # Places along the rod, fewer where an obstacle has so many numbers that each distance takes time.
-PLACES = 257
-FEW_PLACES = 65
+SAMPLES = 257
+FEW_SAMPLES = 65
 MANY_NUMBERS = 1000
 # Of an obstacle with no more numbers than this all places and times are looked at at once.
 FEW_NUMBERS = 20
@@ -34,9 +34,9 @@ WITHIN = 0.05
 
 
 class Before(eqx.Module):
-    """Where a rod last was sound, at places along it (`NodalForm.places`), and the obstacles then, in SI units."""
+    """Where a rod last was sound, at places along it (`NodalForm.samples`), and the obstacles then, in SI units."""
 
-    points: Float[Array, "... places 3"]
+    points: Float[Array, "... samples 3"]
     obstacles: tuple[Obstacle, ...]
 
 
@@ -57,10 +57,10 @@ class Passage(eqx.Module):
 
 def passage(
     before: Before,
-    points: Float[Array, "places 3"],
+    points: Float[Array, "samples 3"],
     obstacles: tuple[Obstacle, ...],
-    radius: Float[Array, "places"],
-    held: Float[Array, "places 3"],
+    radius: Float[Array, "samples"],
+    held: Float[Array, "samples 3"],
 ) -> Passage:
     """Of a rod that is now at `points`; `held`: beside what a support holds this, elsewhere not a number.
 
@@ -85,15 +85,15 @@ def passage(
 def _through(
     old: Obstacle,
     new: Obstacle,
-    before: Float[Array, "places 3"],
-    after: Float[Array, "places 3"],
-    radius: Float[Array, "places"],
-    held: Float[Array, "places 3"],
-) -> tuple[Bool[Array, "places"], Bool[Array, "places"], Float[Array, "places"]]:
+    before: Float[Array, "samples 3"],
+    after: Float[Array, "samples 3"],
+    radius: Float[Array, "samples"],
+    held: Float[Array, "samples 3"],
+) -> tuple[Bool[Array, "samples"], Bool[Array, "samples"], Float[Array, "samples"]]:
     """Which places came through an obstacle, which lie within it, and how deep they were."""
     numbers = sum(leaf.size for leaf in jax.tree.leaves(new))
-    step = (PLACES - 1) // (FEW_PLACES - 1) if numbers > MANY_NUMBERS else 1
-    start, ways, rim, beside = before[::step], (after - before)[::step], radius[::step], held[::step]
+    step = (SAMPLES - 1) // (FEW_SAMPLES - 1) if numbers > MANY_NUMBERS else 1
+    start, displacements, rim, beside = before[::step], (after - before)[::step], radius[::step], held[::step]
 
     def mapped(function: Callable, *values: Array) -> Array:
         if numbers <= FEW_NUMBERS:
@@ -105,11 +105,11 @@ def _through(
         return obstacle.at(point)
 
     def distances(times: Float[Array, "p t"]) -> Float[Array, "p t"]:
-        points = start[:, None] + times[..., None] * ways[:, None]
+        points = start[:, None] + times[..., None] * displacements[:, None]
         return mapped(distance, times.reshape(-1), points.reshape(-1, 3)).reshape(times.shape)
 
     def normals(times: Float[Array, "2*p"]) -> Float[Array, "2*p 3"]:
-        points = jnp.tile(start, (2, 1)) + times[:, None] * jnp.tile(ways, (2, 1))
+        points = jnp.tile(start, (2, 1)) + times[:, None] * jnp.tile(displacements, (2, 1))
         return mapped(jax.grad(distance, argnums=1), times, points)
 
     times = jnp.linspace(0.0, 1.0, TIMES, dtype=start.dtype)

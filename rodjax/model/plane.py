@@ -107,8 +107,8 @@ def _directions(scene: Scene) -> Float[Array, "k 3"]:
     """Unit vectors that span the plane, zero where a scene happens to give none."""
     vectors = [end.tangent for end in (scene.start, scene.end) if isinstance(end, Directed)]
     vectors += [clip.direction for clip in scene.clips if clip.direction is not None]
-    places = [held.position for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Held | Clip)]
-    vectors += [place - places[0] for place in places[1:]]
+    positions = [held.position for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Held | Clip)]
+    vectors += [position - positions[0] for position in positions[1:]]
     if scene.gravity is not None:
         vectors.append(scene.gravity)
     vectors += [load.force for load in dead_forces(scene)]

@@ -69,7 +69,7 @@ class RestStrain(eqx.Module):
         else:
             ahead, further = ((1 + value_at(self.axial, begins + part * steps, a, b))[None] * along for part in GAUSS)
             way = steps[None] * (ahead + further) / 2 + by_turn[None] * (cross(first, further) - cross(second, ahead))
-        q, ways = screw(turn.reshape(3, -1), way.reshape(3, -1))
+        q, displacements = screw(turn.reshape(3, -1), way.reshape(3, -1))
 
         def onward(carry, step):
             position, quaternion = carry
@@ -79,7 +79,7 @@ class RestStrain(eqx.Module):
             return (position, quaternion), (position, quaternion)
 
         begin = jnp.zeros(3, s.dtype), jnp.array([1.0, 0.0, 0.0, 0.0], s.dtype)
-        _, (positions, quaternions) = jax.lax.scan(onward, begin, (q.T, ways.T))
+        _, (positions, quaternions) = jax.lax.scan(onward, begin, (q.T, displacements.T))
         positions = jnp.concatenate([begin[0][None], positions[STEPS - 1 :: STEPS]])
         quaternions = jnp.concatenate([begin[1][None], quaternions[STEPS - 1 :: STEPS]])
         return Poses(positions.T, quaternions.T)
@@ -181,8 +181,8 @@ def _arclengths_and_tangents(points: Float[Array, "k 3"]) -> tuple[Float[Array, 
     knots = jnp.concatenate([jnp.zeros_like(chords[:1]), jnp.cumsum(chords)])
     spline = Spline.through(knots, points)
     parts = jnp.array(LENGTH_POINTS, knots.dtype)
-    places = knots[:-1, None] + jnp.diff(knots)[:, None] * parts[None]
-    speed = _size(_slope(spline, places))
+    arclengths = knots[:-1, None] + jnp.diff(knots)[:, None] * parts[None]
+    speed = _size(_slope(spline, arclengths))
     lengths = jnp.diff(knots) * jnp.sum(speed * jnp.array(LENGTH_WEIGHTS, knots.dtype)[None], axis=1)
     s = jnp.concatenate([jnp.zeros_like(lengths[:1]), jnp.cumsum(lengths)])
     slopes = _slope(Spline.through(s, points), s)

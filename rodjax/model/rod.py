@@ -471,13 +471,13 @@ def _packed(wires: int) -> Float[np.ndarray, "wires 2"]:
     """
     reach = math.ceil(wires**0.5) + 1
     i, j = (index.ravel() for index in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
-    places = np.stack([2.0 * i + j, math.sqrt(3.0) * j], axis=1)
-    angles = np.round(np.arctan2(places[:, 1], places[:, 0]) % (2 * math.pi), 9)
+    positions = np.stack([2.0 * i + j, math.sqrt(3.0) * j], axis=1)
+    angles = np.round(np.arctan2(positions[:, 1], positions[:, 0]) % (2 * math.pi), 9)
     # Squared distances are whole numbers, so that those of one ring are told from rounding.
-    places = places[np.lexsort((angles, i * i + i * j + j * j))][:wires]
-    places = places - np.mean(places, axis=0)
-    _, axes = np.linalg.eigh(places.T @ places)
-    return places @ axes[:, ::-1]
+    positions = positions[np.lexsort((angles, i * i + i * j + j * j))][:wires]
+    positions = positions - np.mean(positions, axis=0)
+    _, axes = np.linalg.eigh(positions.T @ positions)
+    return positions @ axes[:, ::-1]
 
 
 def _shear_modulus(E: Float[Numbers, ""], shear_modulus: Any, poisson_ratio: Any) -> Float[Numbers, ""]:

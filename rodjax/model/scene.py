@@ -362,14 +362,14 @@ def slides(scene: Scene) -> bool:
     return any(clip.sliding for clip in scene.clips)
 
 
-def sliding_places(scene: Scene) -> Float[Array, "slides"] | None:
+def sliding_arclengths(scene: Scene) -> Float[Array, "slides"] | None:
     """The arclengths of the sliding clips; `None` where there are none."""
     return jnp.stack([clip.at for clip in scene.clips if clip.sliding]) if slides(scene) else None
 
 
-def slid(scene: Scene, places: Float[Array, "slides"]) -> Scene:
+def slid(scene: Scene, arclengths: Float[Array, "slides"]) -> Scene:
     """The scene with its sliding clips at other arclengths."""
-    return eqx.tree_at(lambda scene: [clip.at for clip in scene.clips if clip.sliding], scene, list(places))
+    return eqx.tree_at(lambda scene: [clip.at for clip in scene.clips if clip.sliding], scene, list(arclengths))
 
 
 def dead_end_moment(scene: Scene) -> Float[Array, "3"] | None:
@@ -415,7 +415,7 @@ def loads_at_nodes(scene: Scene) -> list[PointForce | PointCouple]:
     return [*(load for load in scene.point_forces if load.follower), *scene.point_couples]
 
 
-def has_node_places(scene: Scene) -> bool:
+def has_node_positions(scene: Scene) -> bool:
     """Whether forces along the rod depend on where it is or how it turns, so that the positions of the nodes, and a
     force in each element, are unknowns: where the rod may touch obstacles or itself, in fields of forces, and of rods
     by frames under loads without a potential.

@@ -159,9 +159,9 @@ def _patch(plane: Plane, seen: Float[np.ndarray, "p 3"], region: Region) -> Face
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     foot = seen[0] - heights[0] * normal
-    places = (seen - foot) @ np.stack([first, second], axis=1)
-    low = places.min(axis=0) - BEYOND * region.extent
-    width, depth = places.max(axis=0) + BEYOND * region.extent - low
+    coordinates = (seen - foot) @ np.stack([first, second], axis=1)
+    low = coordinates.min(axis=0) - BEYOND * region.extent
+    width, depth = coordinates.max(axis=0) + BEYOND * region.extent - low
     return _grid(foot + low[0] * first + low[1] * second, depth * second, width * first, region.extent)
 
 
@@ -171,8 +171,8 @@ def _joined(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "k 3 3"]
     size = np.max(triangles.max(axis=(0, 1)) - low)
     cells = 64.0
     while len(triangles) > MOST_TRIANGLES:
-        places = np.round((triangles - low) * (cells / size))
-        corners, index = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
+        corners_of_cells = np.round((triangles - low) * (cells / size))
+        corners, index = np.unique(corners_of_cells.reshape(-1, 3), axis=0, return_inverse=True)
         faces = index.reshape(-1, 3)
         faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
         faces = faces[np.all(faces != np.roll(faces, 1, axis=1), axis=1)]
@@ -200,14 +200,14 @@ def _split(triangles: Float[np.ndarray, "f 3 3"], longest: float) -> Float[np.nd
 def _level_set(obstacle: Obstacle, region: Region) -> Faces:
     """The surface by a vertex in each cell of a grid through which it passes (Gibson 1998, "Constrained elastic
     surface nets"), moved onto it along the gradient."""
-    places, distance, width = _sampled(obstacle, region.low, region.high)
+    grid, distance, width = _sampled(obstacle, region.low, region.high)
     # Again where it is, as it may be small.
     is_near = np.abs(distance) <= width
     if not np.any(is_near):
         return np.zeros((0, 4, 3))
-    low, high = (np.clip(x, region.low, region.high) for x in _around(places[is_near], width))
-    places, distance, width = _sampled(obstacle, low, high)
-    low, counts = places[0, 0, 0], np.array(distance.shape) - 1
+    low, high = (np.clip(x, region.low, region.high) for x in _around(grid[is_near], width))
+    grid, distance, width = _sampled(obstacle, low, high)
+    low, counts = grid[0, 0, 0], np.array(distance.shape) - 1
     is_inside = distance < 0
     corners = [tuple(slice(k, n + k) for k, n in zip(corner, counts, strict=True)) for corner in CORNERS]
     inside = sum(is_inside[corner].astype(int) for corner in corners)
@@ -238,8 +238,8 @@ def _sampled(
     """The corners of cubes that fill a box, the distances there, and the edge of the cubes."""
     width = float(np.max(high - low)) / CELLS
     counts = np.maximum(np.ceil((high - low) / width - 1e-9), 1).astype(int)
-    places = low + width * np.stack(np.meshgrid(*(np.arange(n + 1) for n in counts), indexing="ij"), axis=-1)
-    return places, np.asarray(obstacle.distance(places)), width
+    grid = low + width * np.stack(np.meshgrid(*(np.arange(n + 1) for n in counts), indexing="ij"), axis=-1)
+    return grid, np.asarray(obstacle.distance(grid)), width
 
 
 def _around(points: Float[np.ndarray, "p 3"], width: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

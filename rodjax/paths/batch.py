@@ -21,7 +21,7 @@ from rodjax.checks import instance, is_known, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, has_friction, has_node_places, slides
+from rodjax.model.scene import Scene, has_friction, has_node_positions, slides
 from rodjax.notes import bar
 from rodjax.paths.harness_path import harness_batch
 from rodjax.paths.path import check_still, path_from, stack_scenes
@@ -208,8 +208,8 @@ def _in_chunks(
         if mesh is not None:
             sharding = jax.sharding.NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
             whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
-            places = (sharding, sharding if each else whole, sharding)
-            inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, places, strict=True))
+            shardings = (sharding, sharding if each else whole, sharding)
+            inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, shardings, strict=True))
         return jax.block_until_ready(_solve_many(*inputs, strain_limit, options, mesh))
 
     firsts = range(0, count, chunk * devices)
@@ -285,7 +285,7 @@ def _solve_here(
     def result(scene: Scene, found: Found) -> Equilibrium:
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 
-    if not isinstance(options.solver, Newton) or slides(scenes) or has_node_places(scenes):
+    if not isinstance(options.solver, Newton) or slides(scenes) or has_node_positions(scenes):
 
         def whole(scene: Scene, guess: Guess | Equilibrium | None) -> Equilibrium:
             return result(scene, solve_from(scene, *state(scene, guess), options))

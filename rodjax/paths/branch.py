@@ -1,9 +1,9 @@
 """One branch of equilibria through a sequence of scenes, stable or not, and the points on it where a motion goes soft.
 
 The parameter of a sequence of m scenes runs from 0 to m - 1 and names the scene between two of them. Along the branch
-the residual (gradient by rotations, closure) of the mixed form stays zero. A step goes along the tangent of the branch
-and comes back to it at right angles (Keller 1977), in the metric of `stability.softest` for rotations beside the
-parameter: a linearised system with a border, solved for two right sides with the factors of Newton's method, O(n).
+the residual (gradient by rotations, constraint residual) of the mixed form stays zero. A step goes along the tangent of
+the branch and comes back to it at right angles (Keller 1977), in the metric of `stability.softest` for rotations beside
+the parameter: a linearised system with a border, solved for two right sides with the factors of Newton's method, O(n).
 At a fold the system itself is singular, with its border it is not.
 
 Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977); Seydel, "Practical bifurcation and
@@ -129,7 +129,7 @@ class Problem(eqx.Module):
     def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
         scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
         state = self.equilibrium.state
-        return carried_to(scaled, state.shape, point, motion, made_at=state.places)
+        return carried_to(scaled, state.shape, point, motion, made_at=state.held_points)
 
     def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
         """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
@@ -137,7 +137,7 @@ class Problem(eqx.Module):
         def residual(parameter):
             form, there = self.at(parameter, point)
             here = form.linearized(there)
-            return Motion(here.gradient, here.closure), (form, there, here)
+            return Motion(here.gradient, here.constraint_residual), (form, there, here)
 
         _, change, found = jax.jvp(residual, (parameter,), (jnp.ones_like(parameter),), has_aux=True)
         return *found, change
@@ -146,12 +146,12 @@ class Problem(eqx.Module):
 def no_motion(result: Equilibrium) -> Motion:
     """A motion of an equilibrium that leaves it where it is."""
 
-    def unbalanced(result: Equilibrium) -> Motion:
+    def residual_vectors(result: Equilibrium) -> Motion:
         form, point = free_form_and_point(result)
         here = form.linearized(point)
-        return Motion(here.gradient, here.closure)
+        return Motion(here.gradient, here.constraint_residual)
 
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(unbalanced, result))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(residual_vectors, result))
 
 
 def times(motion: Motion, other: Motion) -> Float[Array, ""]:
@@ -192,10 +192,10 @@ def regularized(form: Form, system: AnySystem, neutral: Motion) -> Regularized:
 
     What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
 
-    A loop that slides along its rod, or a rod that is free but for its closure, makes the part without border nearly
-    singular where the whole is not, and pivots are not exchanged. So springs hold the rod at a few places that are
-    eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly. A chain
-    from node to node has the forces that close it between them.
+    A loop that slides along its rod, or a rod that is free but for its closure constraint, makes the part without
+    border nearly singular where the whole is not, and pivots are not exchanged. So springs hold the rod at a few places
+    that are eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly. A
+    chain from node to node has the forces that close it between them.
     """
     place = jnp.argmax(jnp.sum(neutral.rotation**2, axis=0))
     turn = neutral.rotation[:, place]
@@ -222,11 +222,11 @@ def _held(
         return dataclasses.replace(system, diagonal=diagonal), 0
     b, m = diagonal.shape[1:]
     stride = 2 ** math.ceil(math.log2(max(m - 1, 1) / PARTS)) if m > PARTS else 1
-    places = np.arange(stride, m - 1, stride)
-    holds = b * len(places)
-    border = np.zeros((b, b, len(places), m))
+    held_points = np.arange(stride, m - 1, stride)
+    holds = b * len(held_points)
+    border = np.zeros((b, b, len(held_points), m))
     for component in range(b):
-        border[component, component, np.arange(len(places)), places] = 1.0
+        border[component, component, np.arange(len(held_points)), held_points] = 1.0
     border = jnp.asarray(border.reshape(b, holds, m), system.border.dtype)
     held = jnp.sum(border, axis=1)
     identity = jnp.eye(b, dtype=held.dtype)[..., None]
@@ -245,7 +245,7 @@ def nearest_to_zero(
 ) -> tuple[Float[Array, ""], Motion]:
     """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
     metric = Metric.of(form, here)
-    nothing = jnp.zeros_like(here.closure)
+    nothing = jnp.zeros_like(here.constraint_residual)
     factors = regularized(form, here.system, neutral)
 
     def unit(motion: Motion) -> Motion:
@@ -324,7 +324,7 @@ def stepped(
         metric = Metric.of(form, here)
         neutral = neutral_motion(form, point, here)
         factors = regularized(form, here.system, neutral)
-        back = less(factors.solve(Motion(-here.gradient, -here.closure)), neutral, metric)
+        back = less(factors.solve(Motion(-here.gradient, -here.constraint_residual)), neutral, metric)
         follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, metric)
         across = Motion(components(here.bases, normal), along.motion.multipliers)
         squared = jnp.where(is_given, 1.0, metric.inner(across, follows) + along.rate / problem.scale**2)
@@ -333,14 +333,14 @@ def stepped(
         part = jnp.minimum(1.0, MAX_ROTATION / jnp.max(jnp.abs(motion.rotation)))
         longest = form.longest_step(point, form.others(motion.multipliers))
         part = part if longest is None else jnp.minimum(part, longest)
-        force_change = form.layout.forces(form.closure(part * motion.multipliers))
+        force_change = form.layout.forces(form.force_components(part * motion.multipliers))
         others = form.others(part * motion.multipliers)
-        moved = form.moved(point, here.bases, part * motion.rotation, force_change, others)
+        retracted = form.retract(point, here.bases, part * motion.rotation, force_change, others)
         least = jnp.maximum(TOLERANCE, STAGNATION * form.rounding_floor(point))
-        is_there = (here.residual <= least) & form.is_closed(here.closure, 0.0)
+        is_there = (here.residual <= least) & form.is_closed(here.constraint_residual, 0.0)
         return _Correction(
             parameter=jnp.where(is_there, state.parameter, state.parameter + part * share),
-            point=jax.tree.map(lambda here, there: jnp.where(is_there, here, there), point, moved),
+            point=jax.tree.map(lambda here, there: jnp.where(is_there, here, there), point, retracted),
             here=here,
             change=change,
             follows=follows,
@@ -380,12 +380,12 @@ def stepped(
     units = nondimensional(scene)[1]
     status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
     outcome = Outcome(here.residual, state.iterations, state.iterations, status.astype(int))
-    places = None
+    held_points = None
     if isinstance(form, SlidingForm):
         assert isinstance(point, SlidingPoint)
-        form, point, places = form.at(point.places), point.inner, point.places
+        form, point, held_points = form.at(point.held_points), point.inner, point.held_points
     shape = result.state.shape.reached(form, point)
-    found = Found(SolverState(shape, point.end_force, units, places), point, outcome, state.index == 0)
+    found = Found(SolverState(shape, point.end_force, units, held_points), point, outcome, state.index == 0)
     return Station(
         parameter=state.parameter,
         equilibrium=build_result(scene, found, jnp.ones((), int)),
@@ -402,8 +402,8 @@ def stepped(
 def is_misplaced(result: Equilibrium, made: Equilibrium) -> Bool[Array, ""]:
     """Whether a rod has slid so far that its mesh, that of `made` stretched, is to be made anew."""
     scaled, _ = nondimensional(result.scene)
-    assert made.state.places is not None
-    form = SlidingForm.of(slid(scaled, made.state.places), made.state.shape)
+    assert made.state.held_points is not None
+    form = SlidingForm.of(slid(scaled, made.state.held_points), made.state.shape)
     point = free_form_and_point(result)[1]
     is_blocked = form.is_blocked(point)
     is_off = form.is_misplaced(point)
@@ -430,7 +430,7 @@ def on_new_mesh(result: Equilibrium, along: BranchTangent, mesh: Shape) -> tuple
 def _points(form: Form) -> Float[Array, "m"]:
     """Arclengths of the tangents or frames."""
     field = form.field
-    return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.places
+    return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.held_points
 
 
 def work(motion: Motion, change: Motion, metric: Metric) -> Float[Array, ""]:

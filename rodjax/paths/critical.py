@@ -82,7 +82,7 @@ def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, i
         form, there = Problem(scenes, segment, result).at(parameter, point, motion)
         here = form.linearized(there)
         rate = Motion(*here.system.times(critical.rotation, critical.multipliers))
-        return Motion(here.gradient, here.closure), times(left, rate)
+        return Motion(here.gradient, here.constraint_residual), times(left, rate)
 
     (_, none), derivatives = jax.vjp(residual, scenes, parameter, nothing)
     if is_fold:

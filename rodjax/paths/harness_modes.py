@@ -66,20 +66,20 @@ def _of_rod(rod: RodInBodies, point: object, pressures: Float[Array, "o 2"] | No
         assert isinstance(form, NodalForm)
         at_ends, couple = end_contacts(rod, form, pressures, couple)
         rates = jnp.where(at_ends.is_closed[..., None], at_ends.rates, 0.0)
-        stiff = jnp.einsum("oei,oej->eij", rates, rates) / form.softness
+        stiff = jnp.einsum("oei,oej->eij", rates, rates) / form.contact_compliance
         couple = couple._replace(second=couple.second + jax.scipy.linalg.block_diag(*stiff))
-        couple = couple._replace(of_closure=_with_gaps(here, couple))
+        couple = couple._replace(of_constraints=_with_gaps(here, couple))
     return here, couple, Metric.of(form, here).mass / rod.units.force, of_ends.reshape(12, 12) / rod.units.force
 
 
 def _with_gaps(here: Linearization, couple: Coupling) -> Float[Array, "k 12"]:
-    """The rows of what the motions of the ends add to the closure, with those of closed contacts."""
+    """The rows of what the motions of the ends add to the constraint residual, with those of closed contacts."""
     system = here.system
     assert isinstance(system, ChainSystem)
     assert couple.of_gaps is not None
     is_closed, first = system.contacts.is_closed, len(system.compliance)
     rates = -jnp.where(is_closed[..., None], couple.of_gaps, 0.0).reshape(-1, 12)
-    return couple.of_closure.at[first : first + is_closed.size].set(rates)
+    return couple.of_constraints.at[first : first + is_closed.size].set(rates)
 
 
 def _groups(result: HarnessEquilibrium) -> tuple[Assembly, list[_Group]]:
@@ -119,8 +119,8 @@ def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
 
             def of_rod(here: Linearization, couple: Coupling, mass: Array, of_ends: Array):
                 factors = factor(here.system.shifted(-value * mass))
-                solved = jax.vmap(factors.solve, (-1, -1), -1)(couple.of_gradient, couple.of_closure)
-                left = couple.second - value * of_ends - couple.of_closure.T @ solved[1]
+                solved = jax.vmap(factors.solve, (-1, -1), -1)(couple.of_gradient, couple.of_constraints)
+                left = couple.second - value * of_ends - couple.of_constraints.T @ solved[1]
                 return factors, solved, left - jnp.einsum("bmi,bmj->ij", couple.of_gradient, solved[0])
 
             factors, solved, left = jax.vmap(of_rod)(group.here, group.coupling, group.mass, group.of_ends)
@@ -149,11 +149,11 @@ def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
         force, first = jnp.zeros_like(q), []
         for group, (factors, _), x in zip(groups, found, rotations, strict=True):
             right = group.mass[:, None] * x
-            nothing = jnp.zeros_like(group.here.closure)
+            nothing = jnp.zeros_like(group.here.constraint_residual)
             here = jax.vmap(lambda factors, f, c: factors.solve(f, c))(factors, right, nothing)
             first.append(here)
             loads = jnp.einsum("kbmi,kbm->ki", group.coupling.of_gradient, here[0])
-            loads += jnp.einsum("kci,kc->ki", group.coupling.of_closure, here[1])
+            loads += jnp.einsum("kci,kc->ki", group.coupling.of_constraints, here[1])
             own = jnp.einsum("kij,kj->ki", group.of_ends, along(group) @ q)
             force += jnp.einsum("k,kiq,ki->q", group.shares, along(group), own - loads)
         moved = jnp.linalg.solve(stiffness, force) if len(q) else q
@@ -177,7 +177,7 @@ def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
         scaled = jax.tree.map(lambda value: value / size, (new, multipliers, moved))
         return *scaled, low + share / size**2
 
-    nothing = [jnp.zeros_like(group.here.closure) for group in groups]
+    nothing = [jnp.zeros_like(group.here.constraint_residual) for group in groups]
     begin = generic, nothing, jnp.ones(motions.shape[1], dtype), low
     rotations, multipliers, q, value = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, begin)
 
@@ -199,12 +199,12 @@ def _displaced(
 ) -> Float[Array, "n+1 3"]:
     """Of the nodes, as a motion begins."""
     form: Form = rod.form
-    change, others = form.layout.forces(form.closure(multipliers)), form.others(multipliers)
+    change, others = form.layout.forces(form.force_components(multipliers)), form.others(multipliers)
 
     def nodes(part: Float[Array, ""]) -> Float[Array, "n+1 3"]:
-        there = rod.moved(part * motions.reshape(2, 6))
+        there = rod.form_at(part * motions.reshape(2, 6))
         step = jax.tree.map(lambda value: part * value, others)
-        return there.nodes_of(there.holding(there.moved(point, here.bases, part * rotation, part * change, step)))
+        return there.nodes_of(there.holding(there.retract(point, here.bases, part * rotation, part * change, step)))
 
     zero = jnp.zeros((), motions.dtype)
     return rod.units.length * jax.jvp(nodes, (zero,), (jnp.ones_like(zero),))[1]

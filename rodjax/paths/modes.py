@@ -112,14 +112,14 @@ def _flexibility(equilibrium: Equilibrium) -> tuple[Float[Array, "3n 3n"], Float
     # A rod that can spin, or turn as a whole, is held softly.
     factors = factor(form.regular(here.system))
     count = 3 * len(form.field.s)
-    before = len(here.closure) - form.layout.size - count
+    before = len(here.constraint_residual) - form.layout.size - count
 
     def moved(force: Float[Array, "3n"]) -> Float[Array, "3n"]:
-        given = jnp.zeros_like(here.closure).at[before : before + count].set(force)
+        given = jnp.zeros_like(here.constraint_residual).at[before : before + count].set(force)
         _, multipliers = factors.solve(jnp.zeros_like(here.gradient), given)
         return form.others(multipliers).displacements.reshape(-1)
 
-    is_free = jnp.repeat(jnp.where(form.is_held, 0.0, 1.0).astype(here.closure.dtype), 3)
+    is_free = jnp.repeat(jnp.where(form.is_held, 0.0, 1.0).astype(here.constraint_residual.dtype), 3)
     forces = jnp.diag(is_free)
     s = jnp.concatenate([form.field.s[:1], (form.field.s[1:] + form.field.s[:-1]) / 2, form.field.s[-1:]])
     mass = form.scene.rod.mass_per_length
@@ -149,17 +149,17 @@ def mode_of(
     equilibrium: Equilibrium,
 ) -> Mode:
     """A motion of an equilibrium and its nondimensional stiffness, as a `Mode`."""
-    force_change = form.layout.forces(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.force_components(motion.multipliers))
 
     def moved(amount: Float[Array, ""]) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"] | None]:
         if not isinstance(form, SlidingForm):
-            there = form.moved(point, here.bases, amount * motion.rotation, amount * force_change)
+            there = form.retract(point, here.bases, amount * motion.rotation, amount * force_change)
             return form.nodes(form.edges(there)), None
         assert isinstance(point, SlidingPoint)
         others = form.others(amount * motion.multipliers)
-        there = form.moved(point, here.bases, amount * motion.rotation, amount * force_change, others)
-        at_places = form.at(there.places)
-        return at_places.nodes(at_places.edges(there.inner)), at_places.field.s
+        there = form.retract(point, here.bases, amount * motion.rotation, amount * force_change, others)
+        at_arclengths = form.at(there.arclengths)
+        return at_arclengths.nodes(at_arclengths.edges(there.inner)), at_arclengths.field.s
 
     _, (displacement, along) = jax.jvp(moved, (jnp.zeros_like(stiffness),), (jnp.ones_like(stiffness),))
     if along is not None:

@@ -18,7 +18,7 @@ from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, between, has_friction, has_node_places, has_potential, nondimensional
+from rodjax.model.scene import Scene, between, has_friction, has_node_positions, has_potential, nondimensional
 from rodjax.notes import note
 from rodjax.paths.harness_path import harness_path
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
@@ -314,7 +314,7 @@ def _step(
 
     zero, count, no = jnp.zeros_like(last.total_twist), jnp.zeros((), int), jnp.array(False)
     point = last.state.point(zero)
-    if point.nodal is None and has_node_places(scene):
+    if point.nodal is None and has_node_positions(scene):
         nodes = last.state.shape.nodes
         point = dataclasses.replace(point, nodal=Nodal(nodes, jnp.zeros((0, len(nodes)), nodes.dtype), nodes[:0, 0]))
     nowhere = jax.tree.map(jnp.zeros_like, point)

@@ -171,12 +171,12 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         note += _somewhere(equilibrium) if np.isfinite(radius) and not isinstance(rod.radius, Along) else ""
         facts.append(Fact("smallest inside bend radius", *_finite(radius, "m", place), note=note))
     else:
-        places, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
+        arclengths, curvature = (np.asarray(x) for x in curvature_along(equilibrium))
         most = int(np.argmax(curvature))
         is_straight = curvature[most] * length <= STRAIGHT
         radius = np.inf if is_straight else 1 / float(curvature[most])
         note = "straight" if is_straight else f"of the centerline{_somewhere(equilibrium)}"
-        facts.append(Fact("smallest bend radius", *_finite(radius, "m", places[most]), note=note))
+        facts.append(Fact("smallest bend radius", *_finite(radius, "m", arclengths[most]), note=note))
     clearances = {name: at for name, at in measured.items() if _limit_of(name) == "clearance"}
     if clearances:
         nearest = min(clearances, key=lambda name: clearances[name][0])

@@ -87,8 +87,8 @@ def _panels(
     limits, color = cable.limits, CABLE_COLORS[number % len(CABLE_COLORS)]
     length, held = float(cable.equilibrium.s[-1]), [reaction.s for reaction in cable.reactions[1:-1]]
     # And on both sides of clips, where force, moment and curvature jump.
-    places = [np.linspace(0.0, length, POINTS), *([(1 - JUST_BEFORE) * s, s] for s in held)]
-    samples = samples_at(cable.equilibrium, np.unique(np.concatenate(places)))
+    arclengths = [np.linspace(0.0, length, POINTS), *([(1 - JUST_BEFORE) * s, s] for s in held)]
+    samples = samples_at(cable.equilibrium, np.unique(np.concatenate(arclengths)))
     s, ones = samples.s, np.ones_like(samples.s)
 
     def limit(name: str, unit: float = 1.0, of: Callable[[float], np.ndarray] = lambda x: x * ones) -> list[np.ndarray]:
@@ -138,8 +138,8 @@ def _along(
 
 
 def _clearances(equilibrium, obstacles: tuple[Obstacle, ...], s: Float[np.ndarray, "k"]) -> Float[Array, "m k"]:
-    places = jnp.asarray(s)
-    return _along(obstacles, equilibrium.position_at(places), radius_at(equilibrium.scene.rod, places))
+    arclengths = jnp.asarray(s)
+    return _along(obstacles, equilibrium.position_at(arclengths), radius_at(equilibrium.scene.rod, arclengths))
 
 
 def _draw(axes: Axes, s: Float[np.ndarray, "k"], panel: Panel) -> None:

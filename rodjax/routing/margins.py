@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rodjax.analysis.clearance import POINTS, places, radius_at
+from rodjax.analysis.clearance import POINTS, arclengths_between, radius_at
 from rodjax.analysis.curvature import at_nodes, curvature_within, has_sides, within_elements
 from rodjax.checks import instance, sequence
 from rodjax.discretization.hermite import Curve
@@ -259,7 +259,7 @@ def _bend_radius(equilibrium: Equilibrium, multiple: Float[Array, ""], everywher
 def _clearances(
     equilibrium: Equilibrium, limit: Float[Array, "..."], obstacles: tuple[Obstacle, ...], everywhere: bool
 ) -> list[Measured]:
-    edges = places(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
+    edges = arclengths_between(equilibrium, np.arange(POINTS + 1) / (POINTS + 1))
     limits = jnp.broadcast_to(limit.astype(edges.dtype), (len(obstacles),))
     # The search needs no derivatives: where the distance is least along the rod, its derivative by the place is 0.
     fixed, fixed_edges, bodies = jax.lax.stop_gradient((equilibrium, edges, obstacles))

@@ -27,7 +27,7 @@ from rodjax.plot import (
     tube_faces,
 )
 from rodjax.routing.view_data import (
-    Sight,
+    CableView,
     azimuth,
     clip_faces,
     coloring,
@@ -45,7 +45,9 @@ ASIDE = 0.04
 WIDTH = 100
 
 
-def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Sequence[str], title: str) -> Figure:
+def plot_route(
+    cable_views: Sequence[CableView], obstacles: Sequence[Obstacle], names: Sequence[str], title: str
+) -> Figure:
     """Cables as tubes colored by the margin of their bend radius, between translucent obstacles.
 
     Clips are collars, forces that supports apply to the cables arrows with their sizes. Each obstacle has its name in
@@ -54,27 +56,29 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     axes.computed_zorder = False  # arrows and words in front of all faces
-    colors = coloring(sights)
+    colors = coloring(cable_views)
     faces, shades = [], []
-    for sight in sights:
-        tube, shade = tube_faces(sight.equilibrium, sight.radius, lambda s, sight=sight: colors.of(sight, s), ())
+    for cable_view in cable_views:
+        tube, shade = tube_faces(
+            cable_view.equilibrium, cable_view.radius, lambda s, cable_view=cable_view: colors.of(cable_view, s), ()
+        )
         faces.append(tube)
         shades.append(np.pad(shade, ((0, 0), (0, 1)), constant_values=1.0))
-        for collar in clip_faces(sight):
+        for collar in clip_faces(cable_view):
             faces.append(collar)
             shades.append(np.tile(to_rgba(CLIP_COLOR), (len(collar), 1)))
     legend = []
-    for k, (surface, name) in enumerate(zip(seen_surfaces(sights, obstacles), names, strict=True)):
+    for k, (surface, name) in enumerate(zip(seen_surfaces(cable_views, obstacles), names, strict=True)):
         color = to_rgba(PALETTE[k % len(PALETTE)], OPACITY)
         faces.append(surface)
         shades.append(np.tile(color, (len(surface), 1)))
         label = line(name) if len(surface) else f"{line(name)} (not in the picture)"
         legend.append(Patch(facecolor=to_rgba(color, 0.8), label=label))
     # All faces together: each artist by itself would be sorted in depth as a whole.
-    view = azimuth(sights, obstacles)
+    view = azimuth(cable_views, obstacles)
     draw_faces(axes, np.concatenate(faces), np.concatenate(shades), view)
-    size = extent([sight.equilibrium for sight in sights])
-    acting = [reaction for sight in sights for reaction in sight.forces]
+    size = extent([cable_view.equilibrium for cable_view in cable_views])
+    acting = [reaction for cable_view in cable_views for reaction in cable_view.forces]
     tips = draw_arrows(
         axes,
         np.reshape([reaction.position for reaction in acting], (-1, 3)),
@@ -86,12 +90,12 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
         azimuth=view,
     )
     right, up, _ = seen_axes(view)
-    for sight in sights:
-        _name(axes, sight, size * (right - up), len(sights) > 1)
+    for cable_view in cable_views:
+        _name(axes, cable_view, size * (right - up), len(cable_views) > 1)
     points = np.concatenate([np.concatenate(faces).reshape(-1, 3), tips])
     width, depth, height = np.ptp(points, axis=0)
     set_view(axes, points, zoom=ZOOM - LESS * min(height / max(width, depth), 1.0), azimuth=view)
-    axes.text2D(0.0, 0.0, thickness_note(sights), transform=axes.transAxes, fontsize=8, color="0.4")
+    axes.text2D(0.0, 0.0, thickness_note(cable_views), transform=axes.transAxes, fontsize=8, color="0.4")
     bar = figure.colorbar(
         ScalarMappable(colors.norm, colors.color_map),
         ax=axes,
@@ -108,11 +112,11 @@ def plot_route(sights: Sequence[Sight], obstacles: Sequence[Obstacle], names: Se
     return figure
 
 
-def _name(axes: Axes3D, sight: Sight, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
+def _name(axes: Axes3D, cable_view: CableView, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
     """Words beside the clips, and the name of one cable of several beside its middle."""
-    places = [(reaction.name, reaction.position) for reaction in sight.reactions[1:-1]]
+    labels = [(reaction.name, reaction.position) for reaction in cable_view.reactions[1:-1]]
     if has_name:
-        places.append((line(sight.name), sight.centerline[len(sight.centerline) // 2]))
-    for name, place in places:
-        x, y, z = place + ASIDE * aside
+        labels.append((line(cable_view.name), cable_view.centerline[len(cable_view.centerline) // 2]))
+    for name, position in labels:
+        x, y, z = position + ASIDE * aside
         axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])

@@ -125,10 +125,10 @@ class Report:
 
     @cached_property
     def _sights(self) -> list[Any]:
-        from rodjax.routing.view_data import extent, sight
+        from rodjax.routing.view_data import cable_view, extent
 
         size = extent([cable.equilibrium for cable in self.cables])
-        return [sight(cable.name, cable.equilibrium, cable.limits, size) for cable in self.cables]
+        return [cable_view(cable.name, cable.equilibrium, cable.limits, size) for cable in self.cables]
 
 
 @one_answer

@@ -194,8 +194,8 @@ def by_few(scattering: Scattering, slopes: Slopes, workers: Workers) -> tuple[Mo
     p, m = len(scattering.root), len(slopes.here.values)
     steepest = np.nan_to_num(slopes.by.values.T, posinf=0.0, neginf=0.0)
     sizes = np.linalg.norm(steepest, axis=1, keepdims=True)
-    ways = np.concatenate([np.eye(p), steepest / np.where(sizes > 0, sizes, 1.0)])
-    signed = np.concatenate([STEP * ways, -STEP * ways])
+    directions = np.concatenate([np.eye(p), steepest / np.where(sizes > 0, sizes, 1.0)])
+    signed = np.concatenate([STEP * directions, -STEP * directions])
     chunks = {number: part for number, *part in scattering.solved(signed, workers)}
     founds, at_rest = zip(*(chunks[number] for number in sorted(chunks)), strict=True)
     converged = np.concatenate(at_rest)

@@ -326,8 +326,8 @@ def _scattering(
                     f"tolerances[{k}]: sigma must be a number or of shape {(len(own), len(own))} for {key}, "
                     f"got {tolerance.sigma.shape}"
                 )
-            squares, ways = np.linalg.eigh(tolerance.sigma)
-            roots.append(ways * np.sqrt(np.maximum(squares, 0.0)))
+            squares, directions = np.linalg.eigh(tolerance.sigma)
+            roots.append(directions * np.sqrt(np.maximum(squares, 0.0)))
         keys += own
         owners += [k] * len(own)
     return tuple(keys), np.array(owners), np.asarray(linalg.block_diag(*roots))

@@ -32,7 +32,7 @@ LEAST_RADIUS = 0.005
 POINTS = 240
 
 
-class Sight(NamedTuple):
+class CableView(NamedTuple):
     """One cable, and along it at k arclengths `s` [m]:
 
     `centerline` (k, 3) [m]; `radii` [m] as they are drawn; `curvature` [1/m]; `bend` [m], the bend radius, the inside
@@ -70,20 +70,20 @@ class Coloring(NamedTuple):
     color_map: Colormap | str
     is_margin: bool
 
-    def of(self, sight: Sight, s: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 4"]:
-        values = sight.margin if self.is_margin else sight.curvature
+    def of(self, cable_view: CableView, s: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 4"]:
+        values = cable_view.margin if self.is_margin else cable_view.curvature
         if values is None:
             return np.tile(WITHOUT_LIMIT, (len(s), 1))
-        return np.asarray(ScalarMappable(self.norm, self.color_map).to_rgba(np.interp(s, sight.s, values)))
+        return np.asarray(ScalarMappable(self.norm, self.color_map).to_rgba(np.interp(s, cable_view.s, values)))
 
 
-def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: float) -> Sight:
+def cable_view(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: float) -> CableView:
     """One cable in a scene of this largest extent [m]."""
     true = equilibrium.scene.rod.radius
     s = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS + 1)
     along, nodes = np.asarray(s), np.asarray(equilibrium.s)
-    places, curvatures = (np.asarray(x) for x in curvature_along(equilibrium))
-    curvature = np.asarray(np.interp(along, places, curvatures))
+    arclengths, curvatures = (np.asarray(x) for x in curvature_along(equilibrium))
+    curvature = np.asarray(np.interp(along, arclengths, curvatures))
     radii = np.zeros(len(s)) if true is None else radius_along(true, s)
     with np.errstate(divide="ignore"):
         bend = 1 / curvature - radii
@@ -93,7 +93,7 @@ def sight(name: str, equilibrium: Equilibrium, limits: Limits | None, extent: fl
     thickest = 0.0 if true is None else largest_radius(true)
     least = LEAST_RADIUS * extent
     drawn = np.full(len(s), least) if thickest == 0 else radii * max(1.0, least / thickest)
-    return Sight(
+    return CableView(
         name,
         equilibrium,
         along,
@@ -113,35 +113,37 @@ def extent(equilibria: Sequence[Equilibrium]) -> float:
     return float(np.max(np.ptp(nodes, axis=0)))
 
 
-def coloring(sights: Sequence[Sight]) -> Coloring:
-    if any(sight.margin is not None for sight in sights):
+def coloring(cable_views: Sequence[CableView]) -> Coloring:
+    if any(cable_view.margin is not None for cable_view in cable_views):
         norm = Normalize(LEAST_MARGIN, MOST_MARGIN)
         return Coloring("margin of the inside bend radius", norm, MARGIN_COLORS, True)
-    largest = max(float(np.max(sight.curvature)) for sight in sights)
+    largest = max(float(np.max(cable_view.curvature)) for cable_view in cable_views)
     return Coloring(LABELS["curvature"], Normalize(0.0, largest if largest > 1e-9 else 1.0), COLOR_MAP, False)
 
 
-def thickness_note(sights: Sequence[Sight]) -> str:
+def thickness_note(cable_views: Sequence[CableView]) -> str:
     """What to say of cables that are not as thick as they are drawn."""
-    radii = [sight.equilibrium.scene.rod.radius for sight in sights]
+    radii = [cable_view.equilibrium.scene.rod.radius for cable_view in cable_views]
     if any(radius is None for radius in radii):
         return "thickness not to scale"
-    times = max(sight.radius / largest_radius(radius) for sight, radius in zip(sights, radii, strict=True))
+    times = max(
+        cable_view.radius / largest_radius(radius) for cable_view, radius in zip(cable_views, radii, strict=True)
+    )
     return f"drawn up to {times:.2g} times as thick as it is" if times > 1.01 else ""
 
 
-def clip_faces(sight: Sight) -> list[Faces]:
+def clip_faces(cable_view: CableView) -> list[Faces]:
     """A collar around the cable for each clip."""
-    return [collar(clip.position, clip.axes[0], sight.radius) for clip in sight.reactions[1:-1]]
+    return [collar(clip.position, clip.axes[0], cable_view.radius) for clip in cable_view.reactions[1:-1]]
 
 
-def azimuth(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> float:
+def azimuth(cable_views: Sequence[CableView], obstacles: Sequence[Obstacle]) -> float:
     """From where to look [degrees]: as all pictures do, or where that is from behind a wall, by right angles aside.
 
     Of places before all walls, the one from which the cables are seen widest.
     """
     walls = [np.asarray(part.normal) for one in obstacles for part in parts_of(one) if isinstance(part, Plane)]
-    points = np.concatenate([sight.centerline for sight in sights])
+    points = np.concatenate([cable_view.centerline for cable_view in cable_views])
 
     def hidden(place: float) -> float:
         # Rounding shall not choose.
@@ -149,13 +151,13 @@ def azimuth(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> float:
 
     if hidden(AZIMUTH) == 0:
         return AZIMUTH
-    places = [AZIMUTH + turn for turn in (0, 180, 90, -90)]
-    return min(places, key=lambda place: (hidden(place), -round(float(np.std(points @ seen_axes(place)[0])), 6)))
+    azimuths = [AZIMUTH + turn for turn in (0, 180, 90, -90)]
+    return min(azimuths, key=lambda place: (hidden(place), -round(float(np.std(points @ seen_axes(place)[0])), 6)))
 
 
-def seen_surfaces(sights: Sequence[Sight], obstacles: Sequence[Obstacle]) -> list[Faces]:
+def seen_surfaces(cable_views: Sequence[CableView], obstacles: Sequence[Obstacle]) -> list[Faces]:
     """Those of obstacles near the cables."""
-    points = np.concatenate([sight.centerline for sight in sights])
-    thickest = max(sight.radius for sight in sights)
+    points = np.concatenate([cable_view.centerline for cable_view in cable_views])
+    thickest = max(cable_view.radius for cable_view in cable_views)
     # The room that the tubes take, so that a patch of a floor lies below all of it.
     return surfaces(obstacles, np.concatenate([points - thickest, points + thickest])) if obstacles else []

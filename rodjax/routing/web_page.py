@@ -19,8 +19,8 @@ from rodjax.routing import report_text
 from rodjax.routing.cable_report import Cable, Gradients
 from rodjax.routing.records import plain
 from rodjax.routing.view_data import (
+    CableView,
     Coloring,
-    Sight,
     azimuth,
     clip_faces,
     coloring,
@@ -36,17 +36,17 @@ COLORS, DIGITS = 61, 1e-5
 TICKS = 4
 
 
-def web_page(report: Any, sights: Sequence[Sight]) -> str:
+def web_page(report: Any, cable_views: Sequence[CableView]) -> str:
     """The page. Names in it are escaped, the scene is JSON in it."""
-    colors = coloring(sights)
-    scene = _scene(report, sights, colors)
+    colors = coloring(cable_views)
+    scene = _scene(report, cable_views, colors)
     # In a script nothing but the end of it is looked for.
     data = json.dumps(scene, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     parts = {
         "TITLE": escape(report.title),
         "LABEL": escape(colors.label),
         "TICKS": _ticks(colors),
-        "NOTE": escape(thickness_note(sights)),
+        "NOTE": escape(thickness_note(cable_views)),
         "PANEL": _panel(report),
         "DATA": data,
     }
@@ -58,31 +58,33 @@ def web_page(report: Any, sights: Sequence[Sight]) -> str:
 # --- the scene -------------------------------------------------------------------------------------------------------
 
 
-def _scene(report: Any, sights: Sequence[Sight], colors: Coloring) -> dict[str, Any]:
-    size = extent([sight.equilibrium for sight in sights])
+def _scene(report: Any, cable_views: Sequence[CableView], colors: Coloring) -> dict[str, Any]:
+    size = extent([cable_view.equilibrium for cable_view in cable_views])
     decimals = max(0, -math.floor(math.log10(DIGITS * size)))
     obstacles = [
         _surface(faces, PALETTE[k % len(PALETTE)], OPACITY, decimals)
-        for k, faces in enumerate(seen_surfaces(sights, report.obstacles))
+        for k, faces in enumerate(seen_surfaces(cable_views, report.obstacles))
     ]
-    clips = [_surface(faces, CLIP_COLOR, 1.0, decimals) for sight in sights for faces in clip_faces(sight)]
-    forces = _forces(sights, ARROW_LENGTH * size, decimals)
-    corners = [sight.centerline for sight in sights]
+    clips = [
+        _surface(faces, CLIP_COLOR, 1.0, decimals) for cable_view in cable_views for faces in clip_faces(cable_view)
+    ]
+    forces = _forces(cable_views, ARROW_LENGTH * size, decimals)
+    corners = [cable_view.centerline for cable_view in cable_views]
     corners += [np.reshape(surface["vertices"], (-1, 3)) for surface in obstacles]
     corners += [np.reshape([force["tip"] for force in forces], (-1, 3))]
     everything = np.concatenate(corners)
     low, high = everything.min(axis=0), everything.max(axis=0)
     return {
-        "azimuth": azimuth(sights, report.obstacles),
+        "azimuth": azimuth(cable_views, report.obstacles),
         "elevation": ELEVATION,
         "center": _rounded((low + high) / 2, decimals),
         "size": float(np.linalg.norm(high - low)),
         "colors": [to_hex(color) for color in _map(colors)(np.linspace(0.0, 1.0, COLORS))],
-        "cables": [_cable(sight, colors, decimals) for sight in sights],
+        "cables": [_cable(cable_view, colors, decimals) for cable_view in cable_views],
         "obstacles": obstacles,
         "clips": clips,
         "forces": forces,
-        "labels": _labels(sights, decimals),
+        "labels": _labels(cable_views, decimals),
     }
 
 
@@ -99,17 +101,17 @@ def _significant(values: np.ndarray) -> list[float | None]:
     return [None if x is None else float(f"{x:.5g}") for x in plain(values)]
 
 
-def _cable(sight: Sight, colors: Coloring, decimals: int) -> dict[str, Any]:
+def _cable(cable_view: CableView, colors: Coloring, decimals: int) -> dict[str, Any]:
     return {
-        "name": sight.name,
-        "points": _rounded(sight.centerline, decimals),
-        "radii": _rounded(sight.radii, decimals + 1),
-        "colors": [to_hex(color) for color in colors.of(sight, (sight.s[:-1] + sight.s[1:]) / 2)],
-        "s": _significant(sight.s),
-        "bend": _significant(sight.bend),
-        "inside": sight.equilibrium.scene.rod.radius is not None,
-        "margins": None if sight.margin is None else _significant(sight.margin),
-        "tension": _significant(sight.tension),
+        "name": cable_view.name,
+        "points": _rounded(cable_view.centerline, decimals),
+        "radii": _rounded(cable_view.radii, decimals + 1),
+        "colors": [to_hex(color) for color in colors.of(cable_view, (cable_view.s[:-1] + cable_view.s[1:]) / 2)],
+        "s": _significant(cable_view.s),
+        "bend": _significant(cable_view.bend),
+        "inside": cable_view.equilibrium.scene.rod.radius is not None,
+        "margins": None if cable_view.margin is None else _significant(cable_view.margin),
+        "tension": _significant(cable_view.tension),
     }
 
 
@@ -124,8 +126,8 @@ def _surface(faces: Faces, color: str, opacity: float, decimals: int) -> dict[st
     }
 
 
-def _forces(sights: Sequence[Sight], length: float, decimals: int) -> list[dict[str, Any]]:
-    acting = [reaction for sight in sights for reaction in sight.forces]
+def _forces(cable_views: Sequence[CableView], length: float, decimals: int) -> list[dict[str, Any]]:
+    acting = [reaction for cable_view in cable_views for reaction in cable_view.forces]
     sizes = [float(np.linalg.norm(reaction.force)) for reaction in acting]
     return [
         {
@@ -137,12 +139,12 @@ def _forces(sights: Sequence[Sight], length: float, decimals: int) -> list[dict[
     ]
 
 
-def _labels(sights: Sequence[Sight], decimals: int) -> list[dict[str, Any]]:
+def _labels(cable_views: Sequence[CableView], decimals: int) -> list[dict[str, Any]]:
     labels = []
-    for sight in sights:
-        labels += [(reaction.name, reaction.position) for reaction in sight.reactions[1:-1]]
-        if len(sights) > 1:
-            labels.append((sight.name, sight.centerline[len(sight.centerline) // 2]))
+    for cable_view in cable_views:
+        labels += [(reaction.name, reaction.position) for reaction in cable_view.reactions[1:-1]]
+        if len(cable_views) > 1:
+            labels.append((cable_view.name, cable_view.centerline[len(cable_view.centerline) // 2]))
     return [{"text": text, "at": _rounded(at, decimals)} for text, at in labels]
 
 
@@ -155,8 +157,8 @@ def _ticks(colors: Coloring) -> str:
     told = [f"{100 * x:.0f} %" if colors.is_margin else f"{x:.3g}" for x in values]
     if colors.is_margin:
         told[0], told[-1] = f"≤ {told[0]}", f"≥ {told[-1]}"
-    places = [100 * (x - low) / (high - low) for x in values]
-    return "".join(f'<span style="left:{place:.4g}%">{text}</span>' for place, text in zip(places, told, strict=True))
+    offsets = [100 * (x - low) / (high - low) for x in values]
+    return "".join(f'<span style="left:{place:.4g}%">{text}</span>' for place, text in zip(offsets, told, strict=True))
 
 
 def _panel(report: Any) -> str:

@@ -6,12 +6,12 @@ ends are eliminated with it, and what is left is a small dense system for the mo
 
     S q = -h - sum B^T K^-1 (g, c),    S = D - sum B^T K^-1 B,
 
-with the system K, gradient g and closure c of a rod, their derivatives B by the motions of its ends, and first and
-second derivatives h, D of L by these. Negative eigenvalues of the whole are those of the rods and those of S
+with the system K, gradient g and constraint residual c of a rod, their derivatives B by the motions of its ends, and
+first and second derivatives h, D of L by these. Negative eigenvalues of the whole are those of the rods and those of S
 (Haynsworth 1968). Rods of one structure and mesh are stacked: one after another along an axis of every array.
 
-Steps are judged as those of `newton`: by L with the new forces and the square of the closures. Motions (u, r) of a
-body: displacement in parts of a mean length, and rotation vector about global axes.
+Steps are judged as those of `newton`: by L with the new forces and the square of the constraint residuals. Motions (u,
+r) of a body: displacement in parts of a mean length, and rotation vector about global axes.
 """
 
 import dataclasses
@@ -41,6 +41,7 @@ from rodjax.solving.coupling import (
     end_contacts,
     linearized_with_ends,
 )
+from rodjax.solving.harness_contact import ContactModel, ContactStep, RodsInContact, contact_step
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -58,7 +59,6 @@ from rodjax.solving.newton import (
     Newton,
 )
 from rodjax.solving.status import Status
-from rodjax.solving.touching import Touched, TouchingModel, TouchingRods, touched
 from rodjax.units import Units
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
@@ -71,7 +71,7 @@ class Poses(NamedTuple):
     positions: Float[Array, "j 3"]
     frames: Float[Array, "j 3 3"]
 
-    def moved(self, motions: Float[Array, "j 6"], length: Float[Array, ""]) -> "Poses":
+    def retract(self, motions: Float[Array, "j 6"], length: Float[Array, ""]) -> "Poses":
         frames = rotated(self.frames, motions[:, 3:])
         # One step towards orthonormal columns: rounding would grow with every step.
         frames = frames @ (1.5 * jnp.eye(3, dtype=frames.dtype)[None] - 0.5 * jnp.swapaxes(frames, 1, 2) @ frames)
@@ -115,15 +115,15 @@ class RodStep(NamedTuple):
         """L after a part of the rotations, under the new force, with its ends moved and with contacts as of the model;
         what it lacks of its spans; the point there.
         """
-        form = rod.moved(motions)
+        form = rod.form_at(motions)
         others = jax.tree.map(lambda change: part * change, self.others)
-        there = form.holding(form.moved(self.point, self.bases, part * self.rotation, self.force_change, others))
-        value, closure = form.lagrangian(there)
+        there = form.holding(form.retract(self.point, self.bases, part * self.rotation, self.force_change, others))
+        value, constraint_residual = form.lagrangian(there)
         scene = form.scene
         if self.at_ends is not None:
             assert isinstance(form, NodalForm)
             value += form.contact_energy(there, self.point) + end_contact_energy(rod, form, self.at_ends)
-        return value + dead_load_energy(total_force(scene), held_position(scene)), closure, there
+        return value + dead_load_energy(total_force(scene), held_position(scene)), constraint_residual, there
 
 
 class Eliminated(NamedTuple):
@@ -142,8 +142,8 @@ class Eliminated(NamedTuple):
 def eliminated(here: Linearization, coupling: Coupling, shift: Float[Array, ""], push: Float[Array, "b m"]):
     h = 1 / here.gradient.shape[1]
     factors = factor(here.system.shifted(h * shift), is_regularized=True)
-    rotation, multipliers = factors.solve(push - here.gradient, -here.closure)
-    by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_closure)
+    rotation, multipliers = factors.solve(push - here.gradient, -here.constraint_residual)
+    by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_constraints)
     return Eliminated(factors.is_minimum, factors.negative, rotation, multipliers, *by_motions)
 
 
@@ -199,7 +199,7 @@ class Assembly(eqx.Module):
         return group.units.energy / self.energy
 
     def body_energies(self, poses: Poses, motions: Float[Array, "j 6"]) -> Float[Array, "j"]:
-        there = poses.moved(motions, self.length)
+        there = poses.retract(motions, self.length)
         return self.bodies.energies(there.positions, there.frames, motions[:, 3:]) / self.energy
 
     def body_derivatives(self, poses: Poses) -> tuple[Float[Array, "j 6"], Float[Array, "j 6 6"]]:
@@ -318,7 +318,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     if all(here.at_ends is None for here in all_here):
         bodies, contacts = _condensed(assembly, all_here, rods, state, balance, find), None
     else:
-        rods, bodies, contacts = _touching(assembly, all_here, rods, state, balance, find)
+        rods, bodies, contacts = _with_contacts(assembly, all_here, rods, state, balance, find)
     steps = _steps(assembly, all_here, rods, bodies, contacts, balance, solver)
     is_sought = (rods.is_definite & (bodies.below == 0)) if find == "minimum" else jnp.array(True)
     is_pushed = rods.is_pushed | bodies.is_pushed
@@ -326,7 +326,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     status = _status(state, balance, trial, steps, is_sought, solver)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
-    there = state.poses.moved(taken * steps.bodies, assembly.length), trial.points
+    there = state.poses.retract(taken * steps.bodies, assembly.length), trial.points
     poses, points = jax.tree.map(
         lambda new, old: jnp.where(goes, new, old), there, (state.poses, tuple(here.points for here in all_here))
     )
@@ -352,7 +352,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
 def _linearized(
     rod: RodInBodies, point: Any, pressures: Float[Array, "o 2"] | None
 ) -> tuple[Any, Linearization, Coupling, EndContacts | None, Array, Array]:
-    form = rod.moved()
+    form = rod.form_at()
     point = form.holding(point)
     here, coupling = linearized_with_ends(rod, form, point)
     point, at_ends = form.accepted(point, here), None
@@ -364,11 +364,11 @@ def _linearized(
     return point, here, coupling, at_ends, form.rounding_floor(point), aside
 
 
-def _split(all_here: list[_Here], of_all: Any, of_touching: Any, changed: Any) -> tuple[Any, ...]:
+def _split(all_here: list[_Here], of_all: Any, of_contacts: Any, changed: Any) -> tuple[Any, ...]:
     """What all groups have, changed by what those with contacts have."""
-    touching = iter(of_touching)
+    in_contact = iter(of_contacts)
     return tuple(
-        one if here.at_ends is None else changed(one, next(touching))
+        one if here.at_ends is None else changed(one, next(in_contact))
         for here, one in zip(all_here, of_all, strict=True)
     )
 
@@ -390,8 +390,8 @@ def _balance(assembly: Assembly, all_here: list[_Here], state: State, solver: Ne
             scale = scale.at[group.body[:, end]].max(shares)
         residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
         floor = jnp.maximum(floor, jnp.max(here.floor))
-        closed = jax.vmap(lambda form, closure: form.is_closed(closure, solver.tolerance))
-        is_closed &= jnp.all(closed(group.form, here.linearization.closure))
+        closed = jax.vmap(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
+        is_closed &= jnp.all(closed(group.form, here.linearization.constraint_residual))
     motions, gradient, scale = assembly.bodies.motions, gradient[:count], scale[:count]
     out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
     residual = jnp.maximum(residual, jnp.max(jnp.abs(out_of_balance), initial=0.0))
@@ -511,9 +511,9 @@ def _condensed_system(
             right = right.at[group.body].add(of_ends)
             continue
         condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
-        condensed -= jnp.einsum("kci,kcj->kij", couple.of_closure, found.multipliers_by_motions)
+        condensed -= jnp.einsum("kci,kcj->kij", couple.of_constraints, found.multipliers_by_motions)
         loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
-        loads += jnp.einsum("kci,kc->ki", couple.of_closure, found.multipliers)
+        loads += jnp.einsum("kci,kc->ki", couple.of_constraints, found.multipliers)
         condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
         loads = (shares[:, None] * loads).reshape(-1, 2, 6)
         for a in range(2):
@@ -530,9 +530,9 @@ def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
     return np.cos(1.0 + 2.0 * np.arange(count)).astype(dtype)
 
 
-def _touching(
+def _with_contacts(
     assembly: Assembly, all_here: list[_Here], rods: _Rods, state: State, balance: _Balance, find: Find
-) -> tuple[_Rods, _Bodies, Touched]:
+) -> tuple[_Rods, _Bodies, ContactStep]:
     """The same with the contacts of rods and bodies, which are sought with both."""
     stiffness, force = _condensed_system(assembly, all_here, rods, balance)
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
@@ -545,15 +545,15 @@ def _touching(
         pushing = _pushing(last, state, balance) if find == "minimum" else jnp.zeros_like(last)
         is_pushed |= jnp.any(pushing > 0)
         pushes = (PUSH / here.aside.shape[2] * pushing)[:, None, None] * here.aside
-        forms = jax.vmap(lambda rod: rod.moved())(here.rods)
+        forms = jax.vmap(lambda rod: rod.form_at())(here.rods)
         parts = forms, here.points, here.linearization, here.coupling, here.at_ends, pushes
-        groups.append(TouchingRods.of(*parts, group.body, assembly.shares(group)))
+        groups.append(RodsInContact.of(*parts, group.body, assembly.shares(group)))
         shifts.append(shift)
     push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
     pattern = jnp.asarray(_generic(len(force), dtype))
     motions = assembly.bodies.motions
-    model = TouchingModel(tuple(groups), motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum")
-    found = touched(model, tuple(shifts), state.damping)
+    model = ContactModel(tuple(groups), motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum")
+    found = contact_step(model, tuple(shifts), state.damping)
     is_definite = rods.is_definite & found.is_found
     for shift in found.shifts:
         is_definite &= jnp.all(shift <= least)
@@ -577,23 +577,23 @@ def _steps(
     all_here: list[_Here],
     rods: _Rods,
     bodies: _Bodies,
-    contacts: Touched | None,
+    contacts: ContactStep | None,
     balance: _Balance,
     solver: Newton,
 ) -> _Steps:
     largest = jnp.max(jnp.sum(bodies.motions[:, 3:] ** 2, axis=1), initial=0.0)
     padded = jnp.pad(bodies.motions, ((0, 1), (0, 0)))
     steps, ends = [], []
-    touching = iter(() if contacts is None else contacts.motions)
+    in_contact = iter(() if contacts is None else contacts.motions)
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
         of_ends = padded[group.body]
         if found is None:
-            rotation, multipliers = next(touching)
+            rotation, multipliers = next(in_contact)
         else:
             flat = of_ends.reshape(-1, 12)
             rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
             multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
-        change = jax.vmap(lambda form, y: form.layout.forces(form.closure(y)))(group.form, multipliers)
+        change = jax.vmap(lambda form, y: form.layout.forces(form.force_components(y)))(group.form, multipliers)
         others = jax.vmap(lambda form, y: form.others(y))(group.form, multipliers)
         steps.append(RodStep(here.points, here.linearization.bases, rotation, change, others, here.at_ends))
         ends.append(of_ends)
@@ -620,11 +620,11 @@ def _searched(
         lacking, points = jnp.zeros_like(energy), []
         for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
             shares = assembly.shares(group)
-            value, closure, point = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part))(
-                step, here.rods, of_ends
-            )
+            value, constraint_residual, point = jax.vmap(
+                lambda step, rod, of_ends: step.value(rod, part * of_ends, part)
+            )(step, here.rods, of_ends)
             energy += jnp.sum(shares * value)
-            lacking += jnp.sum(shares[:, None] * closure**2) / 2
+            lacking += jnp.sum(shares[:, None] * constraint_residual**2) / 2
             points.append(point)
         return energy + weight * lacking, tuple(points)
 
@@ -671,16 +671,18 @@ def _slopes(
 
         def of_rod(form: Form, here: Linearization, coupling: Coupling, step: RodStep, motions: Array):
             nothing = jnp.zeros_like(here.gradient)
-            change = jnp.zeros_like(here.closure)
+            change = jnp.zeros_like(here.constraint_residual)
             count = len(change)
             change = change.at[count - form.layout.size :].set(form.layout.components(step.force_change))
             by_force, lost = here.system.times(nothing, change)
             _, closing = here.system.times(step.rotation, jnp.zeros_like(change))
-            closing += coupling.of_closure @ motions
+            closing += coupling.of_constraints @ motions
             along = jnp.sum((here.gradient + by_force) * step.rotation) + jnp.sum(
-                change * (coupling.of_closure @ motions)
+                change * (coupling.of_constraints @ motions)
             )
-            return along, jnp.sum(form.closure(here.closure + lost) * form.closure(closing))
+            return along, jnp.sum(
+                form.force_components(here.constraint_residual + lost) * form.force_components(closing)
+            )
 
         along, closing = jax.vmap(of_rod)(group.form, here.linearization, here.coupling, step, of_ends.reshape(-1, 12))
         slope += jnp.sum(shares * along)

@@ -41,8 +41,8 @@ class RodInBodies(NamedTuple):
     length: Float[Array, ""]
     touches: Bool[Array, "2"]
 
-    def moved(self, motions: Float[Array, "2 6"] | None = None) -> Form:
-        """The form with its ends at the poses of the bodies, moved."""
+    def form_at(self, motions: Float[Array, "2 6"] | None = None) -> Form:
+        """The form with its ends at the poses of the bodies after these motions."""
         scene = self.form.scene
         ends = []
         for end, support in enumerate((scene.start, scene.end)):
@@ -73,14 +73,14 @@ class RodInBodies(NamedTuple):
 
 
 class Coupling(NamedTuple):
-    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and closure; those of the
-    gaps of contacts apart, `None` without obstacles.
+    """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and constraint residual;
+    those of the gaps of contacts apart, `None` without obstacles.
     """
 
     first: Float[Array, "12"]
     second: Float[Array, "12 12"]
     of_gradient: Float[Array, "b m 12"]
-    of_closure: Float[Array, "k 12"]
+    of_constraints: Float[Array, "k 12"]
     of_gaps: Float[Array, "r n+1 12"] | None
 
 
@@ -120,8 +120,8 @@ def _places(form: NodalForm) -> Float[Array, "2 3"]:
 def end_contact_energy(rod: RodInBodies, form: NodalForm, here: EndContacts) -> Float[Array, ""]:
     """As `NodalForm.contact_energy`, from where a step begins."""
     gaps, _ = end_gaps(rod, form)
-    pressures = here.pressures - (gaps + here.gaps - here.found) / form.softness
-    return form.softness / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+    pressures = here.pressures - (gaps + here.gaps - here.found) / form.contact_compliance
+    return form.contact_compliance / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
 
 
 def end_contacts(
@@ -166,9 +166,9 @@ def held(form: Form, released: Linearization) -> Linearization:
     if isinstance(system, ChainSystem):
         nodes = free[::2]
         system = system.holding(free, nodes)
-        first, contacts, balance, gaps = system.parted(released.closure)
+        first, contacts, balance, gaps = system.split(released.constraint_residual)
         parts = [part.reshape(-1) for part in (first, contacts, balance * nodes[:, None], gaps)]
-        return dataclasses.replace(released, system=system, closure=jnp.concatenate(parts))
+        return dataclasses.replace(released, system=system, constraint_residual=jnp.concatenate(parts))
     assert isinstance(system, SaddlePointSystem), "rods whose ends move do not slide"
     identity = np.eye(len(system.diagonal), dtype=free.dtype)[..., None]
     blocks = free[None, None]
@@ -201,10 +201,10 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         for number, (end, support) in enumerate(zip(ENDS, (form.scene.start, form.scene.end), strict=True))
         if isinstance(support, Clamp)
     ]
-    # By rotations of the frames, and where ends have places of their own by these: columns for each end.
+    # By rotations of the frames, and where ends have positions of their own by these: columns for each end.
     width = 6 if isinstance(system, ChainSystem) else 3
     columns = jnp.zeros((b, m, 2, width), dtype)
-    others = jnp.zeros((len(released.closure), 2, width), dtype)
+    others = jnp.zeros((len(released.constraint_residual), 2, width), dtype)
     for number, end, turn in ends:
         columns = columns.at[:, end, number, -3:].set(turn.rotation)
         if isinstance(system, ChainSystem):
@@ -222,7 +222,7 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
     first = jnp.zeros((2, 6), dtype)
     second = jnp.zeros((2, 6, 2, 6), dtype).at[:, before:, :, before:].set(bent)
     of_gradient = jnp.pad(turned.reshape(b, m, 2, width), ((0, 0), (0, 0), (0, 0), (before, 0)))
-    of_closure = jnp.pad(lacking.reshape(-1, 2, width), ((0, 0), (0, 0), (before, 0)))
+    of_constraints = jnp.pad(lacking.reshape(-1, 2, width), ((0, 0), (0, 0), (before, 0)))
     for number, end, turn in ends:
         arm, carried = rod.arm(number), rod.carried(number)
         pull = (1.0 if end else -1.0) * form.end_forces(point)[end]
@@ -231,11 +231,15 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         second = second.at[number, 3:, number, 3:].add(turn.second + lifted(pull, arm))
         if not isinstance(system, ChainSystem):
             spans = _spans_by_position(form, end, dtype)
-            of_closure = of_closure.at[len(of_closure) - len(spans) :, number].add(spans @ carried)
+            of_constraints = of_constraints.at[len(of_constraints) - len(spans) :, number].add(spans @ carried)
         if turn.torque is not None:
-            of_closure = of_closure.at[0, number, 3:].add(turn.torque)
+            of_constraints = of_constraints.at[0, number, 3:].add(turn.torque)
     return Coupling(
-        first.reshape(12), second.reshape(12, 12), of_gradient.reshape(b, m, 12), of_closure.reshape(-1, 12), of_gaps
+        first.reshape(12),
+        second.reshape(12, 12),
+        of_gradient.reshape(b, m, 12),
+        of_constraints.reshape(-1, 12),
+        of_gaps,
     )
 
 
@@ -255,7 +259,7 @@ def _without_gaps(
     size = system.contacts.is_closed.size
     if not size:
         return lacking, None
-    rates = jax.vmap(lambda x, y: system.contacts.rates(x, system.parted(y)[2]), (-1, -1), -1)(columns, others)
+    rates = jax.vmap(lambda x, y: system.contacts.rates(x, system.split(y)[2]), (-1, -1), -1)(columns, others)
     first = len(system.compliance)
     return lacking.at[first : first + size].set(0.0), rates
 

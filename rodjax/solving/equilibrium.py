@@ -31,20 +31,20 @@ from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.interpolation import resampled
-from rodjax.mechanics.passage import PLACES, Before
+from rodjax.mechanics.passage import SAMPLES, Before
 from rodjax.model.plane import check_planar, is_planar, plane
 from rodjax.model.scene import (
     Scene,
     dead_end_moment,
     has_contacts,
     has_friction,
-    has_node_places,
+    has_node_positions,
     has_potential,
     needs_frames,
     nondimensional,
     slid,
     slides,
-    sliding_places,
+    sliding_arclengths,
     with_plain_rod,
 )
 from rodjax.model.supports import Clamp
@@ -281,7 +281,7 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
     else:
         shape = Polyline.through(shape.points(options.segments))
     end_force = state.end_force
-    if has_node_places(coarse.scene):
+    if has_node_positions(coarse.scene):
         assert isinstance(state.shape, Curve | FramedCurve)
         assert isinstance(shape, Curve | FramedCurve)
         end_force = _of_elements(end_force, state.shape.s, shape.s)
@@ -289,7 +289,7 @@ def _finer(coarse: Equilibrium, defects: Float[Array, "n"] | None, options: Opti
     pressures = _pressures(coarse.scene, options)
     friction = _friction_on(state.friction, state.shape, shape, state.units)
     return SolverState(
-        shape, end_force, state.units, state.places, before=state.before, pressures=pressures, friction=friction
+        shape, end_force, state.units, state.arclengths, before=state.before, pressures=pressures, friction=friction
     )
 
 
@@ -319,7 +319,7 @@ def _before(scene: Scene, guess: Guess | Equilibrium | None) -> Before | None:
         return None
     last = guess.state.before if isinstance(guess, Equilibrium) else None
     if last is None:
-        return Before(jnp.full((PLACES, 3), jnp.nan, scene.rod.length.dtype), scene.obstacles)
+        return Before(jnp.full((SAMPLES, 3), jnp.nan, scene.rod.length.dtype), scene.obstacles)
     shapes = [jax.tree.map(jnp.shape, obstacles) for obstacles in (last.obstacles, scene.obstacles)]
     return last if eqx.tree_equal(*shapes) else Before(last.points, scene.obstacles)
 
@@ -497,7 +497,7 @@ def _discretization(
     """The one to take where none is asked for."""
     if isinstance(solver, NonlinearCG):
         return "finite_difference"
-    if has_node_places(scene) or (scene.clips and needs_frames(scene)):
+    if has_node_positions(scene) or (scene.clips and needs_frames(scene)):
         return "hermite"
     if segments is None and isinstance(guess, Equilibrium) and _is_by_differences(guess.state.shape):
         return "finite_difference"
@@ -535,8 +535,8 @@ def settled_state(scene: Scene, state: SolverState, first: FirstTwist) -> tuple[
         return state, first.total_twist
     scaled, scaled_state = in_units_of(scene, state)
     if slides(scene):
-        assert state.places is not None
-        scaled = slid(scaled, state.places)
+        assert state.arclengths is not None
+        scaled = slid(scaled, state.arclengths)
     form = form_of(scaled, scaled_state.shape)
     begin, point = _first_point(form, scaled_state, first)
     shape = begin.with_unknowns(point)
@@ -590,14 +590,14 @@ def _unsettled_state(
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype)
         shape = kind.through(first_shape(scaled, pieces))
-        places = sliding_places(scaled)
-        state = SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
+        arclengths = sliding_arclengths(scaled)
+        state = SolverState(shape, no_force, units, arclengths, before=before, pressures=pressures, friction=friction)
         return state, FirstTwist(no_twist)
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(scaled, units, pieces))
         twist = FirstTwist(guess.total_twist)
-        places = sliding_places(scaled)
-        state = SolverState(shape, no_force, units, places, before=before, pressures=pressures, friction=friction)
+        arclengths = sliding_arclengths(scaled)
+        state = SolverState(shape, no_force, units, arclengths, before=before, pressures=pressures, friction=friction)
         return state, twist
     state = guess.state
     if isinstance(state.shape, FramedCurve):
@@ -607,14 +607,14 @@ def _unsettled_state(
     else:
         shape = kind.through(state.shape.points(pieces))
     end_force = in_parts(state.end_force, parts)
-    places = sliding_places(scaled)
+    arclengths = sliding_arclengths(scaled)
     if _sliding(guess.scene) == _sliding(scene):
-        places = state.places
+        arclengths = state.arclengths
     friction = _friction(scene, state.units.origin[None] + state.units.length * shape.nodes)
     if scene.obstacles:
         shape, end_force = _on_its_side(scene, guess, shape, end_force)
     units = state.units
-    state = SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
+    state = SolverState(shape, end_force, units, arclengths, before=before, pressures=pressures, friction=friction)
     return state, last_twist(guess)
 
 
@@ -625,11 +625,11 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
     pieces = options.segments if of_joints else 2 * options.segments
     s = jnp.linspace(0.0, 1.0, options.segments + 1, dtype=scene.rod.length.dtype)
     parts = force_parts(scene, options.segments)
-    no_force, places = jnp.zeros((3, parts), s.dtype), sliding_places(scene)
+    no_force, arclengths = jnp.zeros((3, parts), s.dtype), sliding_arclengths(scene)
     before, pressures, friction = _before(given, guess), _pressures(given, options), _from_rest(given, options)
 
     def state(shape: FramedCurve, end_force: Float[Array, "3 parts"] = no_force) -> SolverState:
-        return SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
+        return SolverState(shape, end_force, units, arclengths, before=before, pressures=pressures, friction=friction)
 
     if guess is None:
         if _begins_plain(given, options):
@@ -642,7 +642,7 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         return state(shape), FirstTwist(guess.total_twist)
     shape, first = guess.state.shape, last_twist(guess)
     if _sliding(guess.scene) == _sliding(scene):
-        places = guess.state.places
+        arclengths = guess.state.arclengths
     if isinstance(shape, FramedCurve):
         end_force = in_parts(guess.state.end_force, parts)
         shape = shape.on(s, of_joints)
@@ -650,7 +650,7 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         friction = _friction(given, units.origin[None] + units.length * shape.nodes)
         if scene.obstacles:
             shape, end_force = _on_its_side(given, guess, shape, end_force)
-        begin = SolverState(shape, end_force, units, places, before=before, pressures=pressures, friction=friction)
+        begin = SolverState(shape, end_force, units, arclengths, before=before, pressures=pressures, friction=friction)
         return begin, first
     if has_friction(given):
         friction = _friction(given, guess.position_at(s * guess.scene.rod.length))
@@ -735,11 +735,11 @@ class Search(eqx.Module):
             within = self.is_within_plane & (self.form.stays_in_plane(point) | ~is_converged(outcome.status))
             status = jnp.where(within, outcome.status, Status.NOT_PLANAR)
             outcome = eqx.tree_at(lambda outcome: outcome.status, outcome, status)
-        places = sliding_places(self.form.scene)
+        arclengths = sliding_arclengths(self.form.scene)
         pressures, friction = (
             (point.nodal.pressures, point.nodal.friction) if has_contacts(self.form.scene) else (None, None)
         )
-        state = SolverState(shape, point.end_force, self.units, places, pressures=pressures, friction=friction)
+        state = SolverState(shape, point.end_force, self.units, arclengths, pressures=pressures, friction=friction)
         return Found(state, point, outcome, stable)
 
 
@@ -759,7 +759,7 @@ def _found(scene: Scene, guess: SolverState, first: FirstTwist, options: Options
 
 def _sought(form: Form, point: Point, guess: SolverState, solver: Newton, find: Find) -> NewtonEnd:
     """Where the search ends that begins at a point."""
-    if not has_potential(form.scene) and (has_node_places(form.scene) or slides(form.scene)):
+    if not has_potential(form.scene) and (has_node_positions(form.scene) or slides(form.scene)):
         return found_under_loads(form, point, solver, find, jnp.all(guess.end_force == 0))
     return find_equilibrium(form, point, solver, find)
 
@@ -775,11 +775,11 @@ def on_one_side(search: Search, form: Form, found: Found, before: Before | None)
     assert isinstance(form, NodalForm)
     assert before is not None
     assert search.point.nodal is not None
-    places = search.point.nodal.places
-    begin, _, _ = begun.places(places, search.point)
+    positions = search.point.nodal.positions
+    begin, _, _ = begun.samples(positions, search.point)
     begin = search.units.origin[None] + search.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
-    begins, _ = passage_to(begun, search.point, places, search.units, before)
+    begins, _ = passage_to(begun, search.point, positions, search.units, before)
     passed, now = passage_to(form, found.point, found.state.shape.nodes, found.state.units, before)
     is_sound = passed.is_sound | (begins.is_sound & ~passed.lies_within)
     converged = is_converged(found.outcome.status)
@@ -799,8 +799,8 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
     The mesh goes along with them. Where it was stretched by that, or another one belongs to where they have come, the
     search goes on from there on a mesh that is made anew.
     """
-    assert guess.places is not None
-    shape, point = _first_point(form_of(slid(scene, guess.places), guess.shape), guess, first)
+    assert guess.arclengths is not None
+    shape, point = _first_point(form_of(slid(scene, guess.arclengths), guess.shape), guess, first)
     if scene.turns is not None:
         # They are those of the first shape.
         guess = dataclasses.replace(guess, shape=shape.with_unknowns(point))
@@ -808,8 +808,8 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
 
     def search(last: _Sliding) -> _Sliding:
         state = last.found.state
-        assert state.places is not None
-        here = slid(scene, state.places)
+        assert state.arclengths is not None
+        here = slid(scene, state.arclengths)
         anew = on_mesh_of(here, state.shape, guess.shape)
         shape = jax.tree.map(lambda old, new: jnp.where(last.count == 0, old, new), state.shape, anew)
         state = dataclasses.replace(state, shape=shape)
@@ -841,15 +841,15 @@ class _Sliding(eqx.Module):
 def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> tuple[Found, Bool[Array, ""]]:
     """What a search finds on one mesh, and whether it is to go on on another one."""
     assert isinstance(options.solver, Newton)
-    assert guess.places is not None
+    assert guess.arclengths is not None
     search = Search.of(scene, guess, first, options)
     descends = options.find == "minimum"
     form = SlidingForm(scene=scene, made=scene, shape=search.shape, first=search.form, descends=descends)  # pyright: ignore
     is_warm = jnp.any(guess.end_force != 0)
-    point = SlidingPoint(search.point, guess.places, is_warm, jnp.zeros_like(guess.places))
+    point = SlidingPoint(search.point, guess.arclengths, is_warm, jnp.zeros_like(guess.arclengths))
     end = _sought(form, point, guess, options.solver, options.find)
     assert isinstance(end.point, SlidingPoint)
-    reached = dataclasses.replace(search, form=form.at(end.point.places))
+    reached = dataclasses.replace(search, form=form.at(end.point.arclengths))
     found = reached.found(dataclasses.replace(end, point=end.point.inner))
     if scene.obstacles:
         found = on_one_side(search, reached.form, found, guess.before)
@@ -879,7 +879,7 @@ def _first_point(form: Form, guess: SolverState, first: FirstTwist) -> tuple[Sha
     assert isinstance(form, MixedForm)
     if isinstance(shape, Curve):
         assert isinstance(field, QuadraticRotationElements)
-        tangents = field.apply_prescribed(scene, shape.turned_to_ends(scene, field.places))
+        tangents = field.apply_prescribed(scene, shape.turned_to_ends(scene, field.arclengths))
     else:
         assert isinstance(shape, Polyline)
         if not scene.clips:
@@ -911,4 +911,6 @@ def _in_units(state: SolverState, units: Units) -> SolverState:
     if friction is not None:
         forces = friction.forces * (state.units.force / units.force)
         friction = dataclasses.replace(friction, forces=forces)
-    return SolverState(shape, force, units, state.places, before=state.before, pressures=pressures, friction=friction)
+    return SolverState(
+        shape, force, units, state.arclengths, before=state.before, pressures=pressures, friction=friction
+    )

@@ -141,7 +141,7 @@ def _hanging(reaches: list[_Reach], is_fixed: list[bool]) -> set[int]:
     for j, fixed in enumerate(is_fixed):
         if fixed:
             continue
-        seen, places, waiting = {j}, set(), [j]
+        seen, reached_ends, waiting = {j}, set(), [j]
         while waiting:
             body = waiting.pop()
             for k, reach in enumerate(reaches):
@@ -149,13 +149,13 @@ def _hanging(reaches: list[_Reach], is_fixed: list[bool]) -> set[int]:
                     continue
                 if reach.other is None:
                     if reach.place is not None:
-                        places.add(("place", k))
+                        reached_ends.add(("place", k))
                 elif is_fixed[reach.other]:
-                    places.add(("body", reach.other))
+                    reached_ends.add(("body", reach.other))
                 elif reach.other not in seen:
                     seen.add(reach.other)
                     waiting.append(reach.other)
-        if len(places) < 2:
+        if len(reached_ends) < 2:
             hanging.add(j)
     return hanging
 

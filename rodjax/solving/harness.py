@@ -67,7 +67,7 @@ from rodjax.warn import warn
 Members = tuple[tuple[int, ...], ...]
 
 # Of contacts of bodies, beside the stiffest motion of these, and how often what it gives way by is asked for again.
-ENDS_SOFTNESS = 1e-4
+ENDS_COMPLIANCE = 1e-4
 ENDS_HARDENINGS = 4
 
 
@@ -385,8 +385,8 @@ def _equilibria(
         form = form_of(scaled, rod.shape)
         if point.nodal is not None:
             # From the units of the search, whose origin is where the rod began.
-            places = point.nodal.places + (rod.units.origin - units.origin)[None] / units.length
-            point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, places=places))
+            positions = point.nodal.positions + (rod.units.origin - units.origin)[None] / units.length
+            point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, positions=positions))
         point = form.settled(form.holding(point))
         pressures = point.nodal.pressures if scene.obstacles else None
         state = SolverState(rod.shape.reached(form, point), point.end_force, units, pressures=pressures)
@@ -608,7 +608,7 @@ def _solved_with_contacts(
         return jnp.linalg.solve(matrix, right)
     stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]))
     is_pressure = np.arange(len(right)) >= count
-    soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_SOFTNESS / stiffest, 0.0).astype(right.dtype))
+    soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_COMPLIANCE / stiffest, 0.0).astype(right.dtype))
     found = jnp.linalg.solve(soft, right)
     for _ in range(ENDS_HARDENINGS):
         found += jnp.linalg.solve(soft, right - matrix @ found)

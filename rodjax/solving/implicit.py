@@ -1,9 +1,9 @@
 """How an equilibrium changes with its scene, by the implicit function theorem on the mixed form.
 
-The point of an equilibrium makes the residual (gradient by rotations, closure) vanish. A change of the scene at the
-same point leaves a residual, and the linearised system that Newton's method factorises, block tridiagonal with a
-border, says which rotations and forces take it away: O(n). All of it is made of differentiable operations, so that the
-derivative has derivatives itself, and a transpose.
+The point of an equilibrium makes the residual (gradient by rotations, constraint residual) vanish. A change of the
+scene at the same point leaves a residual, and the linearised system that Newton's method factorises, block tridiagonal
+with a border, says which rotations and forces take it away: O(n). All of it is made of differentiable operations, so
+that the derivative has derivatives itself, and a transpose.
 """
 
 from typing import Any
@@ -73,21 +73,21 @@ def _change_of_one(scene: Scene, result: Equilibrium, scene_change: Scene) -> Eq
     outcome = Outcome(result.residual, result.iterations, result.evaluations, result.status)
     before = result.state.before
 
-    def same(scene: Scene, shape: Shape, point: Point, places: Float[Array, "slides"] | None) -> Equilibrium:
+    def same(scene: Scene, shape: Shape, point: Point, arclengths: Float[Array, "slides"] | None) -> Equilibrium:
         units = nondimensional(scene)[1]
         nodal = point.nodal if has_contacts(scene) else None
         pressures, friction = (None, None) if nodal is None else (nodal.pressures, nodal.friction)
         state = SolverState(
-            shape, point.end_force, units, places, before=before, pressures=pressures, friction=friction
+            shape, point.end_force, units, arclengths, before=before, pressures=pressures, friction=friction
         )
         found = Found(state, point, outcome, result.stable)
         return build_result(scene, found, result.substeps)
 
     (scaled, _), (scaled_change, _) = jax.jvp(nondimensional, (scene,), (scene_change,))
     _, point = form_and_point(result)
-    places = result.state.places
-    changes = _change(scaled, scaled_change, shape, point, places, result)
-    _, change = jax.jvp(same, (scene, shape, point, places), (scene_change, *changes))
+    arclengths = result.state.arclengths
+    changes = _change(scaled, scaled_change, shape, point, arclengths, result)
+    _, change = jax.jvp(same, (scene, shape, point, arclengths), (scene_change, *changes))
     return jax.tree.map(lambda change: None if change.dtype == jax.dtypes.float0 else change, change)
 
 
@@ -96,7 +96,7 @@ def _change(
     scene_change: Scene,
     shape: Shape,
     point: Point,
-    places: Float[Array, "slides"] | None,
+    arclengths: Float[Array, "slides"] | None,
     result: Equilibrium,
 ) -> tuple[Shape, Point, Float[Array, "slides"] | None]:
     """How shape and point of an equilibrium change with its scene, nondimensional, and the arclengths at which it
@@ -104,24 +104,24 @@ def _change(
 
     Not a number where the point is no equilibrium, or critical. A turn that leaves it in equilibrium does not happen.
     """
-    unknown = point if places is None else SlidingPoint.settled_at(point, places)
+    unknown = point if arclengths is None else SlidingPoint.settled_at(point, arclengths)
     form, begin = carried_to(scene, shape, unknown)
     here = form.linearized(begin)
     factors, is_critical, neutral = examined(form, begin, here, result.residual)
 
-    def unbalanced(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
+    def residual_vectors(scene: Scene) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
         form, here = carried_to(scene, shape, unknown)
-        return form.unbalanced(here)
+        return form.residual_vectors(here)
 
     def reached(scene: Scene, motion: Motion) -> tuple[Shape, Point, Float[Array, "slides"] | None]:
         form, there = carried_to(scene, shape, unknown, motion)
-        places = None
+        arclengths = None
         if isinstance(form, SlidingForm):
             assert isinstance(there, SlidingPoint)
-            form, there, places = form.at(there.places), there.inner, there.places
-        return shape.reached(form, there), form.settled(there), places
+            form, there, arclengths = form.at(there.arclengths), there.inner, there.arclengths
+        return shape.reached(form, there), form.settled(there), arclengths
 
-    _, (f, c) = jax.jvp(unbalanced, (scene,), (scene_change,))
+    _, (f, c) = jax.jvp(residual_vectors, (scene,), (scene_change,))
     # A factor, as a choice between numbers would leave the transpose without the one that is none.
     sign = jnp.where(result.converged & ~is_critical, -1.0, jnp.nan).astype(f.dtype)
     f, c = sign * f, sign * c

@@ -33,8 +33,8 @@ class _State(eqx.Module):
 
 
 def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> NewtonEnd:
-    """The equilibrium of a form with node places or sliding clips, from a point that is one under other loads if it is
-    not cold.
+    """The equilibrium of a form with node positions or sliding clips, from a point that is one under other loads if it
+    is not cold.
     """
     without: Form = dataclasses.replace(form, scene=conservative(form.scene))
     count = jnp.zeros((), int)

@@ -20,7 +20,8 @@ class Newton(eqx.Module):
     """Newton's method with tangents of the edges and the force through the rod as unknowns.
 
     A step solves the linearised equilibrium. Where the energy has negative curvature the Hessian is shifted until it
-    has none. A step is shortened until an augmented Lagrangian falls: energy, closure of the polyline and its square.
+    has none. A step is shortened until an augmented Lagrangian falls: energy, closure constraint of the polyline and
+    its square.
 
     **Arguments:**
 
@@ -49,7 +50,7 @@ Find = Literal["minimum", "equilibrium"]
 FIRST_SHIFT = 1.0
 SHIFT_GROWTH = 4.0
 MAX_FACTORS = 30
-# Weight of the squared closure in the augmented Lagrangian [EI/L^3]: about the stiffness of a bent rod.
+# Weight of the squared constraint residual in the augmented Lagrangian [EI/L^3]: about the stiffness of a bent rod.
 CLOSURE_WEIGHT = 100.0
 # A step is accepted when this fraction of the fall that its slope promises comes true, up to the rounding of energies.
 SUFFICIENT_DECREASE = 1e-4
@@ -135,12 +136,12 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     rotation = state.step * state.rotation
     force_change = state.force_change if descends else state.step * state.force_change
     others = jax.tree.map(lambda change: state.step * change, state.others)
-    moved = form.moved(state.point, state.bases, rotation, force_change, others)
-    trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, moved)
+    retracted = form.retract(state.point, state.bases, rotation, force_change, others)
+    trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, retracted)
     linearization = form.linearized(trial)
-    closure = form.closure(linearization.closure)
+    constraint_residual = form.force_components(linearization.constraint_residual)
     objective = form.objective(linearization, state.point) if descends else form.half_square(linearization)
-    merit = objective + state.weight / 2 * jnp.sum(closure**2)
+    merit = objective + state.weight / 2 * jnp.sum(constraint_residual**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
     state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
@@ -178,7 +179,7 @@ def _advanced(
     # Just above the floor, steps that no longer help show that it is reached.
     stagnates = (iterations > 0) & (here.residual > state.residual / 2) & (here.residual <= STAGNATION * floor)
     balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
-    balanced = jnp.where(form.is_closed(here.closure, solver.tolerance), balanced, Status.RUNNING)
+    balanced = jnp.where(form.is_closed(here.constraint_residual, solver.tolerance), balanced, Status.RUNNING)
     is_balanced = balanced != Status.RUNNING
 
     # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
@@ -200,7 +201,7 @@ def _advanced(
     else:
         again = is_pushed = jnp.array(False)
         is_sought = may_go_on = jnp.array(True)
-    force_change = form.layout.forces(form.closure(multipliers))
+    force_change = form.layout.forces(form.force_components(multipliers))
     largest = jnp.sqrt(jnp.max(dot(rotation, rotation)))
     step = jnp.minimum(1.0, solver.max_rotation / largest)
     longest = form.longest_step(point, others)
@@ -211,15 +212,17 @@ def _advanced(
 
     if _descends(form, find):
         # With the new force in place of the old one.
-        closure, closure_rate, change, along = form.under_force(point, here, rotation, force_change, others)
+        constraint_residual, constraint_rate, change, along = form.under_force(
+            point, here, rotation, force_change, others
+        )
         objective = form.objective(here, point) + change
         along += jnp.sum(rotation * here.gradient)
     else:
-        closure = form.closure(here.closure)
-        closure_rate = -closure
+        constraint_residual = form.force_components(here.constraint_residual)
+        constraint_rate = -constraint_residual
         objective = form.half_square(here)
         along = -2 * objective
-    falls = -jnp.sum(closure * closure_rate)
+    falls = -jnp.sum(constraint_residual * constraint_rate)
     weight = jnp.maximum(CLOSURE_WEIGHT, 2 * along / jnp.where(falls > 0, falls, jnp.inf))
 
     status = jnp.where(iterations >= solver.max_iterations, Status.MAX_ITERATIONS, Status.RUNNING)
@@ -249,7 +252,7 @@ def _advanced(
         force_change=force_change,
         others=others,
         weight=weight,
-        merit=objective + weight / 2 * jnp.sum(closure**2),
+        merit=objective + weight / 2 * jnp.sum(constraint_residual**2),
         slope=along - weight * falls,
         step=step,
         halvings=jnp.zeros((), int),

@@ -100,7 +100,7 @@ def minimize(problem: Any, point: PyTree, solver: NonlinearCG) -> Minimum:
 
     def turn(state: _State) -> _State:
         here = problem.with_reference(state.reference)
-        trial = here.moved(state.point, state.step * state.direction)
+        trial = here.displaced(state.point, state.step * state.direction)
         energy, gradient = here.energy_and_gradient(trial)
         slope = jnp.sum(gradient * state.direction)
         energy_is_low = jnp.isfinite(slope) & (energy <= search.energy_bound(state.energy))

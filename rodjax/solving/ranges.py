@@ -130,8 +130,8 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     good += [_each(_numbers(value) > 0, scenes) for value in positive]
     good.append(_each(_numbers(rod.mass_per_length) >= 0, scenes))
     good += [] if rod.rest_strain is None else [_each(_numbers(rod.rest_strain) > -1, scenes)]
-    places = [xp.zeros_like(length), *(clip.at for clip in clips), length]
-    good += [before < after for before, after in itertools.pairwise(places)]
+    arclengths = [xp.zeros_like(length), *(clip.at for clip in clips), length]
+    good += [before < after for before, after in itertools.pairwise(arclengths)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]
     for part in (load.part for load in scenes.distributed if load.part is not None):
         good += [part[..., 0] >= 0, part[..., 0] < part[..., 1], part[..., 1] <= length * (1 + ARCLENGTH_TOLERANCE)]

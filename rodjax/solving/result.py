@@ -49,7 +49,7 @@ from rodjax.mechanics.passage import Before, Passage, passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, has_contacts, has_node_places, has_potential, nondimensional, slid, slides
+from rodjax.model.scene import Scene, has_contacts, has_node_positions, has_potential, nondimensional, slid, slides
 from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
@@ -108,7 +108,7 @@ class SolverState(eqx.Module):
     are unknown; `end_force`: the forces of the layout (`discretization.layout`): the force at s = L as each span sees
     it, with the forces of the clips beyond, zero where that ends freely; with obstacles, or loads
     without a potential, as each segment sees it, with those of clips and contacts;
-    `places`: arclengths at which the rod passes its sliding clips, as parts of its length, where there are some;
+    `arclengths`: those at which the rod passes its sliding clips, as parts of its length, where there are some;
     `clip_moments`: in the continuum, where no mesh gives them; `before`: in scenes with obstacles, where the rod is, or
     was when it last was sound: a solve that begins here is judged by it;
     `pressures`: of each obstacle on each node; `friction`: where obstacles have some, with the memory from which this
@@ -118,7 +118,7 @@ class SolverState(eqx.Module):
     shape: Shape
     end_force: Float[Array, "... 3 parts"] | Float[Array, "... 3"]  # the second only in files, until format 8
     units: Units
-    places: Float[Array, "... slides"] | None = None
+    arclengths: Float[Array, "... slides"] | None = None
     clip_moments: Float[Array, "... clips 3"] | None = None
     before: Before | None = None
     pressures: Float[Array, "... k n+1"] | None = None
@@ -261,7 +261,7 @@ class Equilibrium(eqx.Module):
     def clip_forces(self) -> Float[Array, "... clips 3"]:
         if not self.scene.clips:
             return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
-        if has_node_places(self.scene):
+        if has_node_positions(self.scene):
             return _node_forces(self)[0]
         seen = self.state.end_force * self.state.units.force[..., None, None]
         return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
@@ -358,8 +358,8 @@ def build_result(
     scene: Scene, found: Found, substeps: Int[Array, ""], strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT
 ) -> Equilibrium:
     """What a solver found, in SI units; infinite where no strain is too large."""
-    if found.state.places is not None:
-        scene = slid(scene, found.state.places * scene.rod.length)
+    if found.state.arclengths is not None:
+        scene = slid(scene, found.state.arclengths * scene.rod.length)
     scaled, units = nondimensional(scene)
     point, outcome = found.point, found.outcome
     nodes = found.state.shape.nodes
@@ -526,7 +526,7 @@ def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
 
 @over_leading_axes
 def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Float[Array, "n+1 3"]]:
-    """What clips and what obstacles apply to the rod, of a scene whose nodes have places of their own."""
+    """What clips and what obstacles apply to the rod, of a scene whose nodes have positions of their own."""
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     forces = form.applied(point).T * equilibrium.state.units.force
@@ -558,7 +558,7 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     units = equilibrium.state.units
-    distances, _ = form.distances_and_normals(point.nodal.places)
+    distances, _ = form.distances_and_normals(point.nodal.positions)
     pushes, drags, states = form.exerted(point)
     gaps = (distances - form.radius[None]) * units.length
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
@@ -763,16 +763,16 @@ def _contacts_told(equilibrium: Equilibrium) -> list[str]:
 def _self_contacts_told(equilibrium: Equilibrium) -> list[str]:
     found = jax.tree.map(np.asarray, equilibrium.self_contacts)
     forces = np.linalg.norm(found.forces, axis=-1)
-    touching = np.flatnonzero(forces > 0)
-    if not touching.size:
+    in_contact = np.flatnonzero(forces > 0)
+    if not in_contact.size:
         return ["does not touch itself"]
-    s, beyond = found.s[touching], found.beyond[touching]
-    most = touching[np.argmax(forces[touching])]
+    s, beyond = found.s[in_contact], found.beyond[in_contact]
+    most = in_contact[np.argmax(forces[in_contact])]
     where = f"s = {s.min():.4g} to {s.max():.4g} m and s = {beyond.min():.4g} to {beyond.max():.4g} m"
-    if touching.size == 1:
+    if in_contact.size == 1:
         where = f"s = {s[0]:.4g} m and s = {beyond[0]:.4g} m"
-    places = "place" if touching.size == 1 else "places"
-    return [f"touches itself at {touching.size} {places}, {where}, the largest force {forces[most]:.4g} N"]
+    places = "place" if in_contact.size == 1 else "places"
+    return [f"touches itself at {in_contact.size} {places}, {where}, the largest force {forces[most]:.4g} N"]
 
 
 def _friction_told(equilibrium: Equilibrium, contacts: _Contacts, k: int) -> str:
@@ -896,7 +896,7 @@ def passage_to(
     form: NodalForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
 ) -> tuple[Passage, Before]:
     """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
-    points, radius, held = form.places(nodes, point)
+    points, radius, held = form.samples(nodes, point)
     points, held = (units.origin[None] + units.length * place for place in (points, held))
     obstacles = tuple(obstacle.obstacle for obstacle in form.scene.obstacles if isinstance(obstacle, InUnits))
     found = passage(before, points, obstacles, units.length * radius, held)

@@ -12,15 +12,15 @@ from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.linalg.saddle_point import factor
-from rodjax.model.scene import Scene, sliding_places
+from rodjax.model.scene import Scene, sliding_arclengths
 from rodjax.solving.stability import carried_to
 
 
 def sliding_at(scene: Scene, shape: Shape, point: Point) -> tuple[SlidingForm, SlidingPoint]:
     """The form and the point of an equilibrium of a nondimensional scene with its clips where the rod passes them."""
-    places = sliding_places(scene)
-    assert places is not None
-    form, begin = carried_to(scene, shape, SlidingPoint.settled_at(point, places))
+    arclengths = sliding_arclengths(scene)
+    assert arclengths is not None
+    form, begin = carried_to(scene, shape, SlidingPoint.settled_at(point, arclengths))
     assert isinstance(form, SlidingForm)
     assert isinstance(begin, SlidingPoint)
     return form, begin
@@ -34,14 +34,14 @@ def change_with_axial_forces(
     """
     form, begin = sliding_at(scene, shape, point)
     here = form.linearized(begin)
-    right = jnp.concatenate([-axial, jnp.zeros_like(here.closure[len(axial) :])])
+    right = jnp.concatenate([-axial, jnp.zeros_like(here.constraint_residual[len(axial) :])])
     motion = Motion(*factor(form.regular(here.system)).solve(jnp.zeros_like(here.gradient), right))
 
     def seen(motion: Motion) -> tuple[Any, ...]:
         reached, there = carried_to(scene, shape, begin, motion)
         assert isinstance(reached, SlidingForm)
         assert isinstance(there, SlidingPoint)
-        inner, there = reached.at(there.places), there.inner
+        inner, there = reached.at(there.arclengths), there.inner
         ends = resultants_of(inner, there)
         moments = jnp.stack([ends.start_moment, ends.end_moment, *clip_moments_of(inner, there)], axis=1)
         return inner.nodes_of(there), there.end_force, moments, ends.curvature

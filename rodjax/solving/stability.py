@@ -49,15 +49,15 @@ def carried_to(
     which the mesh of the shape belongs, if not the same.
     """
     if isinstance(point, SlidingPoint):
-        form: Any = SlidingForm.of(slid(scene, point.places if made_at is None else made_at), shape)
+        form: Any = SlidingForm.of(slid(scene, point.arclengths if made_at is None else made_at), shape)
     else:
         form = form_of(scene, shape)
     begin = form.holding(point)
     if motion is None:
         return form, begin
-    force_change = form.layout.forces(form.closure(motion.multipliers))
+    force_change = form.layout.forces(form.force_components(motion.multipliers))
     others = form.others(motion.multipliers)
-    return form, form.moved(begin, form.bases_at(begin), motion.rotation, force_change, others)
+    return form, form.retract(begin, form.bases_at(begin), motion.rotation, force_change, others)
 
 
 def examined(
@@ -68,22 +68,22 @@ def examined(
     Critical: a motion other than the neutral ones has no stiffness left, as far as the residual allows to tell.
     """
     here = eqx.tree_at(lambda here: here.system, here, form.coupled(point, here.system))
-    places = point.tangents.shape[1]
+    points = point.tangents.shape[1]
     # So little that derivatives do not show it, and more than the rounding of pivots of 4 N.
-    shift = min(SHIFT_ROUNDINGS * float(jnp.finfo(residual.dtype).eps) * 4 * places**2, MOST_SHIFT)
+    shift = min(SHIFT_ROUNDINGS * float(jnp.finfo(residual.dtype).eps) * 4 * points**2, MOST_SHIFT)
     shift = jnp.asarray(shift, residual.dtype)
     generic = components(here.bases, generic_field(point.tangents))
-    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.closure))
+    nothing = Motion(jnp.zeros_like(here.gradient), jnp.zeros_like(here.constraint_residual))
     # The first step of the inverse iteration in one sweep with the factorisation.
-    system = here.system.shifted(shift / places)
-    factors, softer, multipliers = factor_and_solve(system, generic / places, nothing.multipliers)
+    system = here.system.shifted(shift / points)
+    factors, softer, multipliers = factor_and_solve(system, generic / points, nothing.multipliers)
     # Which motions are soft is a matter of the point alone; only the factors are differentiated.
     form, point, here, residual, generic = jax.lax.stop_gradient((form, point, here, residual, generic))
     system, softer, multipliers = jax.lax.stop_gradient((system, softer, multipliers))
     stiffness = _stiffness(generic, softer)
     # By symmetry a part of a rod that can turn may be as neutral as all of it, which leaves no digit of the solution.
-    left = jnp.max(jnp.abs(system.times(softer, multipliers)[0] - generic / places))
-    is_lost = jnp.isfinite(left) & (left > MOST_LEFT * jnp.max(jnp.abs(generic)) / places)
+    left = jnp.max(jnp.abs(system.times(softer, multipliers)[0] - generic / points))
+    is_lost = jnp.isfinite(left) & (left > MOST_LEFT * jnp.max(jnp.abs(generic)) / points)
     least = CRITICAL * jnp.maximum(residual, form.rounding_floor(point))
 
     def is_soft(stiffness: Float[Array, ""]) -> Bool[Array, ""]:
@@ -93,7 +93,7 @@ def examined(
         form, point, here, factors = fixed
         neutral = neutral_motions(form, point, here)
         other = neutral.taken_from(Motion(generic, nothing.multipliers)).rotation
-        softest = neutral.taken_from(Motion(*factors.solve(other / places, nothing.multipliers)))
+        softest = neutral.taken_from(Motion(*factors.solve(other / points, nothing.multipliers)))
         return is_soft(_stiffness(other, softest.rotation)) & ~is_lost, neutral
 
     fixed = (form, point, here, jax.lax.stop_gradient(factors))
@@ -138,7 +138,7 @@ def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array
 
     low = below_lowest(lies_below, jnp.ones((), metric.mass.dtype))
     generic = components(here.bases, generic_field(point.tangents))
-    first = Motion(generic, jnp.zeros_like(here.closure)), low
+    first = Motion(generic, jnp.zeros_like(here.constraint_residual)), low
 
     def nearest_to(low: Float[Array, ""], system: AnySystem) -> tuple[Motion, Float[Array, ""]]:
         factors = factor(shifted(system, low))

@@ -91,15 +91,18 @@ class Controls:
         """How far apart the two are: the largest of displacements by `length`, of turns [rad], and of the ways of
         sliders by their whole way.
         """
-        ways = [0.0]
+        distances = [0.0]
         for name, pose in self.poses.items():
             there = other.poses[name]
             if pose is not there:
-                ways += [float(np.linalg.norm(there.position - pose.position)) / length, angle_between(pose, there)]
+                distances += [
+                    float(np.linalg.norm(there.position - pose.position)) / length,
+                    angle_between(pose, there),
+                ]
         for name, value in self.numbers.items():
             slider = sliders[name]
-            ways.append(abs(other.numbers[name] - value) / (slider.high - slider.low))
-        return max(ways)
+            distances.append(abs(other.numbers[name] - value) / (slider.high - slider.low))
+        return max(distances)
 
 
 def angle_between(pose: Pose, other: Pose) -> float:
@@ -191,10 +194,10 @@ def _sliders_of_rod(scene: Scene) -> list[Slider]:
         sliders.append(Slider("rod.GJ", "torsional stiffness", "times", *STIFFNESS_RANGE))
     if scene.gravity is not None:
         sliders.append(Slider("gravity", "gravity", "times", *GRAVITY_RANGE))
-    places = [0.0, *(float(clip.at) for clip in scene.clips), length]
+    arclengths = [0.0, *(float(clip.at) for clip in scene.clips), length]
     for k, clip in enumerate(scene.clips):
         if not clip.sliding:
-            before, at, after = places[k : k + 3]
+            before, at, after = arclengths[k : k + 3]
             # Half of the way to the neighbours, so that clips keep their order and a span its length.
             sliders.append(Slider(f"clips[{k}].at", f"clip {k} at", "m", (before + at) / 2, (at + after) / 2))
     return sliders

@@ -61,7 +61,7 @@ def _followed(
     most = jnp.where(is_possible, Newton().max_iterations, 0)
     solver = eqx.tree_at(lambda solver: solver.max_iterations, Newton(), most)
     result = solve(scene, segments=segments, guess=guess, strain_limit=strain_limit, solver=solver)
-    way = jnp.max(jnp.array([jnp.max(_ways(*both)) for both in zip(_nodes(result), _nodes(guess), strict=True)]))
+    way = jnp.max(jnp.array([jnp.max(_distances(*both)) for both in zip(_nodes(result), _nodes(guess), strict=True)]))
     outcome = Outcome(asked, is_possible, result.converged, result.status, result.iterations, way)
     return result, readings_in_program(result), outcome
 
@@ -70,5 +70,5 @@ def _nodes(shown: Shown) -> list[Float[Array, "... n+1 3"]]:
     return [group.nodes for group in ((shown,) if isinstance(shown, Equilibrium) else shown.groups)]
 
 
-def _ways(nodes: Float[Array, "... n+1 3"], before: Float[Array, "... n+1 3"]) -> Float[Array, "... n+1"]:
+def _distances(nodes: Float[Array, "... n+1 3"], before: Float[Array, "... n+1 3"]) -> Float[Array, "... n+1"]:
     return jnp.sqrt(jnp.sum((nodes - before) ** 2, axis=-1))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.analysis.clearance import places, radius_at
+from rodjax.analysis.clearance import arclengths_between, radius_at
 from rodjax.analysis.curvature import curvature_along, curvature_within
 from rodjax.analysis.samples import framed_at
 from rodjax.checks import Numbers
@@ -69,7 +69,7 @@ class Figures(NamedTuple):
 
 
 def _reading(equilibrium: Equilibrium) -> Reading:
-    s = places(equilibrium, np.arange(PLACES) / PLACES)
+    s = arclengths_between(equilibrium, np.arange(PLACES) / PLACES)
     centerline, tangents, d1 = framed_at(equilibrium, s)
     nodes, scene = equilibrium.s, equilibrium.scene
     values = {name: jnp.interp(s, nodes, getattr(equilibrium, name)) for name in ("curvature", "twist", "tension")}
@@ -161,7 +161,7 @@ def _figures_of_rod(equilibrium: Equilibrium) -> Figures:
     largest = jnp.max(curvature_along(equilibrium)[1])
     scene, clearances = equilibrium.scene, jnp.zeros(0, equilibrium.s.dtype)
     if scene.obstacles:
-        s = places(equilibrium, np.arange(PLACES) / PLACES)
+        s = arclengths_between(equilibrium, np.arange(PLACES) / PLACES)
         centerline, radius = equilibrium.position_at(s), radius_at(scene.rod, s)
         clearances = jnp.stack([jnp.min(jax.vmap(one.at)(centerline) - radius) for one in scene.obstacles])
     return Figures(1 / largest, clearances, jnp.sum(equilibrium.obstacle_forces, axis=1))

@@ -22,7 +22,7 @@ from rodjax.solving.coupling import Coupling, EndContacts
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
 
 
-class TouchingRods(eqx.Module):
+class RodsInContact(eqx.Module):
     """Rods of one structure beside obstacles, stacked along a first axis of every array.
 
     `contacts`: at nodes and within elements; `f`, `c`: right sides without them; `at_ends`: contacts of the bodies in
@@ -50,7 +50,7 @@ class TouchingRods(eqx.Module):
         pushes: Float[Array, "k b m"],
         body: Int[Array, "k 2"],
         shares: Float[Array, "k"],
-    ) -> "TouchingRods":
+    ) -> "RodsInContact":
         def of_rod(
             form: NodalForm, point: Any, here: Linearization, coupling: Coupling, at_ends: EndContacts, push: Array
         ):
@@ -59,14 +59,14 @@ class TouchingRods(eqx.Module):
             assert here.gaps is not None
             assert coupling.of_gaps is not None
             moments, c = form.without_contacts(here, forces)
-            contacts = form.model(point, here.gaps, here.ways)
+            contacts = form.model(point, here.gaps, here.reference_displacements)
             system = system.closed_where(form.first_closed(system.contacts.is_closed, contacts))
             first = coupling.first + jnp.einsum("rni,rn->i", coupling.of_gaps, forces)
             first += jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12)
             return system, contacts, push + moments, c, first
 
         system, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
-        return TouchingRods(system, coupling, contacts, f, c, at_ends, first, body, shares)
+        return RodsInContact(system, coupling, contacts, f, c, at_ends, first, body, shares)
 
     @property
     def size(self) -> int:
@@ -74,10 +74,10 @@ class TouchingRods(eqx.Module):
         return self.contacts.gaps.size + self.at_ends.gaps.size
 
     @property
-    def softness(self) -> Float[Array, "size"]:
+    def contact_compliance(self) -> Float[Array, "size"]:
         """Of all contacts, in a row."""
-        softness = self.system.contacts.softness
-        return self.row(*(jnp.broadcast_to(softness[:, None, None], x.shape) for x in self._shapes))
+        contact_compliance = self.system.contacts.contact_compliance
+        return self.row(*(jnp.broadcast_to(contact_compliance[:, None, None], x.shape) for x in self._shapes))
 
     @property
     def weights(self) -> Float[Array, "size"]:
@@ -90,7 +90,7 @@ class TouchingRods(eqx.Module):
     def row(self, of_rods: Array, at_ends: Array) -> Array:
         return jnp.concatenate([of_rods.reshape(-1), at_ends.reshape(-1)])
 
-    def parted(self, row: Array) -> tuple[Array, Array]:
+    def split(self, row: Array) -> tuple[Array, Array]:
         of_rods, at_ends = self._shapes
         return row[: of_rods.size].reshape(of_rods.shape), row[of_rods.size :].reshape(at_ends.shape)
 
@@ -102,7 +102,7 @@ class TouchingRods(eqx.Module):
 
         def of_rod(system: ChainSystem, coupling: Coupling, x: Array, y: Array, q: Array) -> Array:
             assert coupling.of_gaps is not None
-            return system.contacts.rates(x, system.parted(y)[2]) + coupling.of_gaps @ q
+            return system.contacts.rates(x, system.split(y)[2]) + coupling.of_gaps @ q
 
         rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, of_ends)
         return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, of_ends.reshape(-1, 2, 6)))
@@ -121,38 +121,42 @@ class Eliminated(NamedTuple):
     force: Float[Array, "k 12"]
 
 
-def _eliminated(rods: TouchingRods, is_closed: Array, softness: Array, shift: Float[Array, "k"]) -> Eliminated:
-    def of_rod(rod: TouchingRods, is_closed: Array, closed_end: Array, softness: Array, shift: Array) -> Eliminated:
+def _eliminated(
+    rods: RodsInContact, is_closed: Array, contact_compliance: Array, shift: Float[Array, "k"]
+) -> Eliminated:
+    def of_rod(
+        rod: RodsInContact, is_closed: Array, closed_end: Array, contact_compliance: Array, shift: Array
+    ) -> Eliminated:
         coupling, at_ends, m = rod.coupling, rod.at_ends, rod.f.shape[1]
         assert coupling.of_gaps is not None
-        system = closed_softly(rod.system, is_closed, softness)
+        system = closed_softly(rod.system, is_closed, contact_compliance)
         f, c = with_pressures(system, rod.contacts, rod.f, rod.c)
         factors = factor_chain(system.shifted(shift / m))
         rates = jnp.where(is_closed[..., None], coupling.of_gaps, 0.0)
         size = len(system.compliance)
-        of_closure = coupling.of_closure.at[size : size + is_closed.size].add(-rates.reshape(-1, 12))
+        of_constraints = coupling.of_constraints.at[size : size + is_closed.size].add(-rates.reshape(-1, 12))
         x, y = factors.solve_softly(f, c)
-        by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(coupling.of_gradient, of_closure)
+        by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(coupling.of_gradient, of_constraints)
         stiffness = coupling.second - jnp.einsum("bmi,bmj->ij", coupling.of_gradient, by_motions[0])
-        stiffness -= of_closure.T @ by_motions[1]
+        stiffness -= of_constraints.T @ by_motions[1]
         force = jnp.einsum("rni,rn->i", rates, rod.contacts.pressures) - rod.first
-        force -= jnp.einsum("bmi,bm->i", coupling.of_gradient, x) + of_closure.T @ y
+        force -= jnp.einsum("bmi,bm->i", coupling.of_gradient, x) + of_constraints.T @ y
         # Contacts of the bodies have no unknowns of the rod.
         rates = jnp.where(closed_end[..., None], at_ends.rates, 0.0)
-        pressures = at_ends.pressures - at_ends.gaps / softness
-        stiff = jnp.einsum("oei,oej->eij", rates, rates) / softness
+        pressures = at_ends.pressures - at_ends.gaps / contact_compliance
+        stiff = jnp.einsum("oei,oej->eij", rates, rates) / contact_compliance
         pushed = jnp.einsum("oei,oe->ei", rates, pressures)
         stiffness += jax.scipy.linalg.block_diag(*stiff)
         return Eliminated(
             factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force + pushed.reshape(12)
         )
 
-    closed_rods, closed_ends = rods.parted(is_closed)
-    of_rods, _ = rods.parted(softness)
+    closed_rods, closed_ends = rods.split(is_closed)
+    of_rods, _ = rods.split(contact_compliance)
     return jax.vmap(of_rod)(rods, closed_rods, closed_ends, of_rods[:, 0, 0], shift)
 
 
-class TouchingBodies(eqx.Module):
+class BodyContacts(eqx.Module):
     """The contacts of all rods and bodies in a row, as `linalg.unilateral.Unilateral` those of one rod."""
 
     gaps: Float[Array, "c"]
@@ -165,18 +169,18 @@ class TouchingBodies(eqx.Module):
     def is_closed(self, trial: Float[Array, "c"]) -> Bool[Array, "c"]:
         return trial > 0
 
-    def energy(self, trial: Float[Array, "c"], softness: Float[Array, "c"]) -> Float[Array, ""]:
-        return jnp.sum(self.weights * softness / 2 * self.allowed(trial) ** 2)
+    def energy(self, trial: Float[Array, "c"], contact_compliance: Float[Array, "c"]) -> Float[Array, ""]:
+        return jnp.sum(self.weights * contact_compliance / 2 * self.allowed(trial) ** 2)
 
     def slope(
-        self, trial: Float[Array, "c"], falls: Float[Array, "c"], softness: Float[Array, "c"]
+        self, trial: Float[Array, "c"], falls: Float[Array, "c"], contact_compliance: Float[Array, "c"]
     ) -> Float[Array, ""]:
-        return -jnp.sum(self.weights * softness * self.allowed(trial) * falls)
+        return -jnp.sum(self.weights * contact_compliance * self.allowed(trial) * falls)
 
     def growth(
-        self, trial: Float[Array, "c"], falls: Float[Array, "c"], softness: Float[Array, "c"]
+        self, trial: Float[Array, "c"], falls: Float[Array, "c"], contact_compliance: Float[Array, "c"]
     ) -> Float[Array, ""]:
-        return jnp.sum(jnp.where(trial > 0, self.weights * softness * falls, 0.0) * falls)
+        return jnp.sum(jnp.where(trial > 0, self.weights * contact_compliance * falls, 0.0) * falls)
 
     def turned(self, trial: Array, other: Array) -> Bool[Array, ""]:
         return jnp.array(False)
@@ -194,14 +198,14 @@ class Memory(eqx.Module):
     push: Float[Array, "q"]
 
 
-class TouchingModel(eqx.Module):
+class ContactModel(eqx.Module):
     """The model of a step. `stiffness`, `force`: of the bodies and of the rods that touch nothing, along `motions`.
 
     `push`: by how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
     negative; `may_reverse`: whether a minimum is sought.
     """
 
-    groups: tuple[TouchingRods, ...]
+    groups: tuple[RodsInContact, ...]
     motions: Float[Array, "6j q"]
     stiffness: Float[Array, "q q"]
     force: Float[Array, "q"]
@@ -237,20 +241,20 @@ class TouchingModel(eqx.Module):
             first += rods.size
         return found
 
-    def _firm(
-        self, rods: TouchingRods, is_closed: Array, softness: Array, shift: Float[Array, "k"]
+    def _regularized(
+        self, rods: RodsInContact, is_closed: Array, contact_compliance: Array, shift: Float[Array, "k"]
     ) -> tuple[Eliminated, Float[Array, "k"]]:
         """Stiffer until each rod by itself has a minimum."""
         if not self.may_reverse:
-            return _eliminated(rods, is_closed, softness, shift), shift
+            return _eliminated(rods, is_closed, contact_compliance, shift), shift
 
         def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
             shift, tries, found = trial
             larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
             shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
-            return shift, tries + 1, _eliminated(rods, is_closed, softness, shift)
+            return shift, tries + 1, _eliminated(rods, is_closed, contact_compliance, shift)
 
-        kinds = jax.eval_shape(_eliminated, rods, is_closed, softness, shift)
+        kinds = jax.eval_shape(_eliminated, rods, is_closed, contact_compliance, shift)
         blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         shift, _, found = jax.lax.while_loop(
             lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
@@ -259,13 +263,15 @@ class TouchingModel(eqx.Module):
         )
         return found, shift
 
-    def solved(self, is_closed: Array, trial: Array, softness: Array, memory: Memory) -> tuple[Array, Any, Memory]:
+    def solved(
+        self, is_closed: Array, trial: Array, contact_compliance: Array, memory: Memory
+    ) -> tuple[Array, Any, Memory]:
         stiffness, force = self.stiffness + memory.reversal, self.force + memory.push
         all_found, shifts, is_minimum = [], [], jnp.array(True)
         for rods, closed, soft, last in zip(
-            self.groups, self.split(is_closed), self.split(softness), memory.shifts, strict=True
+            self.groups, self.split(is_closed), self.split(contact_compliance), memory.shifts, strict=True
         ):
-            found, shift = self._firm(rods, closed, soft, last)
+            found, shift = self._regularized(rods, closed, soft, last)
             all_found.append(found)
             shifts.append(shift)
             is_minimum &= jnp.all(found.is_minimum)
@@ -282,21 +288,21 @@ class TouchingModel(eqx.Module):
             aside = vectors @ jnp.where(is_below, self.push * jnp.abs(values) * sides, 0.0)
             push += aside
             force += aside
-            firm = jnp.maximum(jnp.abs(values), self.least)
+            regularized = jnp.maximum(jnp.abs(values), self.least)
         else:
-            firm = jnp.where(jnp.abs(values) < self.least, self.least, values)
+            regularized = jnp.where(jnp.abs(values) < self.least, self.least, values)
             is_minimum &= ~jnp.any(is_below)
-        q = vectors @ ((vectors.T @ force) / firm)
+        q = vectors @ ((vectors.T @ force) / regularized)
         bodies, motions = self.bodies(q), []
         for rods, found in zip(self.groups, all_found, strict=True):
             of_ends = rods.of_ends(bodies)
-            moved = (jnp.einsum("k...i,ki->k...", by, of_ends) for by in found.by_motions)
-            motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(moved))))
+            by_ends = (jnp.einsum("k...i,ki->k...", by, of_ends) for by in found.by_motions)
+            motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_ends))))
         negative = tuple(found.negative for found in all_found)
         below = jnp.where(jnp.any(is_below), jnp.sum(is_below), memory.below)
         return is_minimum, (tuple(motions), q), Memory(tuple(shifts), negative, reversal, below, push)
 
-    def _at_ends(self, rods: TouchingRods) -> Float[Array, "k 12 q"]:
+    def _at_ends(self, rods: RodsInContact) -> Float[Array, "k 12 q"]:
         """The motions of the ends of rods by q."""
         padded = jnp.pad(self.motions, ((0, 6), (0, 0))).reshape(-1, 6, self.motions.shape[1])
         return padded[rods.body].reshape(len(rods.body), 12, -1)
@@ -321,15 +327,17 @@ class TouchingModel(eqx.Module):
 
 
 def _along_rod(
-    rod: TouchingRods, shift: Float[Array, ""], here: tuple[Array, Array, Array], ahead: tuple[Array, Array, Array]
+    rod: RodsInContact, shift: Float[Array, ""], here: tuple[Array, Array, Array], ahead: tuple[Array, Array, Array]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     coupling = rod.coupling
     system = rod.system.closed_where(jnp.zeros(rod.contacts.gaps.shape, bool)).shifted(shift / rod.f.shape[1])
 
     def times(x: Array, y: Array, q: Array) -> tuple[Array, Array, Array]:
         moments, rows = system.times(x, y)
-        by_bodies = coupling.second @ q + coupling.of_closure.T @ y + jnp.einsum("bmi,bm->i", coupling.of_gradient, x)
-        return moments + coupling.of_gradient @ q, rows + coupling.of_closure @ q, by_bodies
+        by_bodies = (
+            coupling.second @ q + coupling.of_constraints.T @ y + jnp.einsum("bmi,bm->i", coupling.of_gradient, x)
+        )
+        return moments + coupling.of_gradient @ q, rows + coupling.of_constraints @ q, by_bodies
 
     def works(motion: tuple[Array, Array, Array], by: tuple[Array, Array, Array]) -> Float[Array, ""]:
         x, y, q = motion
@@ -338,14 +346,14 @@ def _along_rod(
 
     x, y, q = ahead
     by_ahead = times(*ahead)
-    _, _, u, _ = system.parted(y)
-    _, _, of_nodes, _ = system.parted(rod.c)
+    _, _, u, _ = system.split(y)
+    _, _, of_nodes, _ = system.split(rod.c)
     linear = jnp.sum(rod.f * x) + jnp.sum(of_nodes * u) - rod.first @ q
     slope = (works(here, by_ahead) + works(ahead, times(*here))) / 2 - linear
     return slope, works(ahead, by_ahead)
 
 
-class Touched(NamedTuple):
+class ContactStep(NamedTuple):
     """The step that a search found: of each group rotations, multipliers, the pressures at the ends, shifts, and
     negative eigenvalues; motions of the bodies; whether the contacts were found and the rods have a minimum.
     """
@@ -359,10 +367,10 @@ class Touched(NamedTuple):
     is_found: Bool[Array, ""]
 
 
-def touched(model: TouchingModel, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> Touched:
+def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> ContactStep:
     """The minimum of a model."""
     groups = model.groups
-    contacts = TouchingBodies(
+    contacts = BodyContacts(
         *(
             model.rows(list(row))
             for row in (
@@ -373,20 +381,20 @@ def touched(model: TouchingModel, shifts: tuple[Float[Array, "k"], ...], damping
         )
     )
     is_closed = model.rows([rods.row(rods.system.contacts.is_closed, rods.at_ends.is_closed) for rods in groups])
-    softness = model.rows([rods.softness for rods in groups])
-    end = sought(model, contacts, is_closed, softness, model.nowhere(), model.begin(shifts, damping))
+    contact_compliance = model.rows([rods.contact_compliance for rods in groups])
+    end = sought(model, contacts, is_closed, contact_compliance, model.nowhere(), model.begin(shifts, damping))
     of_rods, q = end.motion
-    change = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / softness)
+    change = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
     change -= contacts.pressures
     motions, at_ends = [], []
     for rods, (x, y), row in zip(groups, of_rods, model.split(change), strict=True):
-        in_rods, in_ends = rods.parted(row)
+        in_rods, in_ends = rods.split(row)
         size = rods.system.compliance.shape[-1]
         y = y.at[:, size : size + in_rods[0].size].set(in_rods.reshape(len(y), -1))
         motions.append((x, y))
         at_ends.append(in_ends)
     negative = sum((jnp.sum(each) for each in end.memory.negative), jnp.zeros((), int))
-    return Touched(
+    return ContactStep(
         tuple(motions),
         tuple(at_ends),
         end.memory.shifts,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rodjax import Clamp, Clip, Cylinder, Free, PointForce, Potential, Rod, Scene, frame
+from rodjax.discretization.contact_gaps import gaps_and_normals, within_elements
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.linalg.chain import ChainSystem
@@ -132,7 +133,7 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
             value, _, there = step.value(rod, motions.reshape(2, 6), jnp.ones(()))
             near = rod.form_at(motions.reshape(2, 6))
             assert isinstance(near, NodalForm)
-            gaps = jnp.concatenate([near.gaps_and_normals(there.nodal.positions)[0], near.within_elements(there)[1]])
+            gaps = jnp.concatenate([gaps_and_normals(near, there.nodal.positions)[0], within_elements(near, there)[1]])
             return value - jnp.sum(pressures * gaps), gaps
 
         nowhere = jnp.zeros_like(here.gradient), jnp.zeros((3, 3)), jnp.zeros(form.layout.size)

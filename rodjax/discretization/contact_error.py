@@ -5,9 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.discretization.contact_gaps import depths_at, rough_obstacles
 from rodjax.discretization.error import Errors
 from rodjax.discretization.form_results import positions_between_nodes
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_positions import PositionForm
 from rodjax.geometry.vectors import dot, root
 
 # A force F that acts aside of its place by half of the distance h to the next one where contacts act bends the rod as a
@@ -18,7 +19,7 @@ CONTACT_MOMENT = 8.0
 DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
-def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
+def with_contacts(errors: Errors, form: PositionForm, point: Any) -> Errors:
     """With what it adds that contacts act at nodes and middles of elements, with friction at nodes alone: where one
     lies by itself, it may be anywhere beside these.
 
@@ -28,7 +29,7 @@ def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
     forces = jnp.where(form.is_held[None], 0.0, form.applied(point))
     beside = jnp.pad(forces, ((0, 0), (1, 1)))
     alone = forces - (beside[:, :-2] + beside[:, 2:]) / 2  # not the pressure of an obstacle along which the rod lies
-    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / (2 if form.rough else 4)
+    spacing = (jnp.append(h, h[-1]) + jnp.append(h[0], h)) / (2 if rough_obstacles(form.scene) else 4)
     misplaced = alone * (spacing**2 / CONTACT_REACH)[None]
     sizes = root(dot(misplaced, misplaced))
     defects = errors.defects
@@ -39,17 +40,17 @@ def with_contacts(errors: Errors, form: NodalForm, point: Any) -> Errors:
     return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
 
 
-def depths_of_elements(form: NodalForm, point: Any) -> Float[Array, "n"]:
+def depths_of_elements(form: PositionForm, point: Any) -> Float[Array, "n"]:
     """How deep the rod lies within obstacles at the ends of each element and between them, by the radius; of an element
     beside a held place so much more than it is held there.
     """
     s, nodes = form.field.s, point.nodal.positions
-    at_nodes = form.depths_at(nodes, form.radius)
+    at_nodes = depths_at(form.scene, nodes, form.radius)
     held = jnp.where(form.is_held, at_nodes, 0.0)
     parts = jnp.array(DEPTH_PLACES, s.dtype)
     arclengths = s[:-1, None] + parts[None] * jnp.diff(s)[:, None]
     positions = positions_between_nodes(form, point, nodes, arclengths.reshape(-1))
-    between = form.depths_at(positions, form.radius_in_elements(parts).reshape(-1)).reshape(arclengths.shape)
+    between = depths_at(form.scene, positions, form.radius_in_elements(parts).reshape(-1)).reshape(arclengths.shape)
     at_ends = jnp.where(form.is_held, 0.0, at_nodes)
     depths = jnp.concatenate(
         [at_ends[:-1, None], at_ends[1:, None], between - held[:-1, None] - held[1:, None]], axis=1

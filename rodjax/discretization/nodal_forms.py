@@ -18,7 +18,9 @@ from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.nodal import NodalForm, larger
+from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_contacts import contact_residuals, contacts_at, larger
+from rodjax.discretization.node_friction import by_law
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
@@ -67,9 +69,9 @@ class NodalTangents(NodalForm, MixedForm):
         assert blocks.across is not None
         cells = self._by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
-        contacts = self.contacts(point)
+        contacts = contacts_at(self, point)
         assert point.nodal is not None
-        rows, balance, amiss = self.contact_residuals(point, contacts)
+        rows, balance, amiss = contact_residuals(self, point, contacts)
         constraint_residual = [rows, balance.reshape(-1), self.gap_of_elements(point, edges).reshape(-1)]
         dtype = energy.dtype
         columns = [] if torque_column is None else [torque_column]
@@ -116,7 +118,7 @@ class NodalTangents(NodalForm, MixedForm):
         )
 
     def residual_vectors(self, point: MixedPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        return super().residual_vectors(self.by_law(point))
+        return super().residual_vectors(by_law(self, point))
 
     def in_cells_at(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
         energy, segment_vectors = self.in_elements(point, point.tangents, jnp.zeros_like(point.end_force))
@@ -251,10 +253,10 @@ class NodalFrames(NodalForm, FrameForm):
             gradient = gradient.at[:, ::2].add(fields.by_rotation)
             diagonal = diagonal.at[..., ::2].add(fields.by_rotations)
         assert across is not None, "elements, not joints"
-        contacts = self.contacts(point)
+        contacts = contacts_at(self, point)
         gradient = contacts.added_to(gradient)
         assert point.nodal is not None
-        rows, balance, amiss = self.contact_residuals(point, contacts)
+        rows, balance, amiss = contact_residuals(self, point, contacts)
         dtype = gradient.dtype
         system = ChainSystem(
             diagonal,
@@ -292,13 +294,13 @@ class NodalFrames(NodalForm, FrameForm):
         return self.across[:, None, None, None] * jnp.tensordot(self.across, by_force, 1)[None]
 
     def residual_vectors(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "k"]]:
-        point = self.by_law(point)
+        point = by_law(self, point)
         gradient, fields = self._moments(point), self.at_nodes(point)
         if fields is not None:
             gradient = gradient.at[:, ::2].add(fields.by_rotation)
-        contacts = self.contacts(point)
+        contacts = contacts_at(self, point)
         gradient = contacts.added_to(gradient)
-        rows, balance, _ = self.contact_residuals(point, contacts)
+        rows, balance, _ = contact_residuals(self, point, contacts)
         gaps = self.gap_of_elements(point, self.edges(point))
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.discretization.contact_gaps import model_compliance
 from rodjax.discretization.form import Form, Linearization
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.motion import Metric
@@ -66,7 +67,7 @@ def _of_rod(rod: RodInBodies, point: object, pressures: Float[Array, "o 2"] | No
         assert isinstance(form, NodalForm)
         at_ends, couple = end_contacts(rod, form, pressures, couple)
         rates = jnp.where(at_ends.is_closed[..., None], at_ends.rates, 0.0)
-        stiff = jnp.einsum("oei,oej->eij", rates, rates) / form.contact_compliance
+        stiff = jnp.einsum("oei,oej->eij", rates, rates) / model_compliance(form)
         couple = couple._replace(second=couple.second + jax.scipy.linalg.block_diag(*stiff))
         couple = couple._replace(of_constraints=_with_gaps(here, couple))
     return here, couple, Metric.of(form, here).mass / rod.units.force, of_ends.reshape(12, 12) / rod.units.force

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rodjax.discretization.contact_gaps import curvatures, distances_and_normals, model_compliance
 from rodjax.discretization.form import EndTurn, Form, Linearization
 from rodjax.discretization.layout import SpanForces
-from rodjax.discretization.nodal import GAP_WEIGHT, LEAST_RELAXED, LIES_ON, NodalForm
+from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
 from rodjax.model.supports import Clamp, rotate
@@ -104,7 +106,7 @@ class EndContacts(NamedTuple):
 
 def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Float[Array, "o 2 3"]]:
     """Gaps between obstacles and the ends of a rod in bodies that these push, else 1, and the directions of growth."""
-    distances, normals = form.distances_and_normals(_places(form))
+    distances, normals = distances_and_normals(form.scene, _places(form))
     radius = form.radius[np.array([0, -1])]
     touches = rod.touches[None]
     return jnp.where(touches, distances - radius[None], 1.0), jnp.where(touches[..., None], normals, 0.0)
@@ -120,8 +122,8 @@ def _places(form: NodalForm) -> Float[Array, "2 3"]:
 def end_contact_energy(rod: RodInBodies, form: NodalForm, here: EndContacts) -> Float[Array, ""]:
     """As `NodalForm.contact_energy`, from where a step begins."""
     gaps, _ = end_gaps(rod, form)
-    pressures = here.pressures - (gaps + here.gaps - here.found) / form.contact_compliance
-    return form.contact_compliance / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+    pressures = here.pressures - (gaps + here.gaps - here.found) / model_compliance(form)
+    return model_compliance(form) / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
 
 
 def end_contacts(
@@ -133,7 +135,7 @@ def end_contacts(
     carried = jnp.stack([rod.carried(0), rod.carried(1)])
     rates = jnp.einsum("oec,eci->oei", normals, carried)
     pulls = -jnp.einsum("oe,oec->ec", pressures, normals)
-    curved = -jnp.einsum("oe,oecd->ecd", pressures, form.curvatures(_places(form)))
+    curved = -jnp.einsum("oe,oecd->ecd", pressures, curvatures(form.scene, _places(form)))
     first = jnp.einsum("ec,eci->ei", pulls, carried)
     second = jnp.einsum("eci,ecd,edj->eij", carried, curved, carried)
     second = second.at[:, 3:, 3:].add(jnp.stack([lifted(pulls[e], rod.arm(e)) for e in range(2)]))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import instance, is_known, leaf, one_of, positive, whole_number
 from rodjax.discretization.cells import segments_for_jumps
+from rodjax.discretization.contact_gaps import pressure_rows
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_shape import first_shape
 from rodjax.discretization.first_twist import FirstTwist, last_of
@@ -25,7 +26,7 @@ from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.layout import force_parts, in_parts
 from rodjax.discretization.mixed import MixedForm, MixedPoint
-from rodjax.discretization.nodal import NodalForm, pressure_rows
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import Friction
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape

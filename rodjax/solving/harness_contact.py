@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.form import Linearization
 from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_contacts import contact_model
 from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
 from rodjax.solving.coupling import Coupling, EndContacts
@@ -59,7 +60,7 @@ class RodsInContact(eqx.Module):
             assert here.gaps is not None
             assert coupling.of_gaps is not None
             moments, c = form.without_contacts(here, forces)
-            contacts = form.model(point, here.gaps, here.reference_displacements)
+            contacts = contact_model(form, point, here.gaps, here.reference_displacements)
             system = system.closed_where(form.first_closed(system.contacts.is_closed, contacts))
             first = coupling.first + jnp.einsum("rni,rn->i", coupling.of_gaps, forces)
             first += jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import instance, is_known, leaf, number_list
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.contact_error import depths_of_elements, with_contacts
+from rodjax.discretization.contact_gaps import distances_and_normals
 from rodjax.discretization.dead_loads import energy_of_origin
 from rodjax.discretization.error import (
     Errors,
@@ -39,8 +40,9 @@ from rodjax.discretization.framed_results import (
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
-from rodjax.discretization.nodal import SLIPS, STICKS, NodalForm
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import Friction, Nodal
+from rodjax.discretization.node_contacts import SLIPS, STICKS, exerted_by_itself, exerted_by_obstacles, shares
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
@@ -531,8 +533,8 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     assert isinstance(form, NodalForm)
     forces = form.applied(point).T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
-    shares = form.shares(point) * equilibrium.state.units.force
-    return (forces - shares)[clips], jnp.where(form.is_held[:, None], shares, forces)
+    within = shares(form, point) * equilibrium.state.units.force
+    return (forces - within)[clips], jnp.where(form.is_held[:, None], within, forces)
 
 
 class _Contacts(eqx.Module):
@@ -558,8 +560,8 @@ def _contacts_of(equilibrium: Equilibrium) -> _Contacts:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     units = equilibrium.state.units
-    distances, _ = form.distances_and_normals(point.nodal.positions)
-    pushes, drags, states = form.exerted(point)
+    distances, _ = distances_and_normals(form.scene, point.nodal.positions)
+    pushes, drags, states = exerted_by_obstacles(form, point)
     gaps = (distances - form.radius[None]) * units.length
     return _Contacts((pushes + drags) * units.force, drags * units.force, states, gaps)
 
@@ -576,7 +578,7 @@ def _self_contacts_of(equilibrium: Equilibrium) -> SelfContacts:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     units = equilibrium.state.units
-    found = form.self_exerted(point)
+    found = exerted_by_itself(form, point)
     return SelfContacts(
         found.s * units.length, found.beyond * units.length, found.gaps * units.length, found.forces.T * units.force
     )

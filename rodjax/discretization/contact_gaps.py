@@ -1,0 +1,149 @@
+"""Gaps between a rod whose nodes have positions of their own and the obstacles of its scene, at nodes and in elements.
+
+Obstacles without friction (`smooth_obstacles`) touch the middles of elements too. A node that a support holds has no
+gaps: they count as 1. Rows of pressures are, in this order, those of all obstacles at nodes, those of obstacles without
+friction within elements, and one between elements (`self_contact`).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rodjax.discretization.inner_contacts import Middles
+from rodjax.discretization.layout import CellForces
+from rodjax.discretization.node_positions import PositionForm
+from rodjax.discretization.self_contact import Curve
+from rodjax.model.obstacles import InUnits, Obstacle
+from rodjax.model.scene import Scene
+
+# Compliance of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change,
+# times some 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
+CONTACT_COMPLIANCE = 1e-5
+# And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
+# one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
+LEAST_COMPLIANCE = 5e4
+# Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
+# would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
+FAR_COMPLIANCE = 1e-6
+# In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
+# would say the same, and who bears it would be undetermined: so nodes do.
+THINNER = 1e-5
+
+
+def coefficient(obstacle: Obstacle) -> Any:
+    """The coefficient of friction of an obstacle of a nondimensional scene."""
+    return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction
+
+
+def smooth_obstacles(scene: Scene) -> tuple[int, ...]:
+    """The numbers of the obstacles without friction: those that elements touch in their middles too."""
+    return tuple(k for k, obstacle in enumerate(scene.obstacles) if coefficient(obstacle) is None)
+
+
+def rough_obstacles(scene: Scene) -> tuple[int, ...]:
+    """The numbers of the obstacles with friction."""
+    return tuple(k for k, obstacle in enumerate(scene.obstacles) if coefficient(obstacle) is not None)
+
+
+def inner_rows(scene: Scene) -> slice:
+    """Of all rows of pressures, those within elements."""
+    return slice(len(scene.obstacles), len(scene.obstacles) + len(smooth_obstacles(scene)))
+
+
+def pressure_rows(scene: Scene) -> int:
+    """Of all obstacles at nodes, of those without friction within elements, and one between elements."""
+    return len(scene.obstacles) + len(smooth_obstacles(scene)) + scene.self_contact
+
+
+def has_inner_contacts(form: PositionForm) -> bool:
+    """Whether the rod may touch something between its nodes."""
+    return bool(smooth_obstacles(form.scene)) or form.scene.self_contact
+
+
+def distances_and_normals(
+    scene: Scene, positions: Float[Array, "n+1 3"]
+) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
+    """Distances from the obstacles to positions, and their gradients."""
+    found = [jax.vmap(jax.value_and_grad(obstacle.at))(positions) for obstacle in scene.obstacles]
+    return jnp.stack([distance for distance, _ in found]), jnp.stack([normals for _, normals in found])
+
+
+def curvatures(scene: Scene, positions: Float[Array, "p 3"]) -> Float[Array, "k p 3 3"]:
+    """The second derivatives of the distances from the obstacles."""
+    return jnp.stack([jax.vmap(jax.hessian(obstacle.at))(positions) for obstacle in scene.obstacles])
+
+
+def curvature_terms(
+    scene: Scene, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"], which: tuple[int, ...] | None = None
+) -> Float[Array, "p 3 3"]:
+    """Second derivatives of -sum p g by the positions of nodes or middles; `which`: the obstacles, if not all."""
+    total = jnp.zeros((len(positions), 3, 3), positions.dtype)
+    obstacles = scene.obstacles if which is None else [scene.obstacles[k] for k in which]
+    for obstacle, pressure in zip(obstacles, pressures, strict=True):
+        # Where the rod touches nothing of an obstacle, its curvature is not computed.
+        total = jax.lax.cond(
+            jnp.any(pressure != 0),
+            lambda total, obstacle=obstacle, pressure=pressure: (
+                total - pressure[:, None, None] * jax.vmap(jax.hessian(obstacle.at))(positions)
+            ),
+            lambda total: total,
+            total,
+        )
+    return total
+
+
+def depths_at(scene: Scene, positions: Float[Array, "k 3"], radius: Float[Array, "k"]) -> Float[Array, "k"]:
+    """Penetration into the nearest obstacle at these positions, relative to the radius there; 0 outside."""
+    distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in scene.obstacles])
+    return jnp.maximum(1 - jnp.min(distances, axis=0) / radius, 0.0)
+
+
+def gaps_and_normals(
+    form: PositionForm, positions: Float[Array, "n+1 3"]
+) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:
+    """Gaps at the nodes, 1 at those that are held, and the directions in which they grow."""
+    if not form.scene.obstacles:
+        return jnp.zeros((0, len(positions)), positions.dtype), jnp.zeros((0, *positions.shape), positions.dtype)
+    distances, normals = distances_and_normals(form.scene, positions)
+    return jnp.where(form.is_at_support[None], 1.0, distances - form.radius[None]), normals
+
+
+def within_elements(form: PositionForm, point: Any) -> tuple[Middles, Float[Array, "q n+1"], Float[Array, "q n 3"]]:
+    """The middles of the elements, their gaps, and the directions in which these grow."""
+    s = form.field.s
+    free = jnp.where(form.is_held, 0.0, 1.0).astype(s.dtype)
+    middles = Middles.of(point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, jnp.diff(s))
+    if not smooth_obstacles(form.scene):
+        return middles, jnp.zeros((0, len(s)), s.dtype), jnp.zeros((0, len(s) - 1, 3), s.dtype)
+    distances, normals = distances_and_normals(form.scene, middles.points)
+    smooth = np.array(smooth_obstacles(form.scene))
+    radius = (1 - THINNER) * form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+    gaps = distances[smooth] - radius[None]
+    return middles, jnp.pad(gaps, ((0, 0), (0, 1)), constant_values=1.0), normals[smooth]
+
+
+def curve(form: PositionForm, point: Any) -> Curve:
+    """What self-contact needs of the rod at a point."""
+    s = form.field.s
+    free = jnp.where(form.is_at_support, 0.0, 1.0).astype(s.dtype)
+    radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+    assert isinstance(form.layout, CellForces)
+    normal = form.layout.normal  # of the plane of the rod
+    return Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, normal)
+
+
+def model_compliance(form: PositionForm) -> Float[Array, ""]:
+    """Compliance of the contacts in the model of a step [L^3/EI]."""
+    h = jnp.diff(form.field.s)
+    compliance = CONTACT_COMPLIANCE * h[jnp.argmin(h)] ** 3
+    if not smooth_obstacles(form.scene):
+        return compliance
+    return jnp.maximum(compliance, LEAST_COMPLIANCE * jnp.finfo(h.dtype).eps)
+
+
+def far_unit(form: PositionForm) -> Float[Array, ""]:
+    """The unit of pressures between elements in which all contacts have the same compliance."""
+    return jnp.sqrt(model_compliance(form) / FAR_COMPLIANCE)

@@ -1,0 +1,195 @@
+"""Rods whose nodes have positions of their own, and a force in each element: supports, loads and fields at the nodes.
+
+The force F through an element is the multiplier of its vector from node to node, and the positions x of the nodes are
+unknowns of their own,
+
+    L = L of the elements + sum F . (x_after - x_before - segment vector of the element),
+
+so what acts on an element depends on what is local, the system is a chain, and a step of Newton's method moves nodes
+along straight lines. `nodal.NodalForm` adds contacts.
+"""
+
+import dataclasses
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rodjax.discretization import potentials
+from rodjax.discretization.form import Form, Linearization
+from rodjax.discretization.layout import SpanForces
+from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.potentials import NodeEnergy
+from rodjax.geometry.interpolation import cubic
+from rodjax.geometry.vectors import dot
+from rodjax.mechanics.passage import SAMPLES
+from rodjax.model.along import Value, largest_beside, value_at
+from rodjax.model.supports import Clamp, Held
+
+# Where it is looked whether a rod has come through: beside nodes and middles of most meshes, by this part of a step.
+BESIDE = 0.3
+
+
+class PositionForm(Form):
+    """A nondimensional scene; the `end_force` of its points is (3, n): that through each element, and their `nodal` is
+    there. `ends_move`: of a linearisation in which clamped ends have no given position (`released`).
+    """
+
+    ends_move: bool = eqx.field(kw_only=True, static=True, default=False)
+
+    def released(self, point: Any) -> Linearization:
+        """The ends that clamps hold may turn and move; `residual` without these."""
+        return dataclasses.replace(self, ends_move=True).linearized(point)
+
+    @abstractmethod
+    def node_slopes(self, point: Any) -> Float[Array, "n+1 3"]:
+        """The derivative of the centerline by arclength at the nodes."""
+
+    @abstractmethod
+    def node_axes(self, point: Any) -> Float[Array, "3 b n+1"]:
+        """About which the tangents of the nodes turn, by rotations that are unknown."""
+
+    @abstractmethod
+    def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
+        """What stretch and forces add to L under other forces, and the segment vectors; `elements`: as of
+        `turning_elements`.
+        """
+
+    @abstractmethod
+    def in_cells_at(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        """What the cells add to L, all of it, and their segment vectors."""
+
+    @abstractmethod
+    def turning_elements(self, point: Any, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]) -> Any:
+        """What `in_elements` needs, and its rate as the rod begins to turn."""
+
+    # --- what is unknown ---------------------------------------------------------------------------------------------
+
+    def multipliers_turned(
+        self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
+    ) -> Float[Array, "k"]:
+        positions, _ = self.held_positions
+        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.positions - positions[:, 0][None])
+        by_node = jnp.cross(axis[None], arms).reshape(-1)
+        of_force = self.force_turned(point, axis)
+        return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
+
+    def axial_forces(self, point: Any) -> Float[Array, "slides"]:
+        nodes = self.clip_nodes
+        assert nodes is not None
+        along = dot(self.applied(point)[:, nodes], self.tangents_in_clips(point))
+        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
+
+    def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
+        return super().is_closed(self.force_components(constraint_residual), tolerance)
+
+    def nodal_held(self, nodal: Nodal | None) -> Nodal | None:
+        if nodal is None:
+            return None
+        positions, held = self.held_positions
+        return dataclasses.replace(nodal, positions=nodal.positions.at[held].set(positions.T))
+
+    def forces_in_elements(self, point: Any) -> Float[Array, "3 n"]:
+        """The forces through the elements, of those in the spans, as files until format 10 have them."""
+        members = SpanForces.of(self.scene, self.clip_nodes, len(self.field.s) - 1)
+        forces = jnp.broadcast_to(members.gather(point.end_force), (3, len(self.field.s) - 1))
+        loads = self.loads_on_nodes(point)
+        if loads is None:
+            return forces
+        if isinstance(self.scene.start, Held):
+            return forces + jnp.cumsum(loads[:, :0:-1], axis=1)[:, ::-1]
+        return forces - jnp.cumsum(loads[:, :-1], axis=1)
+
+    # --- supports, and the radius ------------------------------------------------------------------------------------
+
+    @property
+    def is_held(self) -> Bool[Array, "n+1"]:
+        """Whether the position of a node is given."""
+        return self.is_at_support & ~self._is_at_joint if self.ends_move else self.is_at_support
+
+    @property
+    def is_at_support(self) -> Bool[Array, "n+1"]:
+        _, nodes = self.held_positions
+        return jnp.zeros(len(self.field.s), bool).at[nodes].set(True)
+
+    @property
+    def _is_at_joint(self) -> Bool[np.ndarray, "n+1"]:
+        """At ends that clamps hold, whose poses bodies of a harness may have."""
+        is_at_joint = np.zeros(len(self.field.s), bool)
+        is_at_joint[[0, -1]] = [isinstance(end, Clamp) for end in (self.scene.start, self.scene.end)]
+        return is_at_joint
+
+    @property
+    def radius(self) -> Float[Array, "n+1"]:
+        """At the nodes; of a radius that jumps, the larger one beside the node."""
+        return largest_beside(self._radius, self.field.s)
+
+    def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
+        """At places in each element, as parts of it."""
+        s = self.field.s
+        begin, end = (jnp.broadcast_to(side[:, None], (len(s) - 1, len(parts))) for side in (s[:-1], s[1:]))
+        return value_at(self._radius, begin + parts[None] * (end - begin), begin, end)
+
+    @property
+    def _radius(self) -> Value:
+        radius = self.scene.rod.radius
+        assert radius is not None, "a scene with obstacles has a radius"
+        return radius
+
+    def samples(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
+        """At steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
+        beside a held node this, elsewhere not a number.
+        """
+        s = self.field.s
+        x = jnp.linspace(0.0, 1.0, SAMPLES, dtype=s.dtype)
+        x = x.at[1:-1].add(BESIDE * x[1])
+        points = cubic(s, nodes, self.node_slopes(point), x)
+        cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
+        radius = value_at(self._radius, x, s[cell], s[cell + 1])
+        beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
+        return points, radius, jnp.where(self.is_held[cell][:, None], nodes[cell], beside)
+
+    # --- loads and fields --------------------------------------------------------------------------------------------
+
+    def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
+        """The forces of fields on the nodes; `None` without fields."""
+        if not self.scene.potentials:
+            return None
+        return -potentials.by_position(self.scene, self.field.s, *self.node_lines(point)).T
+
+    def node_lines(self, point: Any) -> tuple[Float[Array, "n+1 3"], Float[Array, "3 n+1"]]:
+        """The positions and tangents of the nodes."""
+        return point.nodal.positions, point.tangents[:, ::2]
+
+    def at_nodes(self, point: Any) -> NodeEnergy | None:
+        """What fields are at the nodes, by the rotations that are unknown; `None` without fields."""
+        if not self.scene.potentials:
+            return None
+        return potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), self.node_axes(point))
+
+    def load_energy(self, point: Any) -> Float[Array, ""]:
+        energy = super().load_energy(point)  # pyright: ignore
+        if not self.scene.potentials:
+            return energy
+        return energy + jnp.sum(potentials.node_energies(self.scene, self.field.s, *self.node_lines(point)))
+
+    def applied(self, point: Any) -> Float[Array, "3 n+1"]:
+        """The forces that clips, contacts and supports apply at the nodes."""
+        around = jnp.pad(point.end_force, ((0, 0), (1, 1)))
+        applied, loads = around[:, :-1] - around[:, 1:], self.loads_on_nodes(point)
+        return applied if loads is None else applied - loads
+
+    def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        """Without contacts."""
+        energy, segment_vectors = self.in_cells_at(point)
+        energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0))
+        if self.scene.potentials:
+            energy += jnp.sum(potentials.node_energies(self.scene, self.field.s, *self.node_lines(point)))
+        return energy, self.gap_of_elements(point, segment_vectors).reshape(-1)
+
+    def gap_of_elements(self, point: Any, segment_vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """The vectors between nodes minus the segment vectors of the elements."""
+        return jnp.diff(point.nodal.positions, axis=0) - segment_vectors

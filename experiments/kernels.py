@@ -36,7 +36,8 @@ from rodjax.discretization.joints import (
     twist_derivatives,
     with_held_tangents,
 )
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.results import resultants
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve

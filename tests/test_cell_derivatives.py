@@ -8,7 +8,8 @@ import pytest
 import rodjax as rj
 from rodjax.discretization.cells import ElementCells, JointCells
 from rodjax.discretization.element_strains import ElementStrains
-from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.frame_point import FramePoint
+from rodjax.discretization.framed import FrameForm
 from rodjax.model.scene import nondimensional
 
 CELLS = 3

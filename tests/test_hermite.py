@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 import rodjax as rj
 from rodjax import Clamp, Equilibrium, Free, Pin, PointForce, Rod, Scene, Status, Swivel, frame, problems
 from rodjax.discretization.hermite import QuadraticRotationElements
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.model.scene import nondimensional
 

@@ -15,7 +15,8 @@ from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.hermite import QuadraticRotationElements
-from rodjax.discretization.mixed import Linearization, MixedForm, MixedPoint
+from rodjax.discretization.mixed import Linearization, MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.discretization.twist import transport_along, twist_under_moment
 from rodjax.linalg.saddle_point import SaddlePointSystem

@@ -37,7 +37,8 @@ from rodjax.analysis.shooting import (
     sum_of_loads,
 )
 from rodjax.discretization.cells import ElementCells, varying
-from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.frame_point import FramePoint
+from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.framed_results import own_moments
 from rodjax.geometry.rotations import columns, continuous, from_frame, product, unit

@@ -19,8 +19,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rodjax.checks import Numbers, namespace
+from rodjax.discretization.element_bending import SIMPSON
+from rodjax.discretization.element_points import interleaved, of_elements, parts_before, scatter_add
 from rodjax.discretization.element_strains import ElementStrains
-from rodjax.discretization.hermite import SIMPSON, interleaved, of_elements, parts_before, scatter_add
 from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
 from rodjax.geometry.rotations import inverse, product, unit
 from rodjax.linalg.blocks import short_sum

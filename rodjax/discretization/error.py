@@ -19,9 +19,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.discretization.element_points import interleaved
 from rodjax.discretization.form import Form, Linearization, Point
-from rodjax.discretization.hermite import QuadraticRotationElements, interleaved
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.hermite import QuadraticRotationElements
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
 from rodjax.discretization.results import clip_moments, resultants, with_fields_by_tangent
 from rodjax.discretization.twist import transport

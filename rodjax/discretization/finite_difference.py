@@ -26,7 +26,7 @@ from rodjax.discretization.joints import (
     tangent_bases,
     with_held_tangents,
 )
-from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import (
     FramedTangents,

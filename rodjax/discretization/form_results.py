@@ -7,11 +7,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_results import (
-    clip_moments_of_frames,
-    positions_between_frames,
-    resultants_of_frames,
-)
+from rodjax.discretization.framed_results import clip_moments_of_frames, positions_between_frames, resultants_of_frames
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import Resultants, clip_moments, positions_between, resultants
 

@@ -16,30 +16,28 @@ Loads without a potential are those of `nodal_forms.NodalFrames`.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.cell_derivatives import CellDerivatives, CellStates, derivatives, first_derivatives
 from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
+from rodjax.discretization.frame_point import FramePoint, HeldFrame, Kinematics, Strained, turned_correction
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.layout import ForceLayout, SpanForces
-from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.nodes import held_nodes
-from rodjax.discretization.rest_correction import RestCorrection, part
+from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.geometry.rotations import (
     align_tangent,
     columns,
     from_frame,
     inverse,
     nearer,
-    rotate_about_tangent,
     rotated,
-    tangent,
     turned,
     unit,
 )
@@ -54,89 +52,6 @@ from rodjax.model.supports import Clamp, Directed
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
 # and of EI/L^2: directions count as lying in the plane up to as much.
 OUT_OF_PLANE = 1e-5
-
-
-class FramePoint(eqx.Module):
-    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known; with
-    obstacles where the nodes lie and what pushes.
-    """
-
-    quaternions: Float[Array, "4 m"]
-    end_force: Float[Array, "3 parts"]
-    total_twist: Float[Array, ""]
-    nodal: Nodal | None = None
-
-    @property
-    def tangents(self) -> Float[Array, "3 m"]:
-        return tangent(self.quaternions)
-
-    def flattened(self, normal: Float[Array, "3"], across: Float[Array, "3"]) -> "FramePoint":
-        """The point turned into a plane: with the normal along `across` in the axes of each frame."""
-        tangents = self.tangents
-        in_plane = tangents - normal[:, None] * (normal @ tangents)[None]
-        sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
-        swung_into = align_tangent(self.quaternions, in_plane / jnp.where(sizes > 0, sizes, 1.0))
-        seen = rotated(inverse(swung_into), jnp.broadcast_to(normal[:, None], tangents.shape))
-        turn = jnp.arctan2(seen[1], seen[0]) - jnp.arctan2(across[1], across[0])
-        force = self.end_force - normal[:, None] * (normal @ self.end_force)[None]
-        nodal = None if self.nodal is None else self.nodal.without(normal)
-        return FramePoint(rotate_about_tangent(swung_into, turn), force, jnp.zeros_like(self.total_twist), nodal)
-
-
-class Strained(eqx.Module):
-    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, and `axial` ones
-    under the tension, which with those at rest are `stretched`; tangents, and the lengths along these to the next node;
-    the lengths of rod that they stand for, and with shear its strains and what it adds to phi'.
-    """
-
-    curvature: Float[Array, "2 p n"]
-    twist: Float[Array, "p n"]
-    axial: Float[Array, "p n"]
-    stretched: Float[Array, "p n"]
-    tension: Float[Array, "p n"]
-    tangents: Float[Array, "3 p n"]
-    lengths: Float[Array, "p n"]
-    weights: Float[Array, "p n"]
-    shear: Float[Array, "2 p n"] | None
-    sideways: Float[Array, "3 p n"] | None
-
-    @property
-    def weighted_slopes(self) -> Float[Array, "3 p n"]:
-        """h phi': what each strain point adds to the segment vector."""
-        along = self.lengths[None] * self.tangents
-        return along if self.sideways is None else along + self.weights[None] * self.sideways
-
-    @property
-    def slopes(self) -> Float[Array, "3 p n"]:
-        """phi'."""
-        along = (1 + self.stretched)[None] * self.tangents
-        return along if self.sideways is None else along + self.sideways
-
-    def work(self, forces: Float[Array, "3 p n"]) -> Float[Array, "p n"]:
-        """Of forces on the weighted slopes."""
-        along = self.lengths * dot(forces, self.tangents)
-        return along if self.sideways is None else along + self.weights * dot(forces, self.sideways)
-
-
-class Kinematics(NamedTuple):
-    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the
-    correction at rest what turns with the reference frames, and what lies along the tangents; d1 and d2 where sections
-    shear.
-    """
-
-    strains: Float[Array, "3 p n"]
-    tangents: Float[Array, "3 p n"]
-    rests: Float[Array, "3 n"]
-    along: Float[Array, "p n"] | None
-    across: Float[Array, "3 2 p n"] | None = None
-
-
-class HeldFrame(NamedTuple):
-    """What a support holds of the frame of this number: its tangent, or where `frame` is given all of it."""
-
-    number: int | Int[Array, ""]
-    tangent: Float[Array, "3"]
-    frame: Float[Array, "3 3"] | None
 
 
 class FrameForm(Form):
@@ -304,36 +219,14 @@ class FrameForm(Form):
 
     def strained(self, point: FramePoint) -> Strained:
         forces = self.forces(point.quaternions, point.end_force)
-        return self._strained(self._kinematics(self.field.gather(point.quaternions)), forces)
+        return self.strained_under(self.kinematics(self.field.gather(point.quaternions)), forces)
 
-    def _kinematics(self, quaternions: Float[Array, "4 p n"]) -> Kinematics:
-        field = self.field
-        strains = field.strains(field.seen(quaternions)[field.coordinates]).values
-        if self.rest_strains is not None:
-            strains -= self.rest_strains
-        rests = self._turned_correction(quaternions, jnp.zeros_like(strains[:, 0]))
-        along = None
-        if self.rest_correction is not None and self.rest_correction.along is not None:
-            assert self.rest_strains is not None
-            along = self.rest_correction.along * part(strains[:2], self.rest_strains[:2])
-        across = None if self.sections.GA is None else columns(quaternions)[:, :2]
-        return Kinematics(strains, tangent(quaternions), rests, along, across)
+    def kinematics(self, quaternions: Float[Array, "4 p n"]) -> Kinematics:
+        has_shear = self.sections.GA is not None
+        return Kinematics.of(self.field, self.rest_strains, self.rest_correction, has_shear, quaternions)
 
-    def _strained(self, here: Kinematics, forces: Float[Array, "3 p n"]) -> Strained:
-        strains, tangents = here.strains, here.tangents
-        tension = dot(forces, tangents)
-        axial = self.sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-        weights = self.field.lengths
-        stretched = self.sections.stretched(axial)
-        lengths = weights * (1 + stretched)
-        if here.along is not None:
-            lengths += here.along
-        shear = sideways = None
-        if here.across is not None:
-            shear = self.sections.shear_under(short_sum(here.across * forces[:, None], axis=0))
-            sideways = short_sum(here.across * shear[None], axis=1)
-        of_axis = strains[2], axial, stretched, tension
-        return Strained(strains[:2], *of_axis, tangents, lengths, weights, shear, sideways)
+    def strained_under(self, here: Kinematics, forces: Float[Array, "3 p n"]) -> Strained:
+        return Strained.of(self.field, self.sections, here, forces)
 
     def _cells(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> CellStates:
         forces = self.forces(quaternions, end_force)
@@ -345,17 +238,8 @@ class FrameForm(Form):
         gather = self.field.gather(point.quaternions)
         weighted_slopes = self.strained(point).weighted_slopes
         return self.field.segment_vectors(
-            weighted_slopes, self._turned_correction(gather, jnp.zeros_like(weighted_slopes[:, 0]))
+            weighted_slopes, turned_correction(self.rest_correction, gather, jnp.zeros_like(weighted_slopes[:, 0]))
         ).T
-
-    def _turned_correction(
-        self, quaternions: Float[Array, "4 p n"], nothing: Float[Array, "3 n"]
-    ) -> Float[Array, "3 n"]:
-        return (
-            nothing
-            if self.rest_correction is None
-            else rotated(quaternions[:, REFERENCE], self.rest_correction.turning)
-        )
 
     # --- energies ----------------------------------------------------------------------------------------------------
 
@@ -369,7 +253,9 @@ class FrameForm(Form):
         """The potential of dead forces, zero at the origin, where the rod is held; other loads have none."""
         here = self.strained(point)
         work = jnp.sum(here.work(self.loads))
-        rest = self._turned_correction(self.field.gather(point.quaternions), jnp.zeros_like(self.loads[:, 0]))
+        rest = turned_correction(
+            self.rest_correction, self.field.gather(point.quaternions), jnp.zeros_like(self.loads[:, 0])
+        )
         work += jnp.sum(dot(self.loads[:, REFERENCE], rest))
         return -work
 
@@ -442,7 +328,7 @@ class FrameForm(Form):
     def lagrangian(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         layout = self.layout
         assert isinstance(layout, SpanForces)
-        value, segment_vectors = self.in_cells(self._kinematics(self.field.gather(point.quaternions)), point.end_force)
+        value, segment_vectors = self.in_cells(self.kinematics(self.field.gather(point.quaternions)), point.end_force)
         if not layout.size:
             return value, jnp.zeros(0, value.dtype)
         constraint_residual = layout.components(self.spans - layout.sums(segment_vectors))
@@ -487,14 +373,14 @@ class FrameForm(Form):
         """What follows from the frames of the cells alone, and its rates as they begin to turn."""
         frames, turns = self.field.gather(point.quaternions), self.field.gather(rotation)
         zero = jnp.zeros((), rotation.dtype)
-        return jax.jvp(lambda part: self._kinematics(turned(frames, part * turns)), (zero,), (jnp.ones_like(zero),))
+        return jax.jvp(lambda part: self.kinematics(turned(frames, part * turns)), (zero,), (jnp.ones_like(zero),))
 
     def in_cells(
         self, of_frames: Kinematics, end_force: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, ""], Float[Array, "3 n"]]:
         """What the cells add to L under forces, and their segment vectors."""
         forces = self.through(end_force) + self.loads
-        here = self._strained(of_frames, forces)
+        here = self.strained_under(of_frames, forces)
         value = jnp.sum(self.field.lengths * self._densities(here) - here.tension * here.lengths)
         if here.sideways is not None:
             value -= jnp.sum(here.weights * dot(forces, here.sideways))

@@ -11,7 +11,8 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.first_shape import first_shape
 from rodjax.discretization.first_twist import FirstTwist, more_turns
 from rodjax.discretization.form import Form
-from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.frame_point import FramePoint
+from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.hermite import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.twist import nearest_twist

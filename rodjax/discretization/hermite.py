@@ -11,7 +11,7 @@ t approaches pi: an element has no way through a fold. All strains are rational 
 """
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,25 +21,31 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.element_bending import SIMPSON, bending_energies, by_chords
+from rodjax.discretization.element_pairs import (
+    ARC_WEIGHTS,
+    added,
+    blocks_of_pairs,
+    by_points,
+    by_rotations,
+    flat,
+    half_squared_chords,
+    of_pairs,
+)
+from rodjax.discretization.element_points import interleaved, of_elements, parts_before, scatter_add
 from rodjax.discretization.form import Form
-from rodjax.discretization.joints import Joints, outer, tangent_bases, twist_derivatives, twist_gradient
-from rodjax.discretization.mixed import MixedPoint
+from rodjax.discretization.joints import Joints, tangent_bases, twist_derivatives, twist_gradient
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodes import held_nodes, with_nodes_at, with_nodes_at_clips
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, carried_in_bases, turns_of_bases
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.vectors import components, cross, dot, root
-from rodjax.linalg.blocks import partial_sums, short_sum
+from rodjax.geometry.vectors import cross, dot, root
+from rodjax.linalg.blocks import partial_sums
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Directed, Free, Held
-
-# The pairs of points whose chords shape an element, and the weights of their arcs in its twist: of the areas that
-# polygons of half and whole elements enclose, Richardson's extrapolation.
-PAIRS = ((0, 1), (1, 2), (0, 2))
-ARC_WEIGHTS = (4 / 3, 4 / 3, -1 / 3)
 
 
 class QuadraticRotationElements(eqx.Module):
@@ -114,31 +120,31 @@ class QuadraticRotationElements(eqx.Module):
     # --- strains -----------------------------------------------------------------------------------------------------
 
     def bending_energy(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
-        return jnp.sum(bending_energies(functools.partial(density, scene.rod), _half_squared_chords(tangents), self.h))
+        return jnp.sum(bending_energies(functools.partial(density, scene.rod), half_squared_chords(tangents), self.h))
 
     def bending(
         self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]
     ) -> tuple[Float[Array, ""], Blocks]:
         """The bending energy and its derivatives by rotations of the tangents."""
         of_section = functools.partial(density, scene.rod)
-        energies, first, second = by_chords(of_section, _half_squared_chords(tangents), self.h)
-        return jnp.sum(energies), _by_chords(first, second, tangents, self.basis(scene, bases))
+        energies, first, second = by_chords(of_section, half_squared_chords(tangents), self.h)
+        return jnp.sum(energies), by_rotations(first, second, tangents, self.basis(scene, bases))
 
     def twist(self, scene: Scene, tangents: Float[Array, "3 m"], bases: Float[Array, "3 b m"]) -> Blocks:
         """Derivatives of the total twist by rotations of the tangents."""
-        points, point_bases = _of_pairs(tangents), _of_pairs(self.basis(scene, bases))
+        points, point_bases = of_pairs(tangents), of_pairs(self.basis(scene, bases))
         spacing = jnp.broadcast_to(self.h[None], points[0].shape[1:])
         weights = jnp.array(ARC_WEIGHTS, spacing.dtype)[:, None]
-        joints, joint_bases = jax.tree.map(_flat, (Joints(*points, spacing), point_bases))
+        joints, joint_bases = jax.tree.map(flat, (Joints(*points, spacing), point_bases))
         arcs = jax.tree.map(
             lambda leaf: (
                 leaf.reshape(*leaf.shape[:-1], *spacing.shape) * jnp.expand_dims(weights, range(leaf.ndim - 1))
             ),
             twist_derivatives(joints, joint_bases),
         )
-        return _blocks(
-            gradient=_by_points(arcs.before, arcs.after),
-            diagonal=_by_points(arcs.before_before, arcs.after_after),
+        return blocks_of_pairs(
+            gradient=by_points(arcs.before, arcs.after),
+            diagonal=by_points(arcs.before_before, arcs.after_after),
             below=arcs.after_before,
         )
 
@@ -155,7 +161,7 @@ class QuadraticRotationElements(eqx.Module):
         """The derivatives of what each element adds to the Lagrangian by the tangents of its start and end, where
         `forces` run through the rod.
         """
-        _, by_chord, _ = by_chords(functools.partial(density, scene.rod), _half_squared_chords(tangents), self.h)
+        _, by_chord, _ = by_chords(functools.partial(density, scene.rod), half_squared_chords(tangents), self.h)
         return self._by_end_tangents(scene, tangents, forces, torque, by_chord)
 
     def by_end_tangents_linearized(
@@ -163,13 +169,13 @@ class QuadraticRotationElements(eqx.Module):
     ) -> tuple[tuple[Array, Array], Callable[[Array, Array, Array], tuple[Array, Array]]]:
         """The same, and how it changes with tangents, forces and torque: of the bending by its second derivatives."""
         of_section = functools.partial(density, scene.rod)
-        _, by_chord, second = by_chords(of_section, _half_squared_chords(tangents), self.h)
+        _, by_chord, second = by_chords(of_section, half_squared_chords(tangents), self.h)
         ends = functools.partial(self._by_end_tangents, scene)
         values, further = jax.linearize(ends, tangents, forces, torque, by_chord)
 
         def change(turned: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]):
-            _, chords = jax.jvp(_half_squared_chords, (tangents,), (turned,))
-            bent = jnp.stack([_added(map(jnp.multiply, row, jnp.unstack(chords))) for row in second])
+            _, chords = jax.jvp(half_squared_chords, (tangents,), (turned,))
+            bent = jnp.stack([added(map(jnp.multiply, row, jnp.unstack(chords))) for row in second])
             return further(turned, forces, torque, bent)
 
         return values, change
@@ -182,7 +188,7 @@ class QuadraticRotationElements(eqx.Module):
         torque: Float[Array, ""],
         by_chord: Float[Array, "3 n"],
     ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
-        first, last = _of_pairs(tangents)
+        first, last = of_pairs(tangents)
         normals = (torque * jnp.array(ARC_WEIGHTS, torque.dtype))[None, :, None] * twist_gradient(first, last)
         points = jnp.stack([tangents[:, 0:-1:2], tangents[:, 2::2]], axis=1)
         strain = axial_strain_under(scene.rod, dot(forces, points))
@@ -338,106 +344,3 @@ def _turns_along(tangents: Float[Array, "3 m"], bases: Float[Array, "3 2 m"]) ->
     straight *= 1 / jnp.sqrt(dot(straight, straight))[None]
     bulge = swept_angle(a, b, a, straight) + swept_angle(b, c, straight, c)
     return point_turns[::2] + point_turns[1::2] + bulge / 3
-
-
-def of_elements(by_point: Float[Array, "... m"]) -> tuple[Array, Array, Array]:
-    """What belongs to start, middle and end of the elements."""
-    return by_point[..., 0:-1:2], by_point[..., 1::2], by_point[..., 2::2]
-
-
-def interleaved(nodes: Float[Array, "... n+1"], middles: Float[Array, "... n"]) -> Float[Array, "... m"]:
-    pairs = jnp.stack([nodes, _padded(middles, 0, 1)], axis=-1)
-    return pairs.reshape(*nodes.shape[:-1], -1)[..., :-1]
-
-
-def scatter_add(start: Float[Array, "... n"], middle: Float[Array, "... n"], end: Float[Array, "... n"]) -> Array:
-    """Sums over the elements at each point."""
-    return interleaved(_padded(start, 0, 1) + _padded(end, 1, 0), middle)
-
-
-def _padded(x: Float[Array, "... n"], before: int, after: int) -> Float[Array, "... k"]:
-    return jax.lax.pad(x, jnp.zeros((), x.dtype), [*[(0, 0, 0)] * (x.ndim - 1), (before, after, 0)])
-
-
-def parts_before(s: Float[Array, "n+1"], at: Float[Array, ""]) -> Float[Array, "3 n"]:
-    """How much of the weight of each point of the elements between nodes at `s` lies before an arclength: parabolas,
-    integrated so far.
-    """
-    x = jnp.clip((at - s[:-1]) / jnp.diff(s), 0.0, 1.0)
-    parts = (x - 3 * x**2 / 2 + 2 * x**3 / 3, 2 * x**2 - 4 * x**3 / 3, 2 * x**3 / 3 - x**2 / 2)
-    return jnp.stack([part / weight for part, weight in zip(parts, SIMPSON, strict=True)])
-
-
-def _of_pairs(by_point: Float[Array, "... m"]) -> tuple[Float[Array, "... 3 n"], Float[Array, "... 3 n"]]:
-    """What belongs to the first and to the last point of each pair."""
-    parts = of_elements(by_point)
-    first, last = zip(*PAIRS, strict=True)
-    return jnp.stack([parts[i] for i in first], axis=-2), jnp.stack([parts[j] for j in last], axis=-2)
-
-
-def _flat(by_pair: Float[Array, "... 3 n"]) -> Float[Array, "... 3n"]:
-    return by_pair.reshape(*by_pair.shape[:-2], -1)
-
-
-def _by_points(
-    first: Float[Array, "... 3 n"], last: Float[Array, "... 3 n"]
-) -> tuple[Float[Array, "... n"], Float[Array, "... n"], Float[Array, "... n"]]:
-    """At start, middle and end of the elements, sums of what the pairs give to their first and last points."""
-    ab, bc, ac = range(3)
-    return (
-        first[..., ab, :] + first[..., ac, :],
-        last[..., ab, :] + first[..., bc, :],
-        last[..., bc, :] + last[..., ac, :],
-    )
-
-
-def _added(terms: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.add, terms)
-
-
-def _blocks(gradient: tuple[Array, Array, Array], diagonal: tuple[Array, Array, Array], below: Array) -> Blocks:
-    """Of start, middle and end of the elements. `below`: by the last point of each pair, then by its first."""
-    return Blocks(
-        gradient=jnp.stack(gradient, axis=-2),
-        diagonal=jnp.stack(diagonal, axis=-2),
-        lower=jnp.stack([below[..., 0, :], below[..., 1, :]], axis=-1).reshape(*below.shape[:2], -1),
-        across=below[..., 2, :],
-    )
-
-
-def _half_squared_chords(tangents: Float[Array, "3 m"]) -> Float[Array, "3 n"]:
-    """1 - cos of the angles between the points of each pair, without cancellation."""
-    first, last = _of_pairs(tangents)
-    return dot(last - first, last - first) / 2
-
-
-def _by_chords(
-    first: Float[Array, "3 n"], second: list[list[Float[Array, "n"]]], tangents: Float[Array, "3 m"], bases: Array
-) -> Blocks:
-    """Derivatives by rotations from those by the three chords of each element."""
-    points, point_bases = _of_pairs(tangents), _of_pairs(bases)
-    # 1 - a.b falls by e.b as a turns along e, and grows again by a.b. e.b = e.(b - a) without cancellation, as e.a = 0.
-    chords = points[1] - points[0]
-    toward_last = components(point_bases[0], chords)
-    toward_first = components(point_bases[1], -chords)
-    falls: list[dict[int, Array]] = [{}, {}, {}]
-    for p, (i, j) in enumerate(PAIRS):
-        falls[i][p], falls[j][p] = toward_last[:, p], toward_first[:, p]
-    bent = [[_added(second[p][q][None] * fall for p, fall in falls[i].items()) for q in range(3)] for i in range(3)]
-
-    def block(i: int, j: int) -> Float[Array, "b b n"]:
-        return _added(outer(bent[i][q], fall) for q, fall in falls[j].items())
-
-    cosines = first * dot(*points)
-    at_points = _by_points(cosines, cosines)
-    between = first[None, None] * short_sum(point_bases[1][:, :, None] * point_bases[0][:, None], axis=0)
-    identity = jnp.eye(bases.shape[1], dtype=bases.dtype)[..., None]
-
-    def on_diagonal(i: int) -> Float[Array, "b b n"]:
-        return block(i, i) + at_points[i][None, None] * identity
-
-    return _blocks(
-        gradient=_by_points(-first[None] * toward_last, -first[None] * toward_first),
-        diagonal=(on_diagonal(0), on_diagonal(1), on_diagonal(2)),
-        below=jnp.stack([block(j, i) for i, j in PAIRS], axis=2) - between,
-    )

@@ -21,19 +21,18 @@ share, are a border of a few columns (`saddle_point.SaddlePointSystem`). Arrays 
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, EndTurn, Form, Linearization
 from rodjax.discretization.joints import rotated, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
-from rodjax.discretization.nodal_point import Nodal
+from rodjax.discretization.mixed_point import ByCells, Elastic, MixedPoint
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks, TangentField
 from rodjax.discretization.twist import nearest_twist, twist_under_moment
@@ -48,59 +47,6 @@ from rodjax.model.supports import Clamp, Free
 # A total twist further than this [rad] from those that the end frames allow has lost a part of a turn: others are off
 # by roundings.
 SLIP = 1.0
-
-
-class MixedPoint(eqx.Module):
-    """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero; with
-    obstacles where the nodes lie and what pushes.
-    """
-
-    tangents: Float[Array, "3 m"]
-    end_force: Float[Array, "3 parts"]
-    total_twist: Float[Array, ""]
-    nodal: Nodal | None = None
-
-    def flattened(self, axes: Float[Array, "3 2"]) -> "MixedPoint":
-        """The point without what leaves the plane of these two axes, and without twist."""
-        in_plane = axes.T @ self.tangents
-        sizes = jnp.sqrt(dot(in_plane, in_plane))[None]
-        in_plane = jnp.where(sizes > 0, in_plane / jnp.where(sizes > 0, sizes, 1.0), jnp.eye(2, 1, dtype=sizes.dtype))
-        nodal = None if self.nodal is None else self.nodal.flattened(axes)
-        return MixedPoint(axes @ in_plane, axes @ (axes.T @ self.end_force), jnp.zeros_like(self.total_twist), nodal)
-
-
-class Elastic(NamedTuple):
-    """Bending and torsion of a `Linearization`.
-
-    `torque_column`: by the torque, by the points of each cell; `torsional_compliance`: 1/GJ where the total twist is
-    given; else `None`.
-    """
-
-    bases: Float[Array, "3 b m"]
-    energy: Float[Array, ""]
-    blocks: Blocks
-    torque_column: Float[Array, "b 1 p n"] | None
-    torsional_compliance: Float[Array, ""] | None
-
-
-class ByCells(NamedTuple):
-    """Parts of a `Linearization`, and by the p points of n cells their lengths, tangents and compliance under tension;
-    `by_force`: the derivatives of minus the segment vector by the rotations of the points of its cell.
-    """
-
-    energy: Float[Array, ""]
-    gradient: Float[Array, "b p n"]
-    diagonal: Float[Array, "b b p n"]
-    lengths: Float[Array, "p n"]
-    along: Float[Array, "3 p n"]
-    axial_compliance: Float[Array, "p n"]
-    by_force: Float[Array, "b 3 p n"]
-
-    @property
-    def compliance(self) -> Float[Array, "3 3 n"]:
-        """The derivative of each segment vector by the force through it."""
-        softer = self.axial_compliance[None] * self.along
-        return short_sum(softer[:, None] * self.along[None], axis=2)
 
 
 class MixedForm(Form):
@@ -302,7 +248,7 @@ class MixedForm(Form):
         scene, tangents = self.scene, point.tangents
         assert isinstance(self.layout, SpanForces)
         bases, energy, blocks, torque_column, torsional_compliance = self._elastic(point, holding)
-        cells = self._by_cells(point, bases, blocks)
+        cells = self.by_cells(point, bases, blocks)
         border = [self.layout.columns(cells.by_force)] if self.layout.size else []
         if torque_column is not None:
             border = [torque_column, *border]
@@ -370,25 +316,9 @@ class MixedForm(Form):
             return Elastic(bases, energy, blocks, torque_column, None)
         return Elastic(bases, energy + torsion, blocks, torque_column, 1 / stiffness)
 
-    def _by_cells(self, point: MixedPoint, bases: Float[Array, "3 b m"], blocks: Blocks) -> ByCells:
+    def by_cells(self, point: MixedPoint, bases: Float[Array, "3 b m"], blocks: Blocks) -> ByCells:
         """With what stretch and the forces through the cells add to the derivatives of bending and torsion."""
-        rod, field = self.scene.rod, self.field
-        weights = field.quadrature_weights
-        forces, tension = self.forces_and_tensions(point)
-        strain, axial_compliance = jax.jvp(
-            lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)
-        )
-        lengths, axial_compliance = weights * (1 + strain), weights * axial_compliance
-        along, directions = field.gather(point.tangents), field.gather(bases)
-        across = short_sum(directions * forces[:, None], axis=0)
-        gradient = blocks.gradient - lengths[None] * across
-        identity = np.eye(bases.shape[1], dtype=gradient.dtype)[..., None, None]
-        diagonal = blocks.diagonal + (lengths * tension)[None, None] * identity
-        diagonal -= axial_compliance[None, None] * across[:, None] * across[None]
-        by_force = -lengths[None, None] * jnp.swapaxes(directions, 0, 1)
-        by_force -= axial_compliance[None, None] * across[:, None] * along[None]
-        energy = jnp.sum(weights * (density(rod, axial_strain=strain) - tension * (1 + strain)))
-        return ByCells(energy, gradient, diagonal, lengths, along, axial_compliance, by_force)
+        return ByCells.of(self.scene.rod, self.field, point, bases, blocks, *self.forces_and_tensions(point))
 
     def lagrangian(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         rod, layout = self.scene.rod, self.layout

@@ -13,11 +13,13 @@ from rodjax.discretization import nonconservative
 from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
 from rodjax.discretization.cells import Cells, ElementCells
 from rodjax.discretization.form import Linearization
-from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm, FramePoint, HeldFrame, Kinematics
+from rodjax.discretization.frame_point import FramePoint, HeldFrame, Kinematics
+from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm
 from rodjax.discretization.framed_parts import parts_of
 from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.layout import CellForces
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.node_contacts import contact_residuals, contacts_at, larger
 from rodjax.discretization.node_friction import by_law
@@ -67,7 +69,7 @@ class NodalTangents(NodalForm, MixedForm):
         holding = self._held_by
         bases, energy, blocks, torque_column, torsional_compliance = self._elastic(point, holding)
         assert blocks.across is not None
-        cells = self._by_cells(point, bases, blocks)
+        cells = self.by_cells(point, bases, blocks)
         edges = jnp.sum(cells.lengths[None] * cells.along, axis=1).T
         contacts = contacts_at(self, point)
         assert point.nodal is not None
@@ -215,7 +217,7 @@ class NodalFrames(NodalForm, FrameForm):
         field, scene = self._elements, self.scene
         q = field.gather(point.quaternions)
         cells, base = self._cells(point.quaternions, point.end_force), self.through(point.end_force) + self.loads
-        kinematics, couples = self._kinematics(q), nonconservative.couples(scene, field, q)
+        kinematics, couples = self.kinematics(q), nonconservative.couples(scene, field, q)
 
         def rows(turn: Float[Array, "3 3 n"]) -> tuple[Array, Array, Array]:
             """Of what the loads change alone: moments, gaps and the balance of nodes."""
@@ -225,7 +227,7 @@ class NodalFrames(NodalForm, FrameForm):
             # By the virtual work in what turns the frames, of which only half is a turn of the couple beside its frame.
             moments = first_derivatives(cells._replace(forces=forces)) - cross(turn, couples) / 2
             moments -= nonconservative.couples(scene, field, there)
-            segment_vectors = short_sum(self._strained(kinematics, forces).weighted_slopes, axis=1)
+            segment_vectors = short_sum(self.strained_under(kinematics, forces).weighted_slopes, axis=1)
             return moments, -segment_vectors, -nonconservative.on_nodes(scene, field, there)
 
         along = field.gather(self._projections.reshape(9, -1)).reshape(3, 3, *q.shape[1:])  # [a, b, point, n]
@@ -305,7 +307,7 @@ class NodalFrames(NodalForm, FrameForm):
         return gradient, jnp.concatenate([rows, balance.reshape(-1), gaps.reshape(-1)])
 
     def in_cells_at(self, point: FramePoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        kinematics = self._kinematics(self.field.gather(point.quaternions))
+        kinematics = self.kinematics(self.field.gather(point.quaternions))
         return self.in_elements(point, kinematics, jnp.zeros_like(point.end_force))
 
     def turning_elements(

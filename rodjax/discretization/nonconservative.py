@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells
-from rodjax.discretization.hermite import SIMPSON
+from rodjax.discretization.element_bending import SIMPSON
 from rodjax.geometry.rotations import inverse, rotated
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, per_length
 from rodjax.model.scene import Scene, dead_forces

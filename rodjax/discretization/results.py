@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.joints import Joints, bending_derivatives, tangent_bases, twist_derivatives
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.twist import angle_about, transport, transport_along

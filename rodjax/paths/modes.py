@@ -11,7 +11,7 @@ from rodjax.discretization.cells import JointCells
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve, cells_of
-from rodjax.discretization.framed_results import framed_on_elements
+from rodjax.discretization.framed_error import framed_on_elements
 from rodjax.discretization.motion import Motion
 from rodjax.discretization.nodal_forms import NodalFrames
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint

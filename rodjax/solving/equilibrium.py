@@ -21,11 +21,13 @@ from rodjax.discretization.first_shape import first_shape
 from rodjax.discretization.first_twist import FirstTwist, last_of
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.forms import field_of, form_of
-from rodjax.discretization.framed import FrameForm, FramePoint
+from rodjax.discretization.frame_point import FramePoint
+from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve, first_frames, framed_through, rest_twist
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.layout import force_parts, in_parts
-from rodjax.discretization.mixed import MixedForm, MixedPoint
+from rodjax.discretization.mixed import MixedForm
+from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import Friction
 from rodjax.discretization.nodes import LEAST_ELEMENT

@@ -32,11 +32,8 @@ from rodjax.discretization.form import Form, Point
 from rodjax.discretization.form_results import clip_moments_of, positions_between_nodes, resultants_of
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_results import (
-    errors_of_frames,
-    framed_on_elements,
-    strains_beside_nodes,
-)
+from rodjax.discretization.framed_error import errors_of_frames, framed_on_elements
+from rodjax.discretization.framed_results import strains_beside_nodes
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis

@@ -13,7 +13,7 @@ all but the error of the mesh: the moment jumps there, and what slides would tak
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,11 +24,11 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.cells import varying
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import Polyline
-from rodjax.discretization.form import NEUTRAL, Form, Linearization
+from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of, form_on
-from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding_point import SlidingChange, SlidingLinearization, SlidingPoint
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
 from rodjax.model.along import Along
@@ -48,61 +48,6 @@ LEAST_SLIDE = 1e-7
 STRETCHED = 1.25
 # Nodes that lie apart by less [L] are the same.
 SAME_NODE = 1e-9
-
-
-class SlidingPoint(eqx.Module):
-    """The unknowns of the form at these arclengths; `slides`: whether these change with the next step; `excess`: the
-    slope of the energy by them beyond -R . t where the last step began.
-    """
-
-    inner: Any
-    arclengths: Float[Array, "j"]
-    slides: Bool[Array, ""]
-    excess: Float[Array, "j"]
-
-    @staticmethod
-    def settled_at(point: Any, arclengths: Float[Array, "j"]) -> "SlidingPoint":
-        """An equilibrium of a rod that slides."""
-        return SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
-
-    @property
-    def tangents(self) -> Float[Array, "3 m"]:
-        return self.inner.tangents
-
-    @property
-    def end_force(self) -> Float[Array, "3 parts"]:
-        return self.inner.end_force
-
-    @property
-    def total_twist(self) -> Float[Array, ""]:
-        return self.inner.total_twist
-
-    @property
-    def nodal(self) -> Nodal | None:
-        return self.inner.nodal
-
-
-class SlidingChange(NamedTuple):
-    """Of a step; `others`: as of the form at given arclengths."""
-
-    arclengths: Float[Array, "j"]
-    others: Any
-
-
-class SlidingLinearization(Linearization):
-    """With the arclengths, whether they change, and the slope of the energy by them beyond -R . t."""
-
-    arclengths: Float[Array, "j"] = eqx.field(kw_only=True)
-    slides: Bool[Array, ""] = eqx.field(kw_only=True)
-    excess: Float[Array, "j"] = eqx.field(kw_only=True)
-
-    @property
-    def at_arclengths(self) -> Linearization:
-        """That of the form at given arclengths."""
-        assert isinstance(self.system, BorderedSystem)
-        constraint_residual = self.constraint_residual[len(self.arclengths) :]
-        parts = (self.bases, self.gradient, constraint_residual, self.system.inner, self.energy, self.residual)
-        return Linearization(*parts, self.gaps, self.reference_displacements)
 
 
 class SlidingForm(Form):

@@ -1,0 +1,66 @@
+"""The unknowns of a rod that slides through clips, and its linearisation: those of a form, and arclengths of clips."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rodjax.discretization.form import Linearization
+from rodjax.discretization.nodal_point import Nodal
+from rodjax.linalg.bordered import BorderedSystem
+
+
+class SlidingPoint(eqx.Module):
+    """The unknowns of the form at these arclengths; `slides`: whether these change with the next step; `excess`: the
+    slope of the energy by them beyond -R . t where the last step began.
+    """
+
+    inner: Any
+    arclengths: Float[Array, "j"]
+    slides: Bool[Array, ""]
+    excess: Float[Array, "j"]
+
+    @staticmethod
+    def settled_at(point: Any, arclengths: Float[Array, "j"]) -> "SlidingPoint":
+        """An equilibrium of a rod that slides."""
+        return SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
+
+    @property
+    def tangents(self) -> Float[Array, "3 m"]:
+        return self.inner.tangents
+
+    @property
+    def end_force(self) -> Float[Array, "3 parts"]:
+        return self.inner.end_force
+
+    @property
+    def total_twist(self) -> Float[Array, ""]:
+        return self.inner.total_twist
+
+    @property
+    def nodal(self) -> Nodal | None:
+        return self.inner.nodal
+
+
+class SlidingChange(NamedTuple):
+    """Of a step; `others`: as of the form at given arclengths."""
+
+    arclengths: Float[Array, "j"]
+    others: Any
+
+
+class SlidingLinearization(Linearization):
+    """With the arclengths, whether they change, and the slope of the energy by them beyond -R . t."""
+
+    arclengths: Float[Array, "j"] = eqx.field(kw_only=True)
+    slides: Bool[Array, ""] = eqx.field(kw_only=True)
+    excess: Float[Array, "j"] = eqx.field(kw_only=True)
+
+    @property
+    def at_arclengths(self) -> Linearization:
+        """That of the form at given arclengths."""
+        assert isinstance(self.system, BorderedSystem)
+        constraint_residual = self.constraint_residual[len(self.arclengths) :]
+        parts = (self.bases, self.gradient, constraint_residual, self.system.inner, self.energy, self.residual)
+        return Linearization(*parts, self.gaps, self.reference_displacements)

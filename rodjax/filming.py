@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, one_of, positive
-from rodjax.plot import COLOR_MAP, LABELS, Field, _draw_tube, _limits, _surroundings, set_view, thickness
+from rodjax.drawing import COLOR_MAP, LABELS, Field, color_limits, draw_tube, set_view, surroundings, thickness
 from rodjax.solving.result import Equilibrium
 
 SUFFIXES = (".gif", ".mp4")
@@ -54,14 +54,14 @@ def frames(path: Equilibrium, color_by: Field = "curvature") -> Iterator[Frame]:
     """A picture of each equilibrium of a path."""
     rods = [jax.tree.map(lambda leaf, k=k: leaf[k], path) for k in range(path.s.shape[0])]
     radius, note = thickness(rods)
-    norm = Normalize(*_limits(np.asarray(getattr(path, color_by))))
+    norm = Normalize(*color_limits(np.asarray(getattr(path, color_by))))
     nodes = np.asarray(path.nodes).reshape(-1, 3)
     room = np.concatenate([nodes - radius, nodes + radius])
     for rod in rods:
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
         axes = figure.add_subplot(projection="3d")
         assert isinstance(axes, Axes3D)
-        _draw_tube(axes, rod, radius, color_by, norm, _surroundings(rod, radius))
+        draw_tube(axes, rod, radius, color_by, norm, surroundings(rod, radius))
         set_view(axes, room)
         axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
         figure.colorbar(ScalarMappable(norm, COLOR_MAP), ax=axes, label=LABELS[color_by], shrink=0.6, pad=0.08)

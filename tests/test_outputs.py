@@ -294,8 +294,9 @@ def test_solve_writes_tables_splines_and_pictures_with_surroundings(tmp_path, ca
 
 def test_pictures_show_clips_and_obstacles(touching, monkeypatch):
     drawn = []
-    monkeypatch.setattr("rodjax.plot.draw_faces", lambda axes, faces, colors, *rest: drawn.append((faces, colors)))
-    from rodjax.plot import CLIP_COLOR, OPACITY, plot_rod, to_rgba
+    monkeypatch.setattr("rodjax.drawing.draw_faces", lambda axes, faces, colors, *rest: drawn.append((faces, colors)))
+    from rodjax.drawing import CLIP_COLOR, OPACITY, to_rgba
+    from rodjax.plot import plot_rod
 
     plot_rod(touching)
     ((faces, colors),) = drawn

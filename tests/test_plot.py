@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from rodjax import Clamp, Clip, Free, PointForce, Rod, Scene, Smooth, Steps, frame, plot, problems, solve
+from rodjax import Clamp, Clip, Free, PointForce, Rod, Scene, Smooth, Steps, drawing, frame, plot, problems, solve
 from rodjax.discretization.twist import angle_about, transport_along
 
 SEGMENTS = 10
@@ -51,12 +51,12 @@ def pixels(figure: Figure) -> np.ndarray:
 
 def strip_middle(points):
     """Direction from the centerline to the middle of the black strip."""
-    first, last = points[:, 0], points[:, plot.STRIP_FACES]
+    first, last = points[:, 0], points[:, drawing.STRIP_FACES]
     return (first + last) / 2
 
 
 def test_the_surface_lies_at_the_radius_from_the_centerline(twisted):
-    _, centerline, points = plot.tube(twisted, 0.02)
+    _, centerline, points = drawing.tube(twisted, 0.02)
     distance = np.linalg.norm(points - centerline[:, None], axis=-1)
     np.testing.assert_allclose(distance, 0.02, rtol=1e-12)
     along = np.gradient(centerline, axis=0)
@@ -66,7 +66,7 @@ def test_the_surface_lies_at_the_radius_from_the_centerline(twisted):
 
 
 def test_the_tube_is_smooth_between_ten_segments(twisted):
-    _, centerline, _ = plot.tube(twisted, 0.02)
+    _, centerline, _ = drawing.tube(twisted, 0.02)
     edges = np.diff(centerline, axis=0)
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
     corners = np.degrees(np.arccos(np.sum(edges[1:] * edges[:-1], axis=1)))
@@ -75,7 +75,7 @@ def test_the_tube_is_smooth_between_ten_segments(twisted):
 
 
 def test_the_strip_runs_along_d1_at_the_nodes(twisted):
-    s, centerline, points = plot.tube(twisted, 0.02)
+    s, centerline, points = drawing.tube(twisted, 0.02)
     strip = strip_middle(points) - centerline
     strip /= np.linalg.norm(strip, axis=1, keepdims=True)
     at_nodes = [int(np.argmin(np.abs(s - node))) for node in twisted.s]
@@ -90,13 +90,13 @@ def test_directors_between_nodes_pass_through_those_at_nodes_of_unequal_elements
     scene = Scene(problems.cable(), Clamp((0, 0, 0), level), Clamp((0.8, 0, 0), turned), clips=[clip])
     equilibrium = solve(scene, segments=10)
     assert np.ptp(np.diff(equilibrium.s)) > 0.01
-    _, tangents, d1 = plot.framed_at(equilibrium, equilibrium.s)
+    _, tangents, d1 = drawing.framed_at(equilibrium, equilibrium.s)
     np.testing.assert_allclose(tangents, equilibrium.tangents, atol=1e-10)
     np.testing.assert_allclose(d1, equilibrium.frames[:, :, 0], atol=1e-10)
 
 
 def test_the_strip_winds_by_the_total_twist(twisted):
-    _, centerline, points = plot.tube(twisted, 0.02)
+    _, centerline, points = drawing.tube(twisted, 0.02)
     strip = strip_middle(points) - centerline
     strip /= np.linalg.norm(strip, axis=1, keepdims=True)
     edges = np.diff(centerline, axis=0)
@@ -114,7 +114,7 @@ def test_the_strip_keeps_turns_within_a_segment():
     level = frame((1.0, 0.0, 0.0))
     straight = Scene(rod, Clamp((0.0, 0.0, 0.0), level), Clamp((1.0, 0.0, 0.0), level), turns=3)
     equilibrium = solve(straight, segments=2, discretization="finite_difference")
-    _, centerline, points = plot.tube(equilibrium, 0.02)
+    _, centerline, points = drawing.tube(equilibrium, 0.02)
     strip = strip_middle(points) - centerline
     angle = np.unwrap(np.arctan2(strip[:, 2], strip[:, 1]))
     assert abs(angle[-1] - angle[0]) == pytest.approx(6 * np.pi, abs=1e-6)
@@ -125,13 +125,13 @@ def test_the_strips_are_painted_on_the_tube(twisted):
     pixels(figure)
     (surface,) = [a for a in figure.axes[0].collections if isinstance(a, Poly3DCollection)]
     colors = np.asarray(surface.get_facecolor())
-    s, _, _ = plot.tube(twisted, 0.02)
+    s, _, _ = drawing.tube(twisted, 0.02)
     rings = len(s) - 1
-    assert len(colors) == (rings + 2) * plot.FACES_AROUND  # with two caps
+    assert len(colors) == (rings + 2) * drawing.FACES_AROUND  # with two caps
     is_black = np.all(colors[:, :3] == 0, axis=1)
-    assert is_black.sum() == (rings + 2) * plot.STRIP_FACES
+    assert is_black.sum() == (rings + 2) * drawing.STRIP_FACES
     is_grey = np.ptp(colors[:, :3], axis=1) < 1e-12
-    assert is_grey.sum() == 2 * (rings + 2) * plot.STRIP_FACES
+    assert is_grey.sum() == 2 * (rings + 2) * drawing.STRIP_FACES
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_a_thin_rod_is_drawn_thicker_and_the_picture_says_so(twisted):
     assert notes(plot.plot_rod(twisted, radius=0.005)) == [""]
     assert notes(plot.plot_rod(twisted, radius=0.015)) == ["drawn 3 times as thick as it is"]
     size = float(np.max(np.ptp(np.asarray(twisted.nodes), axis=0)))
-    times = plot.LEAST_RADIUS * size / 0.005
+    times = drawing.LEAST_RADIUS * size / 0.005
     assert notes(plot.plot_rod(twisted)) == [f"drawn {times:.2g} times as thick as it is"]
 
 
@@ -176,7 +176,7 @@ def test_a_rod_that_varies_is_drawn_as_thick_as_it_is(twisted):
     def drawn(radius):
         rod = Rod(length, 1.0, 1.0, 1.0, radius=radius)
         changed = eqx.tree_at(lambda found: found.scene.rod.radius, twisted, rod.radius)
-        s, centerline, points = plot.tube(changed, 0.04)
+        s, centerline, points = drawing.tube(changed, 0.04)
         distance = np.linalg.norm(points - centerline[:, None], axis=-1)
         np.testing.assert_allclose(distance, distance[:, :1] * np.ones_like(distance), rtol=1e-12)
         (note,) = [text.get_text() for text in plot.plot_rod(changed, radius=0.04).axes[0].texts]
@@ -227,9 +227,9 @@ def test_a_rod_can_be_drawn_in_axes_of_another_figure(twisted):
 
 def test_plot_along_shows_the_fields(twisted):
     figure = plot.plot_along(twisted)
-    assert [axes.get_ylabel() for axes in figure.axes] == list(plot.LABELS.values())
+    assert [axes.get_ylabel() for axes in figure.axes] == list(drawing.LABELS.values())
     assert figure.axes[-1].get_xlabel() == "arclength s [m]"
-    for axes, name in zip(figure.axes, plot.LABELS, strict=True):
+    for axes, name in zip(figure.axes, drawing.LABELS, strict=True):
         np.testing.assert_array_equal(axes.lines[0].get_xdata(), twisted.s)
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), getattr(twisted, name))
 

@@ -15,9 +15,9 @@ from matplotlib.image import imread
 
 import rodjax as rj
 from rodjax.analysis.reactions import axes_of
+from rodjax.drawing import AZIMUTH, seen_axes
 from rodjax.model import surfaces as routing_surfaces
 from rodjax.model.surfaces import MOST_TRIANGLES, surfaces
-from rodjax.plot import AZIMUTH, seen_axes
 from rodjax.routing import report_text, web_page
 from rodjax.routing.cable_report import Gradients
 from rodjax.routing.report import FILES

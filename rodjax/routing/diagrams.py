@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from rodjax.analysis.clearance import radius_at
 from rodjax.analysis.samples import Samples, samples_at
+from rodjax.drawing import PALETTE
 from rodjax.model.obstacles import Obstacle
-from rodjax.plot import PALETTE
 from rodjax.programs.compilation import compiled
 from rodjax.routing.cable_report import Cable
 

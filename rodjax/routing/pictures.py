@@ -13,8 +13,7 @@ from matplotlib.ticker import PercentFormatter
 from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import line
-from rodjax.model.obstacles import Obstacle
-from rodjax.plot import (
+from rodjax.drawing import (
     ARROW_LENGTH,
     CLIP_COLOR,
     HALO,
@@ -26,6 +25,7 @@ from rodjax.plot import (
     set_view,
     tube_faces,
 )
+from rodjax.model.obstacles import Obstacle
 from rodjax.routing.view_data import (
     CableView,
     azimuth,

@@ -11,9 +11,9 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
 from rodjax.analysis.curvature import curvature_along
 from rodjax.analysis.reactions import Reaction, reactions
+from rodjax.drawing import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.model.obstacles import Obstacle, Plane
 from rodjax.model.surfaces import Faces, collar, parts_of, surfaces
-from rodjax.plot import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.routing.limits import Limits
 from rodjax.solving.result import Equilibrium
 

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import Colormap, to_hex
 
+from rodjax.drawing import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
 from rodjax.model.surfaces import Faces
-from rodjax.plot import ARROW_LENGTH, CLIP_COLOR, ELEVATION, PALETTE
 from rodjax.routing import report_text
 from rodjax.routing.cable_report import Cable, Gradients
 from rodjax.routing.records import plain

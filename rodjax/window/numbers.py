@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rodjax.drawing import largest_radius
 from rodjax.model.scene import Scene
-from rodjax.plot import largest_radius
 from rodjax.routing.limits import Limits
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from rodjax.drawing import largest_radius
 from rodjax.model.surfaces import surfaces
-from rodjax.plot import largest_radius
 from rodjax.window import tube
 from rodjax.window.controls import Pose, center_of, rods_of
 from rodjax.window.reading import Pieces, Reading

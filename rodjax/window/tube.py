@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from matplotlib import colormaps
 from matplotlib.ticker import MaxNLocator
 
-from rodjax.plot import COLOR_MAP
+from rodjax.drawing import COLOR_MAP
 
 # Faces around a rod, and of them those of a strip.
 AROUND, STRIP = 24, 3

@@ -1,4 +1,4 @@
-"""What the two forms of a scene, by its tangents and by its frames, have in common."""
+"""The interface of a discretized scene: unknowns, retraction of steps, derivatives, forces."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple, Protocol
@@ -97,19 +97,19 @@ class Form(eqx.Module):
 
     @abstractmethod
     def bases_at(self, point: Any) -> Float[Array, "3 b m"]:
-        """Those along which the rod may turn at a point: none where a support holds it."""
+        """The bases of the rotations that are free at a point; zero where a support holds the rod."""
 
     @abstractmethod
     def turn(self, point: Any, bases: Float[Array, "3 b m"], axis: Float[Array, "3"]) -> Float[Array, "b m"]:
-        """The rotations that turn the whole rod about an axis."""
+        """The rotations, in these bases, of a rigid turn of the whole rod about an axis."""
 
     def spin(self, bases: Float[Array, "3 b m"]) -> Float[Array, "b m"] | None:
-        """The rotations that spin all sections about their tangents; `None` where that is no unknown."""
+        """The rotations that spin all sections about their tangents; `None` where spin is not an unknown."""
         return None
 
     @abstractmethod
     def holding(self, point: Any) -> Any:
-        """The point with what the supports hold."""
+        """The point with the values that the supports prescribe."""
 
     @abstractmethod
     def settled(self, point: Any) -> Any:
@@ -122,11 +122,11 @@ class Form(eqx.Module):
 
     @property
     def carries_twist(self) -> bool:
-        """Whether the total twist is an unknown that steps carry, and not read off the frames."""
+        """Whether steps carry the total twist as an unknown; else it is computed from the frames."""
         return False
 
     def allowed_twist(self, point: Any) -> Float[Array, ""]:
-        """Where it is: the total twist of a balanced point [rad], which the frames of its ends allow."""
+        """The total twist of a balanced point [rad] that the frames of its ends allow, where steps carry it."""
         return point.total_twist
 
     @abstractmethod
@@ -141,71 +141,71 @@ class Form(eqx.Module):
         """The retraction of a step: rotations in the bases of the point, a change of force, and `others`."""
 
     def no_others(self, point: Any) -> Any:
-        """A step that changes nothing of that."""
+        """`others` of a step that changes nothing but rotations and forces."""
         return None if point.nodal is None else NodalChange.nothing(point.nodal)
 
     def longest_step(self, point: Any, others: Any) -> Float[Array, ""] | None:
-        """The most of a step that may be taken for what it changes of `others`; `None` where that is all."""
+        """The largest part of a step that its `others` allow; `None` where they allow all of it."""
         return None
 
     def is_blocked(self, point: Any) -> Bool[Array, ""] | None:
-        """Whether a search has come to where only another form goes on; `None` where none does."""
+        """Whether the search can go on with another form only; `None` where that cannot happen."""
         return None
 
     def nodal_held(self, nodal: Any) -> Any:
-        """With held nodes where the supports are."""
+        """With held nodes at the positions of their supports."""
         return nodal
 
     def retracted_nodal(self, point: Any, others: Any) -> Any:
-        """Of a step."""
+        """The positions and pressures of a point after a step."""
         return point.nodal
 
     def others(self, multipliers: Float[Array, "k"]) -> Any:
-        """What a step changes beside rotations and forces; `None` where that is all."""
+        """The changes of a step beside rotations and forces, from its multipliers; `None` without such unknowns."""
         return None
 
     @abstractmethod
     def in_plane(self, point: Any, normal: Float[Array, "3"], axes: Float[Array, "3 2"]) -> tuple["Form", Any]:
-        """Of a rod that stays in the plane of two axes, and a point moved into it."""
+        """The form of a rod that stays in the plane of two axes, and the point projected into it."""
 
     @abstractmethod
     def in_plane_of(self, other: "Form") -> "Form":
-        """The same in the plane of another form of the same scene, or in all of space as that is."""
+        """This form restricted to the plane of another form of the same scene, or free in space as that is."""
 
     @abstractmethod
     def out_of_plane(self, normal: Float[Array, "3"]) -> "Form":
-        """Of a form in a plane, that of the motions out of it, or of all where these couple."""
+        """The form of the motions out of the plane of a planar form; of all motions where the two kinds couple."""
 
     def stays_in_plane(self, point: Any) -> Bool[Array, ""]:
-        """Whether nothing pushes an equilibrium out of its plane, beside what supports and loads show."""
+        """Whether an equilibrium has no moment out of its plane, which supports and loads alone do not show."""
         return jnp.array(True)
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
-        """Whether a step goes from a point to another, which is better or not judged."""
+        """Whether the step from a point to a trial is accepted; `is_better`: whether its merit is low enough."""
         return is_better
 
     @abstractmethod
     def linearized(self, point: Any) -> Linearization: ...
 
     def released(self, point: Any) -> Linearization:
-        """The linearisation at a point, but that the ends may turn where clamps hold them, the total twist following by
-        smallest rotations; `residual` without these.
+        """The linearisation with free rotations of clamped ends, the total twist following by smallest rotations;
+        `residual` leaves these ends out.
         """
         raise NotImplementedError(f"{type(self).__name__} has a force in each element")
 
     def end_turn(self, point: Any, released: Linearization, end: int) -> EndTurn:
-        """Of the clamped start, 0, or end, -1."""
+        """The rigid turn of the clamped start, 0, or end, -1."""
         axes = jnp.eye(3, dtype=released.gradient.dtype)
         rotation = jnp.stack([self.turn(point, released.bases, axis)[:, end] for axis in axes], axis=1)
         nothing = jnp.zeros_like(axes)
         return EndTurn(rotation, None, nothing[0], nothing)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
-        """A point to go on from, with what its linearisation tells."""
+        """The point from which the search goes on, updated by its linearisation."""
         return point
 
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
-        """What a step from a point brings down, where it leads to."""
+        """The merit that a step from `point` has to lower, at the linearisation it leads to."""
         return here.energy
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
@@ -215,8 +215,8 @@ class Form(eqx.Module):
     def sought(
         self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
-        """Whether a system, that of a linearisation and stiffer, is one of a minimum; the rotations and multipliers
-        that lead there, pushed aside.
+        """The step of a system, that of a linearisation or a stiffer one: whether its stiffness is positive, rotations,
+        multipliers. `push`: a force added to leave a saddle.
         """
         found = factor_and_solve(system, push - here.gradient, -here.constraint_residual, is_regularized=True)
         factors, rotation, multipliers = found
@@ -234,8 +234,8 @@ class Form(eqx.Module):
         return here.gradient, here.constraint_residual
 
     def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
-        """L at a point as `Linearization.energy` has it, and what the rod lacks of its spans: for automatic
-        derivatives, by the poses of supports too.
+        """L at a point, as `Linearization.energy`, and the residual of the closure constraints: for automatic
+        differentiation, also by the poses of supports.
         """
         raise NotImplementedError(f"{type(self).__name__} has a force in each element")
 
@@ -248,13 +248,13 @@ class Form(eqx.Module):
         change: Float[Array, "3 parts"],
         others: Any,
     ) -> tuple[Float[Array, "c"], Float[Array, "c"], Float[Array, ""], Float[Array, ""]]:
-        """At a point and its linearisation, under other forces: what the rod lacks of its spans and the rate of that as
-        it begins to turn; by how much L differs, and by how much the rate of L does.
+        """Under changed forces, at a point: the residual of the closure constraints and its rate along the rotations of
+        a step; the change of L, and the change of its rate.
         """
 
     @abstractmethod
     def regular(self, system: AnySystem) -> Any:
-        """The system of a linearisation, neutral modes held."""
+        """The system of a linearisation, shifted so that neutral modes are regular."""
 
     @abstractmethod
     def rounding_floor(self, point: Any) -> Float[Array, ""]:
@@ -262,7 +262,7 @@ class Form(eqx.Module):
 
     @abstractmethod
     def edges(self, point: Any) -> Float[Array, "segments 3"]:
-        """From node to node."""
+        """The vectors from node to node."""
 
     @abstractmethod
     def elastic_energy(self, point: Any) -> Float[Array, ""]: ...
@@ -292,13 +292,11 @@ class Form(eqx.Module):
         pressures: Float[Array, "k n+1"] | None,
         friction: Friction | None,
     ) -> Any:
-        """The point with what it has beside obstacles, of nodes, pressures and friction."""
+        """The point with positions of nodes, pressures and friction, where the form has them as unknowns."""
         return point
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
-        """The forces through the rod at start, middle and end of the elements, where `forces` leave the fields out that
-        act along them.
-        """
+        """The section forces at start, middle and end of the elements: `forces` plus those of fields along them."""
         return forces
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
@@ -323,27 +321,27 @@ class Form(eqx.Module):
     def tangents_in_clips(self, point: Any) -> Float[Array, "3 clips"]: ...
 
     def axial_forces(self, point: Any) -> Float[Array, "slides"]:
-        """What the sliding clips apply to the rod along its tangent."""
+        """The axial forces of the sliding clips on the rod."""
         forces = point.end_force[:, :-1] - point.end_force[:, 1:]
         along = dot(forces, self.tangents_in_clips(point))
         return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     def force_components(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:
-        """The part for the forces of the layout, of what is given for all multipliers."""
+        """The components that belong to the forces of the layout, of a vector over all multipliers."""
         return multipliers[len(multipliers) - self.layout.size :]
 
     def force_turned(self, point: Any, axis: Float[Array, "3"]) -> Float[Array, "c"]:
-        """The components of what the forces change by as the whole rod turns about an axis."""
+        """The components of the change of the forces in a rigid turn of the whole rod about an axis."""
         return self.layout.components(jnp.cross(axis[:, None], point.end_force, axis=0))
 
     def multipliers_turned(
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
-        """The same with zeros, as many as `multipliers`, before it."""
+        """The change of all multipliers in that turn."""
         of_force = self.force_turned(point, axis)
         return multipliers.at[len(multipliers) - len(of_force) :].set(of_force)
 
     def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
-        """Whether the polyline spans its ends as well as befits a residual of this tolerance."""
+        """Whether the closure constraints hold as accurately as a residual of this tolerance needs."""
         least = CLOSURE_ROUNDINGS * jnp.finfo(constraint_residual.dtype).eps
         return jnp.all(jnp.abs(constraint_residual) <= jnp.maximum(CLOSURE_TOLERANCE * tolerance, least))

@@ -136,7 +136,7 @@ class Strained(eqx.Module):
 
 
 class HeldFrame(NamedTuple):
-    """What a support holds of the frame of this number: its tangent, or where `frame` is given all of it."""
+    """The part of a frame that a support holds, with the number of the frame: the tangent, or all of it (`frame`)."""
 
     number: int | Int[Array, ""]
     tangent: Float[Array, "3"]

@@ -116,7 +116,7 @@ class FrameForm(Form):
         return self._residual(gradient - self.projected(gradient)) <= OUT_OF_PLANE * (1 + largest)
 
     def projected(self, by_frame: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
-        """What turns frames, or is turned, without what supports hold or leads out of the plane."""
+        """Rotations or moments of the frames without the components that supports hold or that leave the plane."""
         by_frame = by_frame * self.is_free
         return by_frame if self.across is None else self.across[:, None] * (self.across @ by_frame)[None]
 
@@ -125,7 +125,7 @@ class FrameForm(Form):
 
     @property
     def _projection(self) -> Float[Array, "3 3 m"]:
-        """The same in a plane, as matrices."""
+        """This projection in a plane, as matrices."""
         assert self.across is not None
         return self.across[:, None, None] * (self.across[:, None] * self.is_free)[None]
 
@@ -185,7 +185,7 @@ class FrameForm(Form):
 
     @property
     def spans(self) -> Float[Array, "3 parts"]:
-        """Between held places."""
+        """The vectors between held positions."""
         assert isinstance(self.layout, SpanForces)
         return self.layout.spans(self.held_positions[0])
 
@@ -200,7 +200,7 @@ class FrameForm(Form):
         return mean / jnp.sqrt(dot(mean, mean))[None]
 
     def through(self, end_force: Float[Array, "3 parts"]) -> Float[Array, "3 1 1"] | Float[Array, "3 1 n"]:
-        """The force through the cells besides that of the loads."""
+        """The section force in the cells without the loads beyond them."""
         return self.layout.gather(end_force)[:, None]
 
     def forces(self, quaternions: Float[Array, "4 m"], end_force: Float[Array, "3 parts"]) -> Float[Array, "3 k n"]:
@@ -210,7 +210,7 @@ class FrameForm(Form):
         return forces if following is None else forces + following
 
     def following(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
-        """What follower loads exert on the strain points; `None` where there are none."""
+        """The forces of follower loads at the strain points; `None` without such loads."""
         return None
 
     def couples_along(self, quaternions: Float[Array, "4 m"]) -> Float[Array, "3 k n"] | None:
@@ -268,7 +268,7 @@ class FrameForm(Form):
         return first_derivatives(self._cells(quaternions, end_force))
 
     def residual_vectors(self, point: FramePoint) -> tuple[Float[Array, "3 m"], Float[Array, "c"]]:
-        """What is out of balance at the frames, in their axes, and what the rod lacks of its spans."""
+        """The gradient at the frames, in their axes, and the residual of the closure constraints."""
         gradient = self.field.scatter_add(self.by_rotations(point.quaternions, point.end_force))
         constraint_residual = jnp.zeros(0, gradient.dtype)
         if self.layout.size:
@@ -370,7 +370,7 @@ class FrameForm(Form):
         return constraint_residual[0], constraint_rate[0], energy[0] - energy[1], rate[0] - rate[1]
 
     def turning(self, point: FramePoint, rotation: Float[Array, "3 m"]) -> tuple[Kinematics, Kinematics]:
-        """What follows from the frames of the cells alone, and its rates as they begin to turn."""
+        """The kinematics of the cells, and its rates along rotations."""
         frames, turns = self.field.gather(point.quaternions), self.field.gather(rotation)
         zero = jnp.zeros((), rotation.dtype)
         return jax.jvp(lambda part: self.kinematics(turned(frames, part * turns)), (zero,), (jnp.ones_like(zero),))
@@ -378,7 +378,7 @@ class FrameForm(Form):
     def in_cells(
         self, of_frames: Kinematics, end_force: Float[Array, "3 parts"]
     ) -> tuple[Float[Array, ""], Float[Array, "3 n"]]:
-        """What the cells add to L under forces, and their segment vectors."""
+        """The terms of L from the cells under forces, and the segment vectors."""
         forces = self.through(end_force) + self.loads
         here = self.strained_under(of_frames, forces)
         value = jnp.sum(self.field.lengths * self._densities(here) - here.tension * here.lengths)

@@ -168,7 +168,7 @@ class MixedForm(Form):
 
     @property
     def spans(self) -> Float[Array, "3 parts"]:
-        """Between held places."""
+        """The vectors between held positions."""
         assert isinstance(self.layout, SpanForces)
         return self.layout.spans(self.held_positions[0])
 

@@ -78,9 +78,9 @@ class NodalForm(PositionForm):
         return retracted if nodal.friction is None else self._on_surfaces(nodal, others, retracted)
 
     def _on_surfaces(self, nodal: Nodal, others: NodalChange, retracted: Nodal) -> Nodal:
-        """With nodes that press on obstacles as far from them as their tangent planes have it: these go along them.
+        """Nodes that press on obstacles, moved along the normal so that the gap is that of the linearisation.
 
-        A taut cable slides over a cylinder in whole steps so; along straight lines it would gain length.
+        So a taut cable slides over a cylinder in whole steps; along straight lines it would gain length.
         """
         gaps, normals = gaps_and_normals(self, nodal.positions)
         beyond, there = gaps_and_normals(self, retracted.positions)
@@ -106,7 +106,7 @@ class NodalForm(PositionForm):
         pressures: Float[Array, "k n+1"] | None,
         friction: Friction | None,
     ) -> Any:
-        """Pressures that are not known, not numbers, are those of the forces through the elements."""
+        """NaN pressures, which are unknown, follow from the forces through the elements."""
         nothing = jnp.zeros((pressure_rows(self.scene), len(nodes)), nodes.dtype)
         rough = rough_obstacles(self.scene)
         if rough and friction is None:
@@ -137,7 +137,7 @@ class NodalForm(PositionForm):
     # --- fields along the elements -----------------------------------------------------------------------------------
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
-        """With the contacts within them, whose forces count as if spread along them."""
+        """With the contacts within the elements, whose forces count as distributed along them."""
         fields = None
         if self.scene.potentials:
             fields = potentials.on_elements(self.scene, self.field.s, *self.node_lines(point))
@@ -164,7 +164,7 @@ class NodalForm(PositionForm):
     # --- the search --------------------------------------------------------------------------------------------------
 
     def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
-        """L with the contacts as of the model, with the pressures of a point."""
+        """L with the contact energy of the model, with the pressures of `point`."""
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         contact_compliance = here.system.contacts.contact_compliance
@@ -172,7 +172,7 @@ class NodalForm(PositionForm):
         return here.energy + model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
 
     def contact_energy(self, there: Any, point: Any) -> Float[Array, ""]:
-        """That of `objective`, on the way of a step from a point."""
+        """The contact energy of `objective` at a trial of a step from `point`."""
         gaps, _ = gaps_and_normals(self, there.nodal.positions)
         if smooth_obstacles(self.scene):
             gaps = jnp.concatenate([gaps, within_elements(self, there)[1]])
@@ -208,13 +208,13 @@ class NodalForm(PositionForm):
         return found.is_minimum, found.x, found.y
 
     def first_closed(self, is_closed: Bool[Array, "k n+1"], contacts: Unilateral) -> Bool[Array, "k n+1"]:
-        """What lies on an obstacle without pressure is more likely to press on it than to leave it."""
+        """The first guess of the closed contacts: a node that lies on an obstacle without pressure counts as closed."""
         return is_closed | (contacts.gaps < LIES_ON)
 
     def without_contacts(
         self, here: Linearization, forces: Float[Array, "r n+1"]
     ) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        """What is out of balance without the forces of contacts, as right sides."""
+        """The right sides of a step without the forces of contacts."""
         system = here.system
         assert isinstance(system, ChainSystem)
         first, _, balance, gaps = system.split(-here.constraint_residual)

@@ -1,4 +1,4 @@
-"""What is unknown of a rod whose nodes have positions of their own, beyond what others have."""
+"""The additional unknowns of a rod whose nodes have positions of their own."""
 
 import dataclasses
 from typing import NamedTuple
@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 
 
 class Friction(eqx.Module):
-    """Of f obstacles with friction: their tangential forces on each node; and the memory, where the nodes were in the
-    last equilibrium [m]: a step from there slips by what a node goes along the surface. Not numbers: from rest, where
-    nothing has slipped and friction does not act.
+    """Tangential forces of f obstacles with friction on each node, and the memory of friction: the positions of the
+    nodes in the last equilibrium [m], from which slips along the surface are counted. NaN from rest, where nothing has
+    slipped and friction does not act.
     """
 
     forces: Float[Array, "... f n+1 3"]
@@ -19,13 +19,13 @@ class Friction(eqx.Module):
 
     @staticmethod
     def from_rest(count: int, nodes: Float[Array, "n+1 3"]) -> "Friction":
-        """Of so many obstacles."""
+        """Of `count` obstacles, at rest."""
         return Friction(jnp.zeros((count, *nodes.shape), nodes.dtype), jnp.full_like(nodes, jnp.nan))
 
 
 class Nodal(eqx.Module):
-    """The positions of the nodes, the pressure of each obstacle at each node, and by how much the gaps of each obstacle
-    are seen larger in the next step; `friction`: where an obstacle has some.
+    """The positions of the nodes, and the pressure of each obstacle at each node; `relaxed`: added to the gaps of each
+    obstacle in the next step; `friction`: `None` where no obstacle has any.
     """
 
     positions: Float[Array, "n+1 3"]

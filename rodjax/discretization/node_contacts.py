@@ -104,7 +104,7 @@ def contacts_at(form: PositionForm, point: Any) -> Contacts:
 
 
 def contacts_with_itself(form: PositionForm, point: Any, pressures: Float[Array, "n+1"]) -> SelfContacts:
-    """Of a rod with these forces between its elements."""
+    """Self-contact of the rod with these pressures between its elements."""
     return self_contacts(curve(form, point), pressures, far_unit(form), pressure_rows(form.scene) - 1)
 
 
@@ -116,7 +116,7 @@ def exerted_by_itself(form: PositionForm, point: Any) -> Exerted:
 def _inner(
     form: PositionForm, point: Any, pressures: Float[Array, "q n"]
 ) -> tuple[Float[Array, "q n+1"], InnerRows, Float[Array, "2b+6 2b+6 n"]]:
-    """Gaps in the middles of the elements, their gradients, and what pressures there add to L."""
+    """Gaps in the middles of the elements, their gradients, and the second derivatives of -sum p g."""
     middles, gaps, normals = within_elements(form, point)
     rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
     b = rates.shape[1] - 3
@@ -129,7 +129,7 @@ def _inner(
 
 
 def relaxation(form: PositionForm, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
-    """How much larger the gaps of each obstacle are seen in the next step, where the rod lies within it."""
+    """Half of the penetration into each obstacle, added to its gaps in the next step; 0 below `LEAST_RELAXED`."""
     depths = -jnp.min(gaps, axis=1, initial=jnp.inf)
     if smooth_obstacles(form.scene):
         smooth, inner = np.array(smooth_obstacles(form.scene)), inner_rows(form.scene)
@@ -144,7 +144,7 @@ def relaxation(form: PositionForm, gaps: Float[Array, "k n+1"]) -> Float[Array, 
 def contact_model(
     form: PositionForm, point: Any, gaps: Float[Array, "k n+1"], displacements: Float[Array, "n+1 3"] | None
 ) -> Unilateral:
-    """The contacts of the model of a step from a point, with these gaps and displacements."""
+    """The contacts of the quadratic model of a step, with these gaps and displacements since the last equilibrium."""
     nodal = point.nodal
     gaps = gaps + nodal.relaxed[:, None]
     if nodal.friction is None or displacements is None:
@@ -227,7 +227,7 @@ def _middles_on_elements(form: PositionForm, point: Any) -> OnElements:
 
 
 def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:
-    """What contacts within elements apply to the rod, by parts at both nodes."""
+    """Forces of contacts within elements on the rod, distributed to both nodes."""
     if not has_inner_contacts(form):
         return jnp.zeros_like(point.nodal.positions)
     halves = -contacts_on_elements(form, point).by_position

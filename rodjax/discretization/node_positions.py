@@ -50,21 +50,21 @@ class PositionForm(Form):
 
     @abstractmethod
     def node_axes(self, point: Any) -> Float[Array, "3 b n+1"]:
-        """About which the tangents of the nodes turn, by rotations that are unknown."""
+        """The axes about which the unknown rotations turn the tangents of the nodes."""
 
     @abstractmethod
     def in_elements(self, point: Any, elements: Any, change: Float[Array, "3 n"]) -> tuple[Array, Array]:
-        """What stretch and forces add to L under other forces, and the segment vectors; `elements`: as of
-        `turning_elements`.
+        """The terms of L from stretch and forces under changed forces, and the segment vectors; `elements`: the first
+        result of `turning_elements`.
         """
 
     @abstractmethod
     def in_cells_at(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        """What the cells add to L, all of it, and their segment vectors."""
+        """All terms of L from the cells, and their segment vectors."""
 
     @abstractmethod
     def turning_elements(self, point: Any, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]) -> Any:
-        """What `in_elements` needs, and its rate as the rod begins to turn."""
+        """The arguments of `in_elements`, and their rates along rotations."""
 
     # --- what is unknown ---------------------------------------------------------------------------------------------
 
@@ -93,7 +93,7 @@ class PositionForm(Form):
         return dataclasses.replace(nodal, positions=nodal.positions.at[held].set(positions.T))
 
     def forces_in_elements(self, point: Any) -> Float[Array, "3 n"]:
-        """The forces through the elements, of those in the spans, as files until format 10 have them."""
+        """The forces through the elements from those in the spans, which files until format 10 have."""
         members = SpanForces.of(self.scene, self.clip_nodes, len(self.field.s) - 1)
         forces = jnp.broadcast_to(members.gather(point.end_force), (3, len(self.field.s) - 1))
         loads = self.loads_on_nodes(point)
@@ -124,11 +124,11 @@ class PositionForm(Form):
 
     @property
     def radius(self) -> Float[Array, "n+1"]:
-        """At the nodes; of a radius that jumps, the larger one beside the node."""
+        """The radius at the nodes; where it jumps, the larger of both sides."""
         return largest_beside(self._radius, self.field.s)
 
     def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
-        """At places in each element, as parts of it."""
+        """The radius in each element at relative positions 0 to 1."""
         s = self.field.s
         begin, end = (jnp.broadcast_to(side[:, None], (len(s) - 1, len(parts))) for side in (s[:-1], s[1:]))
         return value_at(self._radius, begin + parts[None] * (end - begin), begin, end)
@@ -140,8 +140,8 @@ class PositionForm(Form):
         return radius
 
     def samples(self, nodes: Float[Array, "n+1 3"], point: Any) -> tuple[Array, Array, Array]:
-        """At steps of arclength, as many as `passage` looks at: the centerline, the radius, and in an element
-        beside a held node this, elsewhere not a number.
+        """At `passage.SAMPLES` arclengths: the centerline, the radius, and the position of a held node at an end of the
+        element, NaN without one.
         """
         s = self.field.s
         x = jnp.linspace(0.0, 1.0, SAMPLES, dtype=s.dtype)
@@ -165,7 +165,7 @@ class PositionForm(Form):
         return point.nodal.positions, point.tangents[:, ::2]
 
     def at_nodes(self, point: Any) -> NodeEnergy | None:
-        """What fields are at the nodes, by the rotations that are unknown; `None` without fields."""
+        """Energies of fields at the nodes and their derivatives by the unknowns; `None` without fields."""
         if not self.scene.potentials:
             return None
         return potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), self.node_axes(point))
@@ -183,7 +183,7 @@ class PositionForm(Form):
         return applied if loads is None else applied - loads
 
     def lagrangian(self, point: Any) -> tuple[Float[Array, ""], Float[Array, "c"]]:
-        """Without contacts."""
+        """L without contacts, and the residual of the closure of each element."""
         energy, segment_vectors = self.in_cells_at(point)
         energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0))
         if self.scene.potentials:

@@ -14,6 +14,7 @@ import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
 from rodjax.discretization.inner_contacts import Middles
 from rodjax.discretization.nodal_point import NodalChange
+from rodjax.discretization.node_contacts import contacts_at
 from rodjax.model.supports import Support
 from rodjax.solving.equilibrium import checked_options
 from rodjax.solving.result import form_and_point
@@ -419,7 +420,7 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
     # Where a node is held the system holds its displacement, which is none.
     np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
     # The cylinder curves where it is touched.
-    assert float(jnp.max(jnp.abs(by_numpy(form.contacts)(point).stiffness))) > 1.0
+    assert float(jnp.max(jnp.abs(by_numpy(lambda point: contacts_at(form, point))(point).stiffness))) > 1.0
 
 
 def test_what_is_far_away_changes_nothing():

@@ -33,19 +33,19 @@ FAR_COMPLIANCE = 1e-6
 THINNER = 1e-5
 
 
-def coefficient(obstacle: Obstacle) -> Any:
+def friction_coefficient(obstacle: Obstacle) -> Any:
     """The coefficient of friction of an obstacle of a nondimensional scene."""
     return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction
 
 
 def smooth_obstacles(scene: Scene) -> tuple[int, ...]:
     """The numbers of the obstacles without friction: those that elements touch in their middles too."""
-    return tuple(k for k, obstacle in enumerate(scene.obstacles) if coefficient(obstacle) is None)
+    return tuple(k for k, obstacle in enumerate(scene.obstacles) if friction_coefficient(obstacle) is None)
 
 
 def rough_obstacles(scene: Scene) -> tuple[int, ...]:
     """The numbers of the obstacles with friction."""
-    return tuple(k for k, obstacle in enumerate(scene.obstacles) if coefficient(obstacle) is not None)
+    return tuple(k for k, obstacle in enumerate(scene.obstacles) if friction_coefficient(obstacle) is not None)
 
 
 def inner_rows(scene: Scene) -> slice:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.contact_gaps import coefficient, gaps_and_normals, rough_obstacles
+from rodjax.discretization.contact_gaps import friction_coefficient, gaps_and_normals, rough_obstacles
 from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential
 from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.node_positions import PositionForm
@@ -33,7 +33,7 @@ def travelled(form: PositionForm, positions: Float[Array, "n+1 3"], friction: Fr
 
 def friction_bounds(form: PositionForm, pressures: Float[Array, "k n+1"], friction: Friction) -> Float[Array, "f n+1"]:
     """Bounds mu p of the tangential forces; 0 from rest."""
-    coefficients = jnp.stack([coefficient(form.scene.obstacles[k]) for k in rough_obstacles(form.scene)])
+    coefficients = jnp.stack([friction_coefficient(form.scene.obstacles[k]) for k in rough_obstacles(form.scene)])
     is_still = jnp.isnan(friction.reference[:, 0]) | form.is_held
     pressures = pressures[np.array(rough_obstacles(form.scene))]
     return jnp.where(is_still[None] | (pressures < 0), 0.0, coefficients[:, None] * pressures)

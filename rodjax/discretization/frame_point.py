@@ -23,8 +23,8 @@ from rodjax.mechanics.energy import Sections
 
 
 class FramePoint(eqx.Module):
-    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known; with
-    obstacles where the nodes lie and what pushes.
+    """Frames along the rod; forces of the layout, zero where none is unknown; the total twist [rad], where known;
+    `nodal`: where positions of nodes are unknowns.
     """
 
     quaternions: Float[Array, "4 m"]
@@ -50,9 +50,10 @@ class FramePoint(eqx.Module):
 
 
 class Kinematics(NamedTuple):
-    """What follows from the frames of cells alone: what strains exceed those at rest by, tangents, and of the
-    correction at rest what turns with the reference frames, and what lies along the tangents; d1 and d2 where sections
-    shear.
+    """Quantities that depend on the frames of cells alone.
+
+    `strains`: minus those at rest; `rests`: the part of the correction at rest that turns with the reference frames;
+    `along`: its part along the tangents; `across`: d1 and d2 where sections shear.
     """
 
     strains: Float[Array, "3 p n"]
@@ -69,7 +70,7 @@ class Kinematics(NamedTuple):
         has_shear: bool,
         quaternions: Float[Array, "4 p n"],
     ) -> "Kinematics":
-        """Of cells with these frames."""
+        """The kinematics of cells with these frames."""
         strains = field.strains(field.seen(quaternions)[field.coordinates]).values
         if rest_strains is not None:
             strains -= rest_strains
@@ -83,9 +84,11 @@ class Kinematics(NamedTuple):
 
 
 class Strained(eqx.Module):
-    """At the strain points, first along the frames of a cell: what strains exceed those at rest by, and `axial` ones
-    under the tension, which with those at rest are `stretched`; tangents, and the lengths along these to the next node;
-    the lengths of rod that they stand for, and with shear its strains and what it adds to phi'.
+    """Strains and slopes at the strain points of cells.
+
+    `curvature`, `twist`, `axial`: strains minus those at rest, `axial` under the `tension`; `stretched`: with the axial
+    strain at rest; `lengths`: of the segment vectors along the `tangents`; `weights`: quadrature weights, lengths of
+    rod; `shear`: shear strains, and `sideways` what they add to phi', `None` without shear.
     """
 
     curvature: Float[Array, "2 p n"]
@@ -101,7 +104,7 @@ class Strained(eqx.Module):
 
     @staticmethod
     def of(field: Cells, sections: Sections, here: Kinematics, forces: Float[Array, "3 p n"]) -> "Strained":
-        """Of cells under these forces."""
+        """The strains of cells under these section forces."""
         strains, tangents = here.strains, here.tangents
         tension = dot(forces, tangents)
         axial = sections.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
@@ -125,12 +128,12 @@ class Strained(eqx.Module):
 
     @property
     def slopes(self) -> Float[Array, "3 p n"]:
-        """phi'."""
+        """The derivative of the centerline by arclength, phi'."""
         along = (1 + self.stretched)[None] * self.tangents
         return along if self.sideways is None else along + self.sideways
 
     def work(self, forces: Float[Array, "3 p n"]) -> Float[Array, "p n"]:
-        """Of forces on the weighted slopes."""
+        """The work of forces on the weighted slopes."""
         along = self.lengths * dot(forces, self.tangents)
         return along if self.sideways is None else along + self.weights * dot(forces, self.sideways)
 

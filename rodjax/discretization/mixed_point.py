@@ -17,8 +17,8 @@ from rodjax.model.rod import Rod
 
 
 class MixedPoint(eqx.Module):
-    """Unit tangents; the forces of the layout, zero where none is unknown; the total twist [rad], else zero; with
-    obstacles where the nodes lie and what pushes.
+    """Unit tangents; forces of the layout, zero where none is unknown; total twist [rad], zero where there is no
+    torsion; `nodal`: where positions of nodes are unknowns.
     """
 
     tangents: Float[Array, "3 m"]
@@ -36,7 +36,7 @@ class MixedPoint(eqx.Module):
 
 
 class Elastic(NamedTuple):
-    """Bending and torsion of a `Linearization`.
+    """The terms of bending and torsion in a `Linearization`.
 
     `torque_column`: by the torque, by the points of each cell; `torsional_compliance`: 1/GJ where the total twist is
     given; else `None`.
@@ -72,7 +72,7 @@ class ByCells(NamedTuple):
         forces: Float[Array, "3 p n"],
         tension: Float[Array, "p n"],
     ) -> "ByCells":
-        """Under the forces through the cells, with the derivatives of bending and torsion."""
+        """`forces`, `tension`: through the cells; `blocks`: the derivatives of bending and torsion."""
         weights = field.quadrature_weights
         strain, axial_compliance = jax.jvp(
             lambda tension: axial_strain_under(rod, tension), (tension,), (jnp.ones_like(tension),)

@@ -125,9 +125,9 @@ class NodalTangents(NodalForm, MixedForm):
     def in_cells_at(self, point: MixedPoint) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
         energy, segment_vectors = self.in_elements(point, point.tangents, jnp.zeros_like(point.end_force))
         energy += self.field.bending_energy(self.scene, point.tangents)
-        return energy + density(
-            self.scene.rod, twist=point.total_twist
-        ) if self.has_torsion else energy, segment_vectors
+        if self.has_torsion:
+            energy += density(self.scene.rod, twist=point.total_twist)
+        return energy, segment_vectors
 
     def turning_elements(
         self, point: MixedPoint, rotation: Float[Array, "b m"], bases: Float[Array, "3 b m"]

@@ -12,8 +12,10 @@ from rodjax.linalg.bordered import BorderedSystem
 
 
 class SlidingPoint(eqx.Module):
-    """The unknowns of the form at these arclengths; `slides`: whether these change with the next step; `excess`: the
-    slope of the energy by them beyond -R . t where the last step began.
+    """The unknowns of the form at fixed arclengths (`inner`), and the arclengths of the sliding clips.
+
+    `slides`: whether the next step changes the arclengths; `excess`: dW/ds + R . t where the last step began, an error
+    of the mesh.
     """
 
     inner: Any
@@ -23,7 +25,7 @@ class SlidingPoint(eqx.Module):
 
     @staticmethod
     def settled_at(point: Any, arclengths: Float[Array, "j"]) -> "SlidingPoint":
-        """An equilibrium of a rod that slides."""
+        """The point of an equilibrium at these arclengths."""
         return SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
 
     @property
@@ -44,14 +46,14 @@ class SlidingPoint(eqx.Module):
 
 
 class SlidingChange(NamedTuple):
-    """Of a step; `others`: as of the form at given arclengths."""
+    """The change of a step; `others`: that of the form at fixed arclengths."""
 
     arclengths: Float[Array, "j"]
     others: Any
 
 
 class SlidingLinearization(Linearization):
-    """With the arclengths, whether they change, and the slope of the energy by them beyond -R . t."""
+    """A linearisation with the arclengths, whether a step changes them, and dW/ds + R . t (`excess`)."""
 
     arclengths: Float[Array, "j"] = eqx.field(kw_only=True)
     slides: Bool[Array, ""] = eqx.field(kw_only=True)
@@ -59,7 +61,7 @@ class SlidingLinearization(Linearization):
 
     @property
     def at_arclengths(self) -> Linearization:
-        """That of the form at given arclengths."""
+        """The linearisation of the form at fixed arclengths."""
         assert isinstance(self.system, BorderedSystem)
         constraint_residual = self.constraint_residual[len(self.arclengths) :]
         parts = (self.bases, self.gradient, constraint_residual, self.system.inner, self.energy, self.residual)

@@ -176,9 +176,9 @@ def jacobian(result: rj.Equilibrium) -> tuple[jax.Array, jax.Array]:
         return jnp.concatenate([gradient.reshape(-1), constraint_residual])
 
     metric = Metric.of(form, here)
-    places = jnp.full(form.arclengths, jnp.sum(metric.mass))
-    forces = jnp.zeros(len(here.constraint_residual) - form.arclengths)
-    mass = jnp.concatenate([jnp.tile(metric.mass, b), places, forces])
+    slides = jnp.full(form.sliding_count, jnp.sum(metric.mass))
+    forces = jnp.zeros(len(here.constraint_residual) - form.sliding_count)
+    mass = jnp.concatenate([jnp.tile(metric.mass, b), slides, forces])
     return jax.jacfwd(residual_vectors)(jnp.zeros(len(mass))), mass
 
 

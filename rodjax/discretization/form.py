@@ -116,7 +116,7 @@ class Form(eqx.Module):
         """The point where a solver stopped, with all that is known of it."""
 
     @property
-    def arclengths(self) -> int:
+    def sliding_count(self) -> int:
         """How many of the multipliers, the first ones, are arclengths of sliding clips."""
         return 0
 

@@ -32,7 +32,7 @@ class Metric(eqx.Module):
     @staticmethod
     def of(form: Form, here: Linearization) -> "Metric":
         mass = form.field.weights * jnp.sum(here.bases**2, axis=(0, 1)) / here.bases.shape[1]
-        return Metric(mass, form.arclengths)
+        return Metric(mass, form.sliding_count)
 
     def inner(self, motion: Motion, other: Motion) -> Float[Array, ""]:
         of_rotations = jnp.sum(self.mass[None] * motion.rotation * other.rotation)

@@ -153,7 +153,7 @@ class SlidingForm(Form):
         return self.first.layout
 
     @property
-    def arclengths(self) -> int:
+    def sliding_count(self) -> int:
         return len(self._numbers)
 
     @property

@@ -129,7 +129,7 @@ class Problem(eqx.Module):
     def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
         scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
         state = self.equilibrium.state
-        return carried_to(scaled, state.shape, point, motion, made_at=state.held_points)
+        return carried_to(scaled, state.shape, point, motion, made_at=state.arclengths)
 
     def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
         """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
@@ -268,7 +268,7 @@ def left_of(
     """The left eigenvector to the eigenvalue nearest to zero, whose motion is given: the same where the system has
     symmetry, else on its side.
     """
-    if not form.arclengths:
+    if not form.sliding_count:
         return motion
     there = eqx.tree_at(lambda here: here.system, here, transposed(here.system))
     left = nearest_to_zero(form, point, there, neutral, others)[1]
@@ -380,12 +380,12 @@ def stepped(
     units = nondimensional(scene)[1]
     status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
     outcome = Outcome(here.residual, state.iterations, state.iterations, status.astype(int))
-    held_points = None
+    arclengths = None
     if isinstance(form, SlidingForm):
         assert isinstance(point, SlidingPoint)
-        form, point, held_points = form.at(point.held_points), point.inner, point.held_points
+        form, point, arclengths = form.at(point.arclengths), point.inner, point.arclengths
     shape = result.state.shape.reached(form, point)
-    found = Found(SolverState(shape, point.end_force, units, held_points), point, outcome, state.index == 0)
+    found = Found(SolverState(shape, point.end_force, units, arclengths), point, outcome, state.index == 0)
     return Station(
         parameter=state.parameter,
         equilibrium=build_result(scene, found, jnp.ones((), int)),
@@ -402,8 +402,8 @@ def stepped(
 def is_misplaced(result: Equilibrium, made: Equilibrium) -> Bool[Array, ""]:
     """Whether a rod has slid so far that its mesh, that of `made` stretched, is to be made anew."""
     scaled, _ = nondimensional(result.scene)
-    assert made.state.held_points is not None
-    form = SlidingForm.of(slid(scaled, made.state.held_points), made.state.shape)
+    assert made.state.arclengths is not None
+    form = SlidingForm.of(slid(scaled, made.state.arclengths), made.state.shape)
     point = free_form_and_point(result)[1]
     is_blocked = form.is_blocked(point)
     is_off = form.is_misplaced(point)
@@ -430,7 +430,7 @@ def on_new_mesh(result: Equilibrium, along: BranchTangent, mesh: Shape) -> tuple
 def _points(form: Form) -> Float[Array, "m"]:
     """Arclengths of the tangents or frames."""
     field = form.field
-    return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.held_points
+    return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.arclengths
 
 
 def work(motion: Motion, change: Motion, metric: Metric) -> Float[Array, ""]:

@@ -153,7 +153,7 @@ def _softest(form: Form, point: Point, here: Linearization) -> tuple[Float[Array
         return jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
 
     motion, stiffness = nearest_to(low, here.system)
-    if not form.arclengths:
+    if not form.sliding_count:
         return stiffness, motion, motion
     return stiffness, motion, nearest_to(low, transposed(here.system))[0]
 

@@ -161,12 +161,14 @@ def test_an_obstacle_in_the_way_is_passed(shortest):
 
 
 @pytest.mark.slow
-def test_the_same_arguments_give_the_same_bits(shortest):
-    again = routed()
-    for a, b in zip(jax.tree.leaves(shortest), jax.tree.leaves(again), strict=True):
+def test_the_same_arguments_give_the_same_bits():
+    """As executables: which of the first answers are NumPy code, equal to rounding, is a matter of time."""
+    with rj.numpy_first(False):
+        first, again = routed(), routed()
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert shortest.starts.message == again.starts.message
-    assert shortest.multipliers == again.multipliers
+    assert first.starts.message == again.starts.message
+    assert first.multipliers == again.multipliers
 
 
 @pytest.mark.slow

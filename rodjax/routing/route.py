@@ -218,9 +218,9 @@ def route(
     allow. A trial that would pull the rod more taut is stepped back from without a solve, as is one where clips would
     not follow one another; so is one without an equilibrium.
 
-    The same arguments give the same route to the last bit. Where no start keeps to the limits, the result is that of
-    the least violation, `feasible` is False, and `str` says what is missing. Raises `ValueError` or `TypeError` for
-    invalid arguments, and `ValueError` where no start has an equilibrium.
+    The same arguments give the same route to the last bit, as executables (`rodjax.numpy_first`). Where no start keeps
+    to the limits, the result is that of the least violation, `feasible` is False, and `str` says what is missing.
+    Raises `ValueError` or `TypeError` for invalid arguments, and `ValueError` where no start has an equilibrium.
     """
     workers = Workers(checked_executor(executor), checked_threads(threads))
     problem, names = _problem(scene, variables, limits, objective, obstacles, names, segments, solver)

@@ -346,6 +346,9 @@ def test_negative_eigenvalues_are_counted(size):
     mixed = np.concatenate([(mixed + mixed.swapaxes(1, 2)) / 2, np.zeros((1, size, size))])
     assert int(jax.jit(negative_count)(jnp.asarray(mixed))) == np.sum(values < 0)
     assert int(negative_count(jnp.asarray(np.diag(np.r_[0.0, -np.ones(size - 1)])[None]))) == size - 1
+    # Eigenvalues 2 cos(k pi/(size + 1)): pivots that are exactly zero stand before others.
+    path = np.eye(size, k=1) + np.eye(size, k=-1)
+    assert int(jax.jit(negative_count)(jnp.asarray(path[None]))) == size // 2
 
 
 # --- borders that may be full ----------------------------------------------------------------------------------------

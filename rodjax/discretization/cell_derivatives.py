@@ -45,7 +45,7 @@ class CellStates(NamedTuple):
     @property
     def is_separable(self) -> bool:
         """Whether each strain and each acting force adds to the density on its own."""
-        return self.sections.law is None and (self.rest_correction is None or self.rest_correction.along is None)
+        return self.sections.is_separable and (self.rest_correction is None or self.rest_correction.along is None)
 
     @property
     def turning(self) -> Float[Array, "3 n"] | None:
@@ -76,6 +76,10 @@ class Coordinates(NamedTuple):
     seen: Float[Array, "4 p-1 n"]
     directors: Float[Array, "3 3 p n"]
     own_forces: Float[Array, "3 p n"]
+
+    def turned_forces(self, acting: slice) -> Float[Array, "f 3 p n"]:
+        """The derivatives of the acting forces by the rotations of their frames."""
+        return skew(self.own_forces)[acting]
 
     @staticmethod
     def of(cells: CellStates) -> "Coordinates":
@@ -148,7 +152,7 @@ def derivatives(cells: CellStates) -> CellDerivatives:
     moments, by_forces = stresses[:3], stresses[3:]
     slopes, turning = _slopes(jacobian, moments), _turning(cells.field, here)
     # How the acting forces change as their frames turn, and with the force through the cell: [f, component, point].
-    turned, forcing = skew(here.own_forces)[cells.acting], jnp.swapaxes(here.directors[:, cells.acting], 0, 1)
+    turned, forcing = here.turned_forces(cells.acting), jnp.swapaxes(here.directors[:, cells.acting], 0, 1)
     by_forcing = _times(stiffness.forces, forcing)
 
     blocks = _curving(cells, here, slopes, by_forces)
@@ -223,7 +227,7 @@ def _by_rotations(
     if cells.turning is not None:
         reference -= cross(cells.turning, here.own_forces[:, REFERENCE])
     rows.insert(REFERENCE, reference)
-    return jnp.stack(rows, axis=1) + dot(by_forces[:, None], skew(here.own_forces)[cells.acting])
+    return jnp.stack(rows, axis=1) + dot(by_forces[:, None], here.turned_forces(cells.acting))
 
 
 def _quadratic(

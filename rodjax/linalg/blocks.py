@@ -97,9 +97,14 @@ def negative_count(matrices: Float[Array, "m c c"]) -> Int[Array, ""]:
         return jnp.sum(matrices < 0)
     _, diagonal, beside, _ = jax.lax.linalg.tridiagonal(matrices, lower=True)
     least = jnp.finfo(matrices.dtype).tiny
-    pivot = diagonal[:, 0]
-    count = jnp.sum(pivot < 0)
+
+    def pivot(value: Float[Array, "m"]) -> Float[Array, "m"]:
+        """Not zero, and counted with the sign that the next one sees."""
+        return jnp.where(jnp.abs(value) < least, least, value)
+
+    last = pivot(diagonal[:, 0])
+    count = jnp.sum(last < 0)
     for k in range(1, matrices.shape[-1]):
-        pivot = diagonal[:, k] - beside[:, k - 1] ** 2 / jnp.where(jnp.abs(pivot) < least, -least, pivot)
-        count += jnp.sum(pivot < 0)
+        last = pivot(diagonal[:, k] - beside[:, k - 1] ** 2 / last)
+        count += jnp.sum(last < 0)
     return count

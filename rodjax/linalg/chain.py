@@ -479,20 +479,17 @@ class ChainFactors(eqx.Module):
         if middles.left is not None:
             of_positions -= _on_nodes(reduction[:, 2 * b + 3 : 2 * b + 6], reduction[:, 2 * b + 6 :])
         right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_positions], axis=1)
-
         right = jnp.einsum("npq,nqr->npr", self.inverses, right)
 
-        def less(here: Array, matrix: Array, beside: Array) -> Array:
-            # In one loop with the difference, where a product of matrices is a call.
-            return here - jnp.sum(matrix[:, :, None] * beside[None], axis=1)
-
-        def forward(before: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-            here = less(given[1], given[0], before)
+        def substituted(beside: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+            coupling, here = given
+            # One loop with the difference, where a product of matrices is a call.
+            here -= jnp.sum(coupling[:, :, None] * beside[None], axis=1)
             return here, here
 
-        last, reached = jax.lax.scan(forward, right[0], (self.before, right[1:]))
+        last, reached = jax.lax.scan(substituted, right[0], (self.before, right[1:]))
         reached = jnp.concatenate([right[:1], reached[:-1]])
-        _, solved = jax.lax.scan(forward, last, (self.after, reached), reverse=True)
+        _, solved = jax.lax.scan(substituted, last, (self.after, reached), reverse=True)
         z = jnp.concatenate([solved, last[None]])
         around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)

@@ -120,6 +120,11 @@ class Sections(eqx.Module):
         bending = (self.EI[0] * curvature[0] ** 2 + self.EI[1] * curvature[1] ** 2) / 2
         return bending + self.GJ / 2 * twist**2 + self.EA / 2 * axial_strain**2
 
+    @property
+    def is_separable(self) -> bool:
+        """Whether `density` is a sum of functions of one strain each: its second derivatives are then a diagonal."""
+        return self.law is None
+
     def stretched(self, axial_strain: Float[Array, "*k"]) -> Float[Array, "*k"]:
         """All of the axial strain, of what it exceeds that without stress by."""
         return axial_strain if self.rest_axial is None else axial_strain + self.rest_axial

@@ -1137,6 +1137,28 @@ def damaged_sweeps(damaged, world):
         assert re.fullmatch(r"rodjax: out\.h5 [^\n]*\n", err)
 
 
+def damaged_ends(content: bytes) -> Iterator[bytes]:
+    """With the seal's mark gone, and content before it: as zeros, cut out, in another order."""
+    inside, beyond = len(content) - 100, len(content) - 20
+    yield content[:inside] + bytes(beyond - inside) + content[beyond:]
+    yield content[:-50] + content[-36:]
+    yield content[:inside] + content[inside:beyond][::-1] + content[beyond:]
+
+
+def test_a_damaged_seal_does_not_hide_damage_before_it(world):
+    copied(world, "scene.toml", "grid.toml", "whole.h5")
+    save(world.samples.single, "a.vtkhdf")
+    for damaged in damaged_ends(Path("a.vtkhdf").read_bytes()):
+        Path("a.vtkhdf").write_bytes(damaged)
+        with pytest.raises(ValueError, match="is damaged: the seal after its end is missing"):
+            load("a.vtkhdf")
+    for damaged in damaged_ends(Path("whole.h5").read_bytes()):
+        Path("out.h5").write_bytes(damaged)
+        code, err = world.run(*RESUME)
+        assert code == 2
+        assert re.fullmatch(r"rodjax: out\.h5 [^\n]*is damaged: the seal after its end is missing[^\n]*\n", err)
+
+
 # --- places that cannot be written to --------------------------------------------------------------------------------
 
 

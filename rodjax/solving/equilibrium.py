@@ -53,7 +53,7 @@ from rodjax.model.scene import (
 from rodjax.model.supports import Clamp
 from rodjax.notes import note
 from rodjax.programs.compilation import compiled
-from rodjax.solving.guess import Guess
+from rodjax.solving.guess import Guess, beside_obstacles
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
@@ -592,7 +592,7 @@ def _unsettled_state(
     before, pressures, friction = _before(scene, guess), _pressures(scene, options), _from_rest(scene, options)
     if guess is None:
         no_twist = jnp.zeros((), no_force.dtype)
-        shape = kind.through(first_shape(scaled, pieces))
+        shape = kind.through(beside_obstacles(scaled, first_shape(scaled, pieces), pieces))
         arclengths = sliding_arclengths(scaled)
         state = SolverState(shape, no_force, units, arclengths, before=before, pressures=pressures, friction=friction)
         return state, FirstTwist(no_twist)
@@ -639,7 +639,14 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
             shape, force, first = _as_plain(given, options)
             # Loads without a potential are put on by `loading` where a search begins without a force.
             return state(shape, in_parts(force, parts) if has_potential(scene) else no_force), first
-        return state(first_frames(scene, s, of_joints)), FirstTwist(rest_twist(scene))
+        shape = first_frames(scene, s, of_joints)
+        if scene.obstacles:
+            points = first_shape(scene, pieces)
+            aside = beside_obstacles(scene, points, pieces)
+            is_aside = jnp.any(aside != points)
+            framed = framed_through(scene, aside, of_joints)
+            shape = jax.tree.map(lambda there, here: jnp.where(is_aside, there, here), framed, shape)
+        return state(shape), FirstTwist(rest_twist(scene))
     if isinstance(guess, Guess):
         shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
         return state(shape), FirstTwist(guess.total_twist)

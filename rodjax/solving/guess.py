@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,7 +11,10 @@ from jaxtyping import Array, Float
 from rodjax.checks import leaf, number_array, shown
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.interpolation import resampled
+from rodjax.mechanics.taut import drawn_in
 from rodjax.model.scene import Scene, scene_axes
+from rodjax.model.supports import Directed, Held
+from rodjax.model.triangle_mesh import Mesh
 from rodjax.units import Units
 
 # Cosine between neighbouring edges below which a guess counts as folded, and by how much of an edge it is unfolded.
@@ -20,6 +24,9 @@ ASIDE = 0.05
 
 class Guess(eqx.Module):
     """An initial shape; it need not match the supports, the length or the mesh.
+
+    Beside obstacles it tells on which side the rod passes them. Where it is longer than the rod, or lies within one, it
+    is drawn in and led out first, between two supports without clips.
 
     `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
     frames allow on this shape, the solution has the one nearest to this.
@@ -39,9 +46,32 @@ class Guess(eqx.Module):
         self.total_twist = leaf(number_array(total_twist, "total_twist"))
 
     def nodes(self, scene: Scene, units: Units, segments: int) -> Float[Array, "n+1 3"]:
-        """The nodes of a mesh on this shape, for a nondimensional scene."""
-        nodes = resampled((self.points - units.origin[None]) / units.length, segments)
-        return _unfolded(nodes, scene_axes(scene))
+        """The nodes of a mesh on this shape, for a nondimensional scene; beside obstacles as of `beside_obstacles`."""
+        points = (self.points - units.origin[None]) / units.length
+        return _unfolded(beside_obstacles(scene, points, segments), scene_axes(scene))
+
+
+def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
+    """The nodes of a mesh on a shape, for a nondimensional scene; where obstacles are near, on one that is drawn in,
+    if it is longer than the rod or lies within an obstacle.
+
+    Not through clips, not with a free end, and not beside a `Mesh`, whose distance is dear.
+    """
+    nodes = resampled(points, segments)
+    start, end, radius = scene.start, scene.end, scene.rod.radius
+    has_mesh = any(map(_is_mesh, jax.tree.leaves(scene.obstacles, is_leaf=_is_mesh)))
+    if not scene.obstacles or has_mesh or scene.clips or not isinstance(start, Held) or not isinstance(end, Held):
+        return nodes
+    between = points.at[0].set(start.position).at[-1].set(end.position)
+    assert radius is not None, "a rod beside obstacles has a radius"
+    thickest = jnp.max(getattr(radius, "values", radius))
+    first, last = (support.tangent if isinstance(support, Directed) else None for support in (start, end))
+    string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, scene.rod.length)
+    return jnp.where(is_needed, resampled(string, segments), nodes)
+
+
+def _is_mesh(obstacle: Any) -> bool:
+    return isinstance(obstacle, Mesh)
 
 
 def _unfolded(nodes: Float[Array, "n+1 3"], axes: Float[Array, "3 3"]) -> Float[Array, "n+1 3"]:

@@ -1,0 +1,125 @@
+"""First shapes beside obstacles: strings that are led out of them and drawn in to the length of the rod."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, taut
+
+RADIUS = 0.005
+PIPE = rj.Capsule((0.3, -1, 0), (0.3, 1, 0), 0.1)
+NO_TANGENTS = (None, None)
+
+
+def parabola(span: float, height: float, count: int = 65) -> np.ndarray:
+    u = np.linspace(0, 1, count)
+    return np.stack([span * u, 0 * u, 4 * height * u * (1 - u)], axis=1)
+
+
+def length_of(points) -> float:
+    return float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+
+
+def drawn(points: np.ndarray, length: float, obstacles=(PIPE,), tangents=NO_TANGENTS):
+    string, is_needed = drawn_in(jnp.asarray(points), tangents, obstacles, jnp.asarray(RADIUS), jnp.asarray(length))
+    return np.asarray(string), bool(is_needed)
+
+
+def around_the_pipe(distance: float) -> float:
+    """The least length from one pin to the other over the pipe: two tangents and an arc of 0.3 beside its axis."""
+    tangent = np.sqrt(0.3**2 - distance**2)
+    return 2 * tangent + distance * (np.pi - 2 * np.arccos(distance / 0.3))
+
+
+def test_a_string_is_drawn_in_to_the_length_of_the_rod():
+    begin = parabola(0.6, 0.4)
+    string, is_needed = drawn(begin, 0.8)
+    assert is_needed
+    # The last round makes it shorter by less than a thousandth; places are spread along its chords.
+    assert 0.798 < length_of(string) <= 0.8
+    assert np.max(string[:, 2]) > 0.1  # on its side of the pipe
+    np.testing.assert_allclose(string[[0, -1]], begin[[0, -1]], atol=1e-15)
+    steps = np.linalg.norm(np.diff(string, axis=0), axis=1)
+    np.testing.assert_allclose(steps, np.mean(steps), rtol=1e-3)
+
+
+def test_a_string_too_short_for_its_side_is_taut_there():
+    string, is_needed = drawn(parabola(0.6, 0.4), 0.61)
+    assert is_needed
+    # Kept away by a tenth more than the radius; chords of 1/64 lack 1e-5, rounds end at 1e-7 of a length each.
+    assert length_of(string) == pytest.approx(around_the_pipe(0.1 + 1.1 * RADIUS), abs=1e-3)
+    needed, touched = taut(jnp.asarray(string), (PIPE,), jnp.asarray(RADIUS))
+    assert float(needed) == pytest.approx(around_the_pipe(0.1 + RADIUS), abs=2e-4)
+    assert bool(touched[0])
+
+
+def test_what_lies_within_is_led_out_with_the_tangents_of_supports():
+    first, last = jnp.array([0.6, 0.0, 0.8]), jnp.array([1.0, 0.0, 0.0])
+    string, is_needed = drawn(parabola(0.6, 0.02), 0.9, tangents=(first, last))
+    assert is_needed
+    distances = np.asarray(PIPE.distance(string[1:-1]))
+    np.testing.assert_array_less(RADIUS, distances)
+    # Chords of the first and last piece, before places are spread evenly: within 5 degrees.
+    for chord, tangent in ((string[1] - string[0], first), (string[-1] - string[-2], last)):
+        assert np.dot(chord, tangent) / np.linalg.norm(chord) > np.cos(np.deg2rad(5))
+
+
+def test_a_shape_that_fits_is_left_as_it_is():
+    """As long as the rod to 2 %, and nowhere nearer to the pipe than by a hundredth of the radius."""
+    begin = parabola(0.6, 0.15, DRAWN_PIECES + 1)
+    string, is_needed = drawn(begin, length_of(begin) / 1.01)
+    assert not is_needed
+    assert not np.array_equal(string, begin)  # spread, and not asked for
+    scene = rj.Scene(rj.Rod(1.0, 1.0, 1.0, 1e6, 1.0, radius=RADIUS), rj.Pin((0, 0, 0)), rj.Pin((0.6, 0, 0)))
+    # The guess of a rod without obstacles does not know of any of this, and a rod far from them has the same bits.
+    far = rj.Capsule((0.3, -1, -9), (0.3, 1, -9), 0.1)
+    long = rj.Guess(parabola(0.6, 0.4))
+    results = [
+        rj.solve(
+            rj.Scene(scene.rod, scene.start, scene.end, (0, 0, -9.81), obstacles=obstacles), segments=8, guess=long
+        )
+        for obstacles in ((), (far,))
+    ]
+    np.testing.assert_allclose(results[0].nodes, results[1].nodes, atol=1e-9)
+
+
+# Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the
+# others within boxes. Ends, tangents in the plane, weight, capsule (start, end, radius), box (center, size), cylinder.
+SCENES = {
+    "too long": (
+        (0.60637743, (0.85658923, -0.51599892), (0.89873231, -0.4384977), 1.09834266),
+        ((0.6052, -0.9602, -0.193), (0.0463, 0.9602, -0.193), 0.0745),
+        ((0.4611, 0.0, -0.2229), 0.0978),
+        ((0.3292, -0.4863, -10.341), (0.5614, 0.4863, -10.341), 0.044),
+    ),
+    "within a box": (
+        (0.46291043, (0.86279475, -0.50555437), (0.99661428, 0.08221905), 111.57006897),
+        ((0.2736, -0.9996, 0.0353), (0.3321, 0.9996, 0.0353), 0.0462),
+        ((0.3506, 0.0, -0.4169), 0.1728),
+        ((0.3404, -0.4998, -0.2069), (0.3676, 0.4998, -0.2069), 0.0564),
+    ),
+    "heavy": (
+        (0.65716401, (0.92948503, 0.36885984), (0.99949781, 0.03168811), 6420.22206826),
+        ((0.3101, -0.9816, -0.1179), (-0.0714, 0.9816, -0.1179), 0.0789),
+        ((0.4934, 0.0, -0.4263), 0.1694),
+        ((0.2546, -0.4984, -0.2627), (0.3352, 0.4984, -0.2627), 0.0658),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_starts_that_are_too_long_or_within_obstacles_come_to_rest(name):
+    (span, first, last, weight), capsule, (center, size), cylinder = SCENES[name]
+    obstacles = [rj.Capsule(*capsule), rj.Box(center, (size, 2.0, size)), rj.Cylinder(*cylinder)]
+    start, end = (rj.Swivel((x, 0, 0), (tangent[0], 0, tangent[1])) for x, tangent in ((0.0, first), (span, last)))
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6, weight, radius=RADIUS)
+    scene = rj.Scene(rod, start, end, (0, 0, -1), obstacles=obstacles)
+    begin = parabola(span, -0.6 * np.sqrt(1 - span**2))
+    begin[:, 1] = 0.02 * np.sin(np.pi * np.linspace(0, 1, len(begin)))
+    result = rj.solve(scene, segments=48, guess=rj.Guess(begin), strain_limit=None)
+    assert bool(result.converged)
+    assert bool(result.stable)
+    # At contact points to rounding; the supports are no nearer.
+    distances = np.min([np.asarray(obstacle.distance(result.nodes)) for obstacle in obstacles], axis=0)
+    assert np.min(distances) > RADIUS - 1e-9

@@ -60,8 +60,8 @@ class Harness(eqx.Module):
 
     # In the place of a scene.
     instead: ClassVar[str] = (
-        "rodjax.solve, solve_path, solve_batch and end_stiffness take it, others the scene of a rod with clamps "
-        "where its joints were found: result[name].scene"
+        "rodjax.solve, solve_path, solve_batch, follow and end_stiffness take it, others the scene of a rod with "
+        "clamps where its joints were found: result[name].scene"
     )
 
     scenes: tuple[Scene, ...]

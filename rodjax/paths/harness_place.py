@@ -32,7 +32,7 @@ from rodjax.solving.coupling import RodInBodies
 from rodjax.solving.harness import ends_of, harness_equilibrium
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, form_and_point
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, form_and_point
 from rodjax.solving.status import Outcome
 
 
@@ -315,13 +315,16 @@ class HarnessProblem(eqx.Module):
     def departure(
         self, parameter: Float[Array, ""], motion: HarnessMotion, share: Float[Array, ""]
     ) -> tuple[tuple[tuple[Direction, ...], Float[Array, "q"]], None]:
-        """A motion in global axes; a step may be any part of it."""
-        under = self._under(parameter, self.point.poses)
-        points = self._held(under, self.point.rods)
-        directions = []
-        for bases, x in zip(self._bases(under, points), motion.rods, strict=True):
-            turns = jax.vmap(lambda bases, rotation: short_sum(bases * rotation[None], axis=1))(bases, x.rotation)
-            directions.append(Direction(turns, x.multipliers))
+        """A motion of the equilibrium in global axes; a step may be any part of it."""
+
+        def turns(rod: Equilibrium, rotation: Float[Array, "b m"]) -> Float[Array, "3 m"]:
+            form, point = form_and_point(rod)
+            return short_sum(form.bases_at(point) * rotation[None], axis=1)
+
+        directions = [
+            Direction(jax.vmap(turns)(group, x.rotation), x.multipliers)
+            for group, x in zip(self.equilibrium.groups, motion.rods, strict=True)
+        ]
         return (tuple(directions), motion.bodies), None
 
     def retracted(self, place: HarnessPlace, motion: HarnessMotion) -> tuple[Float[Array, ""], HarnessPoint]:

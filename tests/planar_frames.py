@@ -32,11 +32,32 @@ def _shot(rod: PlanarRod, start: np.ndarray) -> np.ndarray:
     return solve_ivp(rates, (0.0, rod.length), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
 
 
+Loads = dict[str, tuple[float, float, float]]
+
+
 def solve_frame(
-    rods: Sequence[PlanarRod], loads: dict[str, tuple[float, float, float]], guess: np.ndarray, poses: dict
+    rods: Sequence[PlanarRod], loads: Loads, guess: np.ndarray, poses: dict
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Poses of the joints, and states at the starts of the rods. `guess`: (nx, ny, m) of each rod at its start."""
+    joints, begins, _ = _solve(rods, loads, guess, poses, None)
+    return joints, begins
+
+
+def load_that_holds(
+    rods: Sequence[PlanarRod], loads: Loads, guess: np.ndarray, poses: dict, held: tuple[str, int, float]
+) -> float:
+    """The component of the load on a joint under which that component of its pose has a given value: also at a limit
+    point, where the load determines no pose. `held`: the joint, the component and the value.
+    """
+    return _solve(rods, loads, guess, poses, held)[2]
+
+
+def _solve(
+    rods: Sequence[PlanarRod], loads: Loads, guess: np.ndarray, poses: dict, held: tuple[str, int, float] | None
+) -> tuple[dict[str, np.ndarray], list[np.ndarray], float]:
     names = list(loads)
+    scale = max(rod.EI / rod.length**2 for rod in rods)
+    place = -1 if held is None else 3 * names.index(held[0]) + held[1]
 
     def pose(support: tuple, joints: dict) -> tuple:
         if isinstance(support[0], str):
@@ -44,12 +65,17 @@ def solve_frame(
             return x, y, angle + support[1]
         return support
 
-    def split(unknowns: np.ndarray) -> tuple[dict, np.ndarray]:
-        joints = dict(zip(names, unknowns[: 3 * len(names)].reshape(-1, 3), strict=True))
-        return joints, unknowns[3 * len(names) :].reshape(-1, 3)
+    def split(unknowns: np.ndarray) -> tuple[dict, np.ndarray, dict]:
+        """In the place of a pose that is held the unknown is the load."""
+        of_joints, forces = unknowns[: 3 * len(names)].copy(), unknowns[3 * len(names) :].reshape(-1, 3)
+        given = np.array([loads[name] for name in names], float).reshape(-1)
+        if held is not None:
+            given[place], of_joints[place] = scale * of_joints[place], held[2]
+        joints = dict(zip(names, of_joints.reshape(-1, 3), strict=True))
+        return joints, forces, dict(zip(names, given.reshape(-1, 3), strict=True))
 
     def begins(unknowns: np.ndarray) -> list[np.ndarray]:
-        joints, forces = split(unknowns)
+        joints, forces, _ = split(unknowns)
         found = []
         for rod, (nx, ny, m) in zip(rods, forces, strict=True):
             x, y, angle = pose(rod.start, joints)
@@ -58,8 +84,7 @@ def solve_frame(
         return found
 
     def lacking(unknowns: np.ndarray) -> np.ndarray:
-        joints, _ = split(unknowns)
-        balance = {name: np.array(load, float) for name, load in loads.items()}
+        joints, _, balance = split(unknowns)
         rows = []
         for rod, begin in zip(rods, begins(unknowns), strict=True):
             end = _shot(rod, begin)
@@ -71,8 +96,10 @@ def solve_frame(
                 balance[rod.end[0]] -= end[3:]
         return np.concatenate([rows, *[of_joint / scale for of_joint in balance.values()]])
 
-    scale = max(rod.EI / rod.length**2 for rod in rods)
     first = np.concatenate([np.ravel([poses[name] for name in names]), np.ravel(guess)])
+    if held is not None:
+        first[place] = loads[held[0]][held[1]] / scale
     found = root(lacking, first, tol=1e-13)
     assert np.max(np.abs(lacking(found.x))) < 1e-10
-    return split(found.x)[0], begins(found.x)
+    load = 0.0 if held is None else scale * found.x[place]
+    return split(found.x)[0], begins(found.x), float(load)

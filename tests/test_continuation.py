@@ -8,7 +8,7 @@ import pytest
 import rodjax as rj
 from rodjax import BranchEnd, Clamp, Free, Guess, PointForce, Rod, Scene, frame
 from rodjax.discretization.form import NEUTRAL
-from rodjax.paths.branch import rotation_vector
+from rodjax.geometry.rotations import rotation_vector
 
 SEGMENTS = 16
 ORIGIN, LEVEL = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)

@@ -270,7 +270,6 @@ def test_a_report_of_a_harness_is_of_all_its_cables(both, tmp_path):
             lambda parts: rodjax.sensitivities(parts.harness, of=["nodes"], wrt=["gravity"]),
             "real fields of this harness",
         ),
-        (lambda parts: rodjax.follow([parts.harness] * 2), 'its branches are followed by solve_path(..., find="equil'),
         (lambda parts: rodjax.solve_batch([[parts.harness]]), "is a Harness: rodjax.solve_path and solve_batch take"),
         (lambda parts: rodjax.end_stiffness(parts.harness), "cable must be one of 'a', 'b', got None"),
         (lambda parts: rodjax.end_stiffness(parts.harness, "a"), "scene['a'].end must be a Clamp"),

@@ -152,6 +152,18 @@ def from_frame(frame: Float[Array, "3 3"]) -> Float[Array, "4"]:
     return row / jnp.sqrt(jnp.sum(row**2))
 
 
+def rotation_vector(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The smallest rotation from one frame to another as a vector [rad], no longer than pi, global axes."""
+    q = from_frame(other @ frame.T)
+    q = jnp.where(q[0] < 0, -q, q)
+    squared = jnp.sum(q[1:] ** 2)
+    # Series near zero, where the derivative of the length is infinite.
+    is_small = squared < 1e-4
+    length = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    series = 1 + squared / 6 + 3 * squared**2 / 40 + 5 * squared**3 / 112
+    return 2 * jnp.where(is_small, series, jnp.arctan2(length, q[0]) / length) * q[1:]
+
+
 def nearer(q: Float[Array, "4 *k"], other: Float[Array, "4 *k"]) -> Float[Array, "4 *k"]:
     """The one of the two quaternions of a rotation that is nearer to another."""
     return jnp.where(dot(q, other)[None] < 0, -q, q)

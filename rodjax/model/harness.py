@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
-from rodjax.geometry.rotations import from_frame
+from rodjax.geometry.rotations import rotation_vector
 from rodjax.model.along import largest_beside
 from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
@@ -60,8 +60,8 @@ class Harness(eqx.Module):
 
     # In the place of a scene.
     instead: ClassVar[str] = (
-        "rodjax.solve, solve_path, solve_batch and end_stiffness take it, others the scene of a rod with clamps "
-        "where its joints were found: result[name].scene"
+        "rodjax.solve, solve_path, solve_batch, follow and end_stiffness take it, others the scene of a rod with "
+        "clamps where its joints were found: result[name].scene"
     )
 
     scenes: tuple[Scene, ...]
@@ -358,18 +358,7 @@ def _stacked_if_any(values: list[Any], default: np.ndarray, dtype: Any) -> Array
 
 def rotation_vectors(frames: Float[Array, "j 3 3"], others: Float[Array, "j 3 3"]) -> Float[Array, "j 3"]:
     """From other frames to frames, global axes, no longer than pi."""
-
-    def one(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:
-        q = from_frame(frame @ other.T)
-        q = jnp.where(q[0] < 0, -q, q)
-        squared = jnp.sum(q[1:] ** 2)
-        # Series near zero, where the derivative of the length is infinite.
-        is_small = squared < 1e-4
-        length = jnp.sqrt(jnp.where(is_small, 1.0, squared))
-        series = 1 + squared / 6 + 3 * squared**2 / 40 + 5 * squared**3 / 112
-        return 2 * jnp.where(is_small, series, jnp.arctan2(length, q[0]) / length) * q[1:]
-
-    return jax.vmap(one)(frames, others)
+    return jax.vmap(rotation_vector)(others, frames)
 
 
 def joint_ends(scene: Scene, joint_names: tuple[str, ...]) -> tuple[tuple[int, int], Any, Any]:

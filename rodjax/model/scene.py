@@ -8,15 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
+from rodjax.geometry.rotations import rotation_vector
 from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential, check_potential
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
 from rodjax.model.summaries import scene_text
-from rodjax.model.supports import Clamp, Clip, Free, Held, Hinge, Movable, Pin, Slider, Spring, Support, Swivel
+from rodjax.model.supports import Clamp, Clip, Free, Held, Hinge, Movable, Pin, Slider, Spring, Support, Swivel, rotate
 from rodjax.units import Units
 
 # Supports further apart than this many lengths of the rod between them are taken for a mistake: no cable is stretched
@@ -294,8 +294,7 @@ def support_between(support: Support, other: Support, fraction: Float[Array, ""]
 def frame_between(
     frame: Float[Array, "3 3"], other: Float[Array, "3 3"], fraction: Float[Array, ""]
 ) -> Float[Array, "3 3"]:
-    turn = Rotation.from_matrix(frame.T @ other).as_rotvec()
-    return frame @ Rotation.from_rotvec(fraction * turn).as_matrix()
+    return rotate(frame, fraction * rotation_vector(frame, other))
 
 
 def held_position(scene: Scene) -> Float[Array, "3"]:

@@ -1,4 +1,5 @@
-"""One branch of equilibria through a sequence of scenes, stable or not, and the points on it where a motion goes soft.
+"""One branch of equilibria through a sequence of scenes or harnesses, stable or not, and the points on it where a
+motion goes soft.
 
 The parameter of a sequence of m scenes runs from 0 to m - 1 and names the scene between two of them. Along the branch
 the residual (gradient by rotations, constraint residual) of the mixed form stays zero. A step goes along the tangent of
@@ -10,54 +11,41 @@ Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1
 stability analysis" (2010).
 """
 
-import dataclasses
-import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.edges import EdgeTangents
-from rodjax.discretization.form import Form, Linearization, Point
-from rodjax.discretization.joints import generic_field
-from rodjax.discretization.motion import Metric, Motion, neutral_turn
+from rodjax.discretization.form import Form
+from rodjax.discretization.motion import Motion
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.sliding import SlidingForm, SlidingPoint
+from rodjax.discretization.sliding import SlidingForm
 from rodjax.geometry.vectors import components
 from rodjax.linalg.blocks import short_sum
-from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
-from rodjax.linalg.chain import ChainSystem
-from rodjax.linalg.saddle_point import AnyFactors, AnySystem, SaddlePointSystem, factor, transposed
-from rodjax.model.scene import Scene, between, nondimensional, slid
-from rodjax.model.supports import Clamp, rotate
+from rodjax.model.harness import Harness
+from rodjax.model.scene import Scene, nondimensional, slid
+from rodjax.paths import harness_place, rod_place
+from rodjax.paths.harness_modes import HarnessMode, mode_of_motion
+from rodjax.paths.harness_place import HarnessProblem
 from rodjax.paths.modes import Mode, mode_of
+from rodjax.paths.place import added, left_of, less, nearest_to_zero, scaled
+from rodjax.paths.rod_place import RodProblem
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import on_mesh_of
-from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, free_form_and_point
-from rodjax.solving.stability import carried_to
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.result import Equilibrium, free_form_and_point
 from rodjax.solving.status import Outcome, Status
 
-# A point lies on the branch when no force larger than this is left on a node [EI/L^2], or rounding allows no less.
-TOLERANCE = 1e-9
 MAX_ITERATIONS = 12
-# The most by which a correction turns a tangent [rad].
-MAX_ROTATION = 1.0
-# Stiffness of the spring against a neutral turn [EI/L], that of a softly held rod.
-SPRING = 10.0
-# Stiffness of the springs that hold a rod while its system is factorised [EI/L], and the parts it is held in.
-SPRING_STIFFNESS = 100.0
-PARTS = 4
-# Inverse iterations for the motion whose stiffness is nearest to zero: where it is near, one gains six digits.
-INVERSE_ITERATIONS = 4
 
 
 class BranchTangent(eqx.Module):
     """A direction in which equilibria change: a motion, and the change of the parameter that goes with it."""
 
-    motion: Motion
+    motion: Any
     rate: Float[Array, ""]
 
 
@@ -72,225 +60,42 @@ class Station(eqx.Module):
     """
 
     parameter: Float[Array, ""]
-    equilibrium: Equilibrium
+    equilibrium: Equilibrium | HarnessEquilibrium
     along: BranchTangent
     alignment: Float[Array, ""]
     index: Int[Array, ""]
     stiffness: Float[Array, ""]
-    motion: Motion
+    motion: Any
     slope: Float[Array, ""]
 
 
-def scene_at(scenes: Scene, segment: Int[Array, ""], parameter: Float[Array, ""]) -> Scene:
-    """The scene of a parameter between the scenes number `segment` and the next one; beyond them on in a line."""
-    scene, other = (jax.tree.map(lambda leaf, k=k: leaf[segment + k], scenes) for k in (0, 1))
-    fraction = parameter - segment.astype(parameter.dtype)
-    mixed = between(scene, other, fraction)
-    # As `between` has them, but smooth where the frames are the same.
-    ends = [name for name in ("start", "end") if isinstance(getattr(scene, name), Clamp)]
-    clips = [k for k, clip in enumerate(scene.clips) if clip.frame is not None]
-
-    def held(scene: Scene) -> list[Float[Array, "3 3"]]:
-        return [getattr(scene, name).frame for name in ends] + [scene.clips[k].frame for k in clips]
-
-    pairs = zip(held(scene), held(other), strict=True)
-    frames = [rotate(frame, fraction * rotation_vector(frame, next_frame)) for frame, next_frame in pairs]
-    return eqx.tree_at(held, mixed, frames) if frames else mixed
+def problem_of(scenes: Scene | Harness, segment: Int[Array, ""], result: Any) -> Any:
+    """The scenes or harnesses about an equilibrium."""
+    if isinstance(scenes, Harness):
+        return HarnessProblem(scenes, segment, result)
+    return RodProblem(scenes, segment, result)
 
 
-def rotation_vector(frame: Float[Array, "3 3"], other: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """The smallest rotation from one frame to another as a vector [rad], by less than pi, global axes."""
-    turn = other @ frame.T
-    sines = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    squared, cosine = jnp.sum(sines**2), (jnp.trace(turn) - 1) / 2
-    # Series of the arcsine near zero, where the derivatives of the length are infinite.
-    is_small = (squared < 1e-4) & (cosine > 0)
-    sine = jnp.sqrt(jnp.where(is_small, 1.0, squared))
-    series = 1 + squared / 6 + squared**2 * (3 / 40) + squared**3 * (5 / 112)
-    return jnp.where(is_small, series, jnp.arctan2(sine, cosine) / sine) * sines
+def count_of(scenes: Scene | Harness) -> int:
+    """How many scenes or harnesses are stacked."""
+    return (scenes.scenes[0] if isinstance(scenes, Harness) else scenes).rod.length.shape[0]
 
 
-class Problem(eqx.Module):
-    """The scenes about an equilibrium, and what they make of it under other parameters."""
-
-    scenes: Scene
-    segment: Int[Array, ""]
-    equilibrium: Equilibrium
-
-    @property
-    def point(self) -> Point:
-        return free_form_and_point(self.equilibrium)[1]
-
-    @property
-    def scale(self) -> float:
-        """The change of the parameter that counts as much as one radian all along the rod."""
-        return float(self.scenes.rod.length.shape[0] - 1)
-
-    def at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
-        scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
-        state = self.equilibrium.state
-        return carried_to(scaled, state.shape, point, motion, made_at=state.arclengths)
-
-    def linearized(self, parameter: Float[Array, ""], point: Point) -> tuple[Form, Point, Linearization, Motion]:
-        """The form, the point carried there, its linearisation, and the change of the residual with the parameter."""
-
-        def residual(parameter):
-            form, there = self.at(parameter, point)
-            here = form.linearized(there)
-            return Motion(here.gradient, here.constraint_residual), (form, there, here)
-
-        _, change, found = jax.jvp(residual, (parameter,), (jnp.ones_like(parameter),), has_aux=True)
-        return *found, change
-
-
-def no_motion(result: Equilibrium) -> Motion:
+def no_motion(result: Equilibrium | HarnessEquilibrium) -> Any:
     """A motion of an equilibrium that leaves it where it is."""
-
-    def residual_vectors(result: Equilibrium) -> Motion:
-        form, point = free_form_and_point(result)
-        here = form.linearized(point)
-        return Motion(here.gradient, here.constraint_residual)
-
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(residual_vectors, result))
-
-
-def times(motion: Motion, other: Motion) -> Float[Array, ""]:
-    """The work of one in the other."""
-    return jnp.sum(motion.rotation * other.rotation) + jnp.sum(motion.multipliers * other.multipliers)
-
-
-def less(motion: Motion, other: Motion, metric: Metric) -> Motion:
-    """The part at right angles to another motion of length 1, or to none."""
-    return added(motion, other, -metric.inner(motion, other))
-
-
-def added(motion: Motion, other: Motion, share: Float[Array, ""]) -> Motion:
-    return jax.tree.map(lambda x, y: x + share * y, motion, other)
-
-
-class Regularized(eqx.Module):
-    """The factors of a linearisation that has its springs."""
-
-    factors: AnyFactors
-    holds: int = eqx.field(static=True)
-
-    @property
-    def negative(self) -> Int[Array, ""]:
-        """The number of negative eigenvalues under the constraints: a hold is none of these."""
-        factors = self.factors
-        if isinstance(factors, BorderedFactors):
-            return factors.inner.negative + factors.below_by_pivots + self.holds
-        return factors.negative + self.holds
-
-    def solve(self, motion: Motion) -> Motion:
-        rotation, multipliers = self.factors.solve(motion.rotation, jnp.pad(motion.multipliers, (0, self.holds)))
-        return Motion(rotation, multipliers[: len(motion.multipliers)])
-
-
-def regularized(form: Form, system: AnySystem, neutral: Motion) -> Regularized:
-    """The factors of a linearisation with a spring against its neutral turn, where this turns a tangent most.
-
-    What is at right angles to the turn has the same solution but for a share of the turn, with all digits.
-
-    A loop that slides along its rod, or a rod that is free but for its closure constraint, makes the part without
-    border nearly singular where the whole is not, and pivots are not exchanged. So springs hold the rod at a few places
-    that are eliminated last, and as many multipliers, columns of the border, take their moments away again: exactly. A
-    chain from node to node has the forces that close it between them.
-    """
-    place = jnp.argmax(jnp.sum(neutral.rotation**2, axis=0))
-    turn = neutral.rotation[:, place]
-    squared = jnp.sum(turn**2)
-    spring = SPRING * turn[:, None] * turn[None] / jnp.where(squared > 0, squared, 1.0)
-    system = form.regular(system)
-    if isinstance(system, BorderedSystem):
-        inner, holds = _held(system.inner, place, spring)
-        columns, rows = (
-            Vectors(part.x, jnp.pad(part.y, ((0, 0), (0, holds)))) for part in (system.columns, system.rows)
-        )
-        system = dataclasses.replace(system, inner=inner, columns=columns, rows=rows)
-        return Regularized(factor(system), holds)
-    system, holds = _held(system, place, spring)
-    return Regularized(factor(system), holds)
-
-
-def _held(
-    system: SaddlePointSystem | ChainSystem, place: Int[Array, ""], spring: Float[Array, "b b"]
-) -> tuple[SaddlePointSystem | ChainSystem, int]:
-    """With a spring at one point, and the multipliers that take away what holds the rod at others: so many."""
-    diagonal = system.diagonal.at[:, :, place].add(spring)
-    if isinstance(system, ChainSystem):
-        return dataclasses.replace(system, diagonal=diagonal), 0
-    b, m = diagonal.shape[1:]
-    stride = 2 ** math.ceil(math.log2(max(m - 1, 1) / PARTS)) if m > PARTS else 1
-    held_points = np.arange(stride, m - 1, stride)
-    holds = b * len(held_points)
-    border = np.zeros((b, b, len(held_points), m))
-    for component in range(b):
-        border[component, component, np.arange(len(held_points)), held_points] = 1.0
-    border = jnp.asarray(border.reshape(b, holds, m), system.border.dtype)
-    held = jnp.sum(border, axis=1)
-    identity = jnp.eye(b, dtype=held.dtype)[..., None]
-    diagonal += SPRING_STIFFNESS * identity * held[None]
-    k = len(system.compliance)
-    compliance = jnp.zeros((k + holds, k + holds), held.dtype).at[:k, :k].set(system.compliance)
-    compliance = compliance.at[k:, k:].set(-jnp.eye(holds, dtype=held.dtype) / SPRING_STIFFNESS)
-    system = SaddlePointSystem(
-        diagonal, system.lower, jnp.concatenate([system.border, border], axis=1), compliance, across=system.across
-    )
-    return system, holds
-
-
-def nearest_to_zero(
-    form: Form, point: Point, here: Linearization, neutral: Motion, others: tuple[Motion, ...] = ()
-) -> tuple[Float[Array, ""], Motion]:
-    """The eigenvalue [EI/L^2] nearest to zero and its motion, of length 1, at right angles to the others."""
-    metric = Metric.of(form, here)
-    nothing = jnp.zeros_like(here.constraint_residual)
-    factors = regularized(form, here.system, neutral)
-
-    def unit(motion: Motion) -> Motion:
-        for other in (neutral, *others):
-            motion = less(motion, other, metric)
-        size = jnp.sqrt(metric.inner(motion, motion))
-        return jax.tree.map(lambda x: x / size, motion)
-
-    def closer(_, motion: Motion) -> Motion:
-        return unit(factors.solve(metric.times(motion)))
-
-    first = unit(Motion(components(here.bases, generic_field(point.tangents)), nothing))
-    motion = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, first)
-    return times(motion, Motion(*here.system.times(motion.rotation, motion.multipliers))), motion
-
-
-def left_of(
-    form: Form, point: Point, here: Linearization, neutral: Motion, motion: Motion, others: tuple[Motion, ...] = ()
-) -> Motion:
-    """The left eigenvector to the eigenvalue nearest to zero, whose motion is given: the same where the system has
-    symmetry, else on its side.
-    """
-    if not form.sliding_count:
-        return motion
-    there = eqx.tree_at(lambda here: here.system, here, transposed(here.system))
-    left = nearest_to_zero(form, point, there, neutral, others)[1]
-    sign = jnp.sign(Metric.of(form, here).inner(left, motion))
-    return jax.tree.map(lambda x: sign * x, left)
-
-
-def neutral_motion(form: Form, point: Point, here: Linearization) -> Motion:
-    """The turn of the whole rod that leaves it in equilibrium, of length 1, or no motion."""
-    turn = neutral_turn(form, point, here)
-    squared = Metric.of(form, here).inner(turn, turn)
-    return jax.tree.map(lambda x: x / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), turn)
+    if isinstance(result, HarnessEquilibrium):
+        return harness_place.no_motion(result)
+    return rod_place.no_motion(result)
 
 
 class _Correction(eqx.Module):
     """Where a correction is: what was found at the point, and the point to look at next."""
 
     parameter: Float[Array, ""]
-    point: Point
-    here: Linearization
-    change: Motion  # of the residual with the parameter
-    follows: Motion  # how the equilibrium follows the parameter
+    point: Any
+    kept: Any  # of the place
+    magnitude: Float[Array, ""]
+    follows: Any  # how the equilibrium follows the parameter
     index: Int[Array, ""]
     is_converged: Bool[Array, ""]
     iterations: Int[Array, ""]
@@ -298,10 +103,10 @@ class _Correction(eqx.Module):
 
 @compiled
 def stepped(
-    scenes: Scene,
+    scenes: Scene | Harness,
     segment: Int[Array, ""],
     parameter: Float[Array, ""],
-    result: Equilibrium,
+    result: Equilibrium | HarnessEquilibrium,
     along: BranchTangent,
     distance: Float[Array, ""],
     target: Float[Array, ""],
@@ -310,39 +115,31 @@ def stepped(
 
     `target`: not a number where the parameter is free.
     """
-    problem = Problem(scenes, segment, result)
+    problem = problem_of(scenes, segment, result)
     is_given = ~jnp.isnan(target)
-    far = jax.tree.map(lambda x: distance * x, along)
-    first = jnp.where(is_given, target, parameter + far.rate)
-    form, begin = problem.at(parameter, problem.point)
-    reach = form.longest_step(begin, form.others(far.motion.multipliers))
-    normal = short_sum(form.bases_at(begin) * along.motion.rotation[None], axis=1)
-    _, predicted = problem.at(first, problem.point, far.motion)
+    first = jnp.where(is_given, target, parameter + distance * along.rate)
+    direction, reach = problem.departure(parameter, along.motion, distance)
+    predicted = problem.moved(first, problem.point, scaled(along.motion, distance))
+    per_square = 1 / problem.scale**2
 
     def corrected(state: _Correction) -> _Correction:
-        form, point, here, change = problem.linearized(state.parameter, state.point)
-        metric = Metric.of(form, here)
-        neutral = neutral_motion(form, point, here)
-        factors = regularized(form, here.system, neutral)
-        back = less(factors.solve(Motion(-here.gradient, -here.constraint_residual)), neutral, metric)
-        follows = less(factors.solve(jax.tree.map(jnp.negative, change)), neutral, metric)
-        across = Motion(components(here.bases, normal), along.motion.multipliers)
-        squared = jnp.where(is_given, 1.0, metric.inner(across, follows) + along.rate / problem.scale**2)
+        place = problem.linearized(state.parameter, state.point)
+        metric, neutral = place.metric, place.neutral()
+        factors = place.regularized(neutral)
+        back, follows = (
+            less(factors.solve(jax.tree.map(jnp.negative, right)), neutral, metric)
+            for right in (place.residual, place.change)
+        )
+        across = place.components(direction)
+        squared = jnp.where(is_given, 1.0, metric.inner(across, follows) + per_square * along.rate)
         share = jnp.where(is_given, 0.0, -metric.inner(across, back)) / squared
-        motion = added(back, follows, share)
-        part = jnp.minimum(1.0, MAX_ROTATION / jnp.max(jnp.abs(motion.rotation)))
-        longest = form.longest_step(point, form.others(motion.multipliers))
-        part = part if longest is None else jnp.minimum(part, longest)
-        force_change = form.layout.forces(form.force_components(part * motion.multipliers))
-        others = form.others(part * motion.multipliers)
-        retracted = form.retract(point, here.bases, part * motion.rotation, force_change, others)
-        least = jnp.maximum(TOLERANCE, STAGNATION * form.rounding_floor(point))
-        is_there = (here.residual <= least) & form.is_closed(here.constraint_residual, 0.0)
+        part, retracted = problem.retracted(place, added(back, follows, share))
+        is_there = place.is_balanced
         return _Correction(
             parameter=jnp.where(is_there, state.parameter, state.parameter + part * share),
-            point=jax.tree.map(lambda here, there: jnp.where(is_there, here, there), point, retracted),
-            here=here,
-            change=change,
+            point=jax.tree.map(lambda here, there: jnp.where(is_there, here, there), place.point, retracted),
+            kept=place.kept,
+            magnitude=place.magnitude,
             follows=follows,
             index=factors.negative,
             is_converged=is_there,
@@ -352,49 +149,35 @@ def stepped(
     def is_running(state: _Correction) -> Bool[Array, ""]:
         return ~state.is_converged & (state.iterations < MAX_ITERATIONS) & jnp.isfinite(state.parameter)
 
-    nothing = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda: problem.linearized(first, predicted)[2:]),
-    )
-    here, change = nothing
     count = jnp.zeros((), int)
+    kept = jax.eval_shape(lambda: problem.linearized(first, predicted).kept)
+    kept = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept)
+    still = jax.tree.map(jnp.zeros_like, along.motion)
     # A step that takes a clip beyond its neighbours is none.
     begins = count if reach is None else jnp.where(reach < 1, MAX_ITERATIONS, count)
-    state = _Correction(first, predicted, here, change, change, count, jnp.array(False), begins)
+    state = _Correction(first, predicted, kept, jnp.zeros_like(first), still, count, jnp.array(False), begins)
     state = jax.lax.while_loop(is_running, corrected, state)
 
-    here, point, change = state.here, state.point, state.change
-    form, point = problem.at(state.parameter, point)
-    metric = Metric.of(form, here)
+    place = problem.again(state.parameter, state.point, state.kept)
+    metric = place.metric
     # The tangent, on in the direction in which the step went.
-    before = Motion(components(here.bases, normal), along.motion.multipliers)
-    size = jnp.sqrt(metric.inner(state.follows, state.follows) + 1 / problem.scale**2)
-    cosine = (metric.inner(before, state.follows) + along.rate / problem.scale**2) / size
+    size = jnp.sqrt(metric.inner(state.follows, state.follows) + per_square)
+    cosine = (metric.inner(place.components(direction), state.follows) + per_square * along.rate) / size
     sign = jnp.where(cosine < 0, -1.0, 1.0).astype(size.dtype) / size
-    tangent = BranchTangent(jax.tree.map(lambda x: sign * x, state.follows), sign)
-    neutral = neutral_motion(form, point, here)
-    stiffness, motion = nearest_to_zero(form, point, here, neutral)
-    left = left_of(form, point, here, neutral, motion)
-
-    scene = scene_at(scenes, segment, state.parameter)
-    units = nondimensional(scene)[1]
+    neutral = place.neutral()
+    stiffness, motion = nearest_to_zero(place, neutral)
+    left = left_of(place, neutral, motion)
     status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
-    outcome = Outcome(here.residual, state.iterations, state.iterations, status.astype(int))
-    arclengths = None
-    if isinstance(form, SlidingForm):
-        assert isinstance(point, SlidingPoint)
-        form, point, arclengths = form.at(point.arclengths), point.inner, point.arclengths
-    shape = result.state.shape.reached(form, point)
-    found = Found(SolverState(shape, point.end_force, units, arclengths), point, outcome, state.index == 0)
+    outcome = Outcome(state.magnitude, state.iterations, state.iterations, status.astype(int))
     return Station(
         parameter=state.parameter,
-        equilibrium=build_result(scene, found, jnp.ones((), int)),
-        along=tangent,
+        equilibrium=problem.result(state.parameter, place, outcome, state.index),
+        along=BranchTangent(scaled(state.follows, sign), sign),
         alignment=jnp.abs(cosine),
         index=state.index,
         stiffness=stiffness,
         motion=motion,
-        slope=work(left, change, metric),
+        slope=place.work_share(left),
     )
 
 
@@ -433,17 +216,14 @@ def _points(form: Form) -> Float[Array, "m"]:
     return (field.s[:-1] + field.s[1:]) / 2 if isinstance(field, EdgeTangents) else field.arclengths
 
 
-def work(motion: Motion, change: Motion, metric: Metric) -> Float[Array, ""]:
-    """What a change of the residual does in a motion of length 1, as a part of the most that one of its size could."""
-    is_free = metric.mass > 0
-    forces = jnp.where(is_free, 1 / jnp.where(is_free, metric.mass, 1.0), 0.0)[None] * change.rotation**2
-    gaps, pulls = (jnp.sqrt(jnp.sum(x**2)) for x in (change.multipliers, motion.multipliers))
-    most = jnp.sqrt(jnp.sum(forces)) + gaps * (1 + pulls)
-    return times(motion, change) / jnp.where(most > 0, most, 1.0)
+def mode_at(result: Equilibrium | HarnessEquilibrium, stiffness: Float[Array, ""], motion: Any) -> Mode | HarnessMode:
+    """A motion of an equilibrium in SI units."""
+    if isinstance(result, HarnessEquilibrium):
+        return mode_of_motion(result, stiffness, motion)
+    return _mode_at(result, stiffness, motion)
 
 
 @compiled
-def mode_at(result: Equilibrium, stiffness: Float[Array, ""], motion: Motion) -> Mode:
-    """A motion of an equilibrium in SI units."""
+def _mode_at(result: Equilibrium, stiffness: Float[Array, ""], motion: Motion) -> Mode:
     form, point = free_form_and_point(result)
     return mode_of(form, point, form.linearized(point), stiffness, motion, result)

@@ -14,16 +14,22 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rodjax.checks import instance, is_known, number_array, positive, whole_number
-from rodjax.model.scene import Scene, has_potential
-from rodjax.paths.branch import BranchTangent, mode_at, scene_at
+from rodjax.model.harness import Harness
+from rodjax.model.scene import Scene
+from rodjax.paths.branch import BranchTangent, count_of, mode_at
 from rodjax.paths.critical import differentiable_parameter
+from rodjax.paths.harness_modes import HarnessMode
+from rodjax.paths.harness_path import are_harnesses, stack_harnesses
+from rodjax.paths.harness_place import harness_at
 from rodjax.paths.modes import Mode
-from rodjax.paths.path import stack_scenes
+from rodjax.paths.path import not_followed, stack_scenes
+from rodjax.paths.rod_place import scene_at
 from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, StepControl, begun, towards, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, Solver
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
@@ -44,14 +50,14 @@ class CriticalPoint(eqx.Module):
     - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; or `"branch"`,
       where another branch of equilibria crosses, as where a straight strut buckles
     - `equilibrium`: there; its scene is that of the parameter
-    - `mode`: the critical motion, whose stiffness [N] is what is left of zero. Where a rod may buckle in all directions
-      at once, one of them
+    - `mode`: the critical motion, whose stiffness [N] is what is left of zero, of a harness a `HarnessMode`. Where a
+      rod may buckle in all directions at once, one of them
     - `index_before`, `index_after`: the number of motions along which the energy falls, on both sides along the branch
     """
 
     parameter: Float[Array, ""]
-    equilibrium: Equilibrium
-    mode: Mode
+    equilibrium: Equilibrium | HarnessEquilibrium
+    mode: Mode | HarnessMode
     kind: Kind = eqx.field(static=True)
     index_before: int = eqx.field(static=True)
     index_after: int = eqx.field(static=True)
@@ -67,7 +73,7 @@ class Branch(eqx.Module):
     """
 
     parameter: Float[Array, "k"]
-    equilibria: Equilibrium
+    equilibria: Equilibrium | HarnessEquilibrium
     index: Int[Array, "k"]
     critical_points: tuple[CriticalPoint, ...]
     ended: BranchEnd = eqx.field(static=True)
@@ -75,13 +81,13 @@ class Branch(eqx.Module):
 
 @one_answer
 def follow(
-    scenes: Sequence[Scene] | Scene,
+    scenes: Sequence[Scene] | Scene | Sequence[Harness],
     *,
     segments: int | None = None,
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | None = None,
+    guess: Guess | Equilibrium | HarnessEquilibrium | None = None,
     start: float = 0.0,
     direction: int = 1,
     step: float = DEFAULT_STEPS.first,
@@ -97,14 +103,15 @@ def follow(
 
     **Arguments:**
 
-    - `scenes`: at least two `Scene`s of one structure, or one `Scene` whose leaves have a leading axis. The end frames
-        may turn by less than pi from one to the next.
+    - `scenes`: at least two `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or at least two
+        `Harness`es of one structure. The end frames may turn by less than pi from one to the next.
     - `segments`, `rtol`, `discretization`, `solver`, `guess`: as for `rodjax.solve`, which finds the first equilibrium,
-        a minimum, and its mesh. A guess that is an `Equilibrium` is taken for that itself, whatever its stability.
+        a minimum, and its mesh. A guess that is an `Equilibrium` (of harnesses a `HarnessEquilibrium`) is taken for
+        that itself, whatever its stability.
     - `start`: the parameter to begin with, from 0 to m - 1; `direction`: 1 where it is to grow from there, -1 to fall.
     - `step`, `max_step`: the first and the longest step along the branch: root mean square of the turn of the tangents
-        [rad], and of the change of the parameter as a part of m - 1. Two critical points within a step are found where
-        they change the index, or the direction of the parameter.
+        [rad], of all rods of a harness, and of the change of the parameter as a part of m - 1. Two critical points
+        within a step are found where they change the index, or the direction of the parameter.
     - `max_points`: the most equilibria.
     - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
         notebook.
@@ -128,8 +135,8 @@ def follow(
 
 @one_answer
 def critical_points(
-    scenes: Sequence[Scene] | Scene,
-    path: Equilibrium,
+    scenes: Sequence[Scene] | Scene | Sequence[Harness],
+    path: Equilibrium | HarnessEquilibrium,
     *,
     step: float = DEFAULT_STEPS.first,
     max_step: float = DEFAULT_STEPS.longest,
@@ -144,13 +151,11 @@ def critical_points(
     Raises as `follow` does.
     """
     stacked = _checked(scenes, "critical_points")
-    instance(path, "path", Equilibrium)
-    if path.s.shape[:-1] != stacked.rod.length.shape:
-        raise ValueError(
-            f"path must have one equilibrium a scene, {stacked.rod.length.shape[0]}, got {path.s.shape[:-1]}"
-        )
+    instance(path, "path", _result_of(stacked))
+    if path.energy.shape != (count_of(stacked),):
+        raise ValueError(f"path must have one equilibrium a scene, {count_of(stacked)}, got {path.energy.shape}")
     steps = _checked_steps(step, max_step, DEFAULT_STEPS.most)
-    last = stacked.rod.length.shape[0] - 1
+    last = count_of(stacked) - 1
     found: list[Crossing] = []
     k = 0
     while k < last:
@@ -164,13 +169,13 @@ def critical_points(
 
 @one_answer
 def critical_point(
-    scenes: Sequence[Scene] | Scene,
+    scenes: Sequence[Scene] | Scene | Sequence[Harness],
     *,
     segments: int | None = None,
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | None = None,
+    guess: Guess | Equilibrium | HarnessEquilibrium | None = None,
     start: float = 0.0,
     direction: int = 1,
     step: float = DEFAULT_STEPS.first,
@@ -189,7 +194,7 @@ def critical_point(
     Werner & Spence, "The computation of symmetry-breaking bifurcation points" (1984); Seydel, "Practical bifurcation
     and stability analysis" (2010).
     """
-    stacked = stack_scenes(scenes)
+    stacked = _all_of(scenes)
     (fixed,) = not_differentiated(stacked)
     fixed = _checked(fixed, "critical_point")
     (guess,) = not_differentiated(guess)
@@ -210,8 +215,12 @@ def critical_point(
 
 @one_answer
 def switch_branch(
-    scenes: Sequence[Scene] | Scene, point: CriticalPoint, *, side: int = 1, distance: float = SWITCH
-) -> tuple[Float[Array, ""], Equilibrium]:
+    scenes: Sequence[Scene] | Scene | Sequence[Harness],
+    point: CriticalPoint,
+    *,
+    side: int = 1,
+    distance: float = SWITCH,
+) -> tuple[Float[Array, ""], Equilibrium | HarnessEquilibrium]:
     """The parameter and the equilibrium beside a critical point on the branch that crosses there, to `follow` it.
 
     **Arguments:**
@@ -249,27 +258,37 @@ def _critical_point(crossing: Crossing) -> CriticalPoint:
 
 
 @compiled
-def _stacked(results: list[Equilibrium]) -> Equilibrium:
+def _stacked(results: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
 
 _scene_at = compiled(scene_at)
+_harness_at = compiled(harness_at)
+
+
+def _result_of(scenes: Scene | Harness) -> type:
+    return HarnessEquilibrium if isinstance(scenes, Harness) else Equilibrium
 
 
 def _first(
-    scenes: Scene,
+    scenes: Scene | Harness,
     start: float,
     segments: int | None,
     rtol: float | None,
     discretization: Discretization | None,
     solver: Solver | None,
-    guess: Guess | Equilibrium | None,
-) -> Equilibrium:
+    guess: Any,
+) -> Any:
     """The equilibrium to begin with."""
-    if isinstance(guess, Equilibrium) and segments is None and rtol is None and discretization is None:
+    is_harness = isinstance(scenes, Harness)
+    if guess is not None and is_harness:
+        instance(guess, "guess", HarnessEquilibrium)
+    is_known_one = isinstance(guess, _result_of(scenes))
+    if is_known_one and segments is None and rtol is None and discretization is None:
         return guess
-    segment = min(int(start), scenes.rod.length.shape[0] - 2)
-    scene = _scene_at(scenes, jnp.asarray(segment, int), jnp.asarray(start, scenes.rod.length.dtype))
+    dtype = (scenes.scenes[0] if is_harness else scenes).rod.length.dtype
+    place = jnp.asarray(min(int(start), count_of(scenes) - 2), int), jnp.asarray(start, dtype)
+    scene: Any = _harness_at(scenes, *place) if is_harness else _scene_at(scenes, *place)
     return solve(
         scene,
         segments=segments,
@@ -277,30 +296,34 @@ def _first(
         discretization=discretization,
         solver=solver,
         guess=guess,
-        find="equilibrium" if isinstance(guess, Equilibrium) else "minimum",
+        find="equilibrium" if is_known_one else "minimum",
     )
 
 
 # --- checks ----------------------------------------------------------------------------------------------------------
 
 
-def _checked(scenes: Any, name: str) -> Scene:
-    stacked = stack_scenes(scenes)
+def _checked(scenes: Any, name: str) -> Any:
+    stacked = scenes if isinstance(scenes, Harness) else _all_of(scenes)
     if not is_known(stacked):
         raise ValueError(f"{name} needs scenes of known numbers: call it outside jax.jit and jax.vmap")
-    count = stacked.rod.length.shape[0]
+    count = count_of(stacked)
     if count < 2:
         raise ValueError(f"scenes must be at least two, between which the parameter runs, got {count}")
-    if not has_potential(stacked):
+    lacking = not_followed(stacked)
+    if lacking == "potential":
         raise ValueError(
             "scenes must have a potential: dead moments on a free end, couples along the rod and follower loads "
             "have none"
         )
-    if stacked.obstacles:
-        raise ValueError(f"{name} needs scenes without obstacles")
-    if stacked.self_contact:
-        raise ValueError(f"{name} needs scenes without self_contact")
+    if lacking is not None:
+        raise ValueError(f"{name} needs scenes without {lacking}")
     return stacked
+
+
+def _all_of(scenes: Any) -> Any:
+    """Stacked, with a leading axis on every leaf; of harnesses or of scenes."""
+    return stack_harnesses(scenes) if are_harnesses(scenes) else stack_scenes(scenes)
 
 
 def _checked_steps(step: Any, max_step: Any, max_points: Any) -> StepControl:
@@ -310,8 +333,8 @@ def _checked_steps(step: Any, max_step: Any, max_points: Any) -> StepControl:
     return StepControl(step, max_step, whole_number(max_points, "max_points", 1, 10**6))
 
 
-def _checked_start(scenes: Scene, start: Any, direction: Any) -> tuple[float, float]:
-    last = scenes.rod.length.shape[0] - 1
+def _checked_start(scenes: Scene | Harness, start: Any, direction: Any) -> tuple[float, float]:
+    last = count_of(scenes) - 1
     start = float(number_array(start, "start"))
     if not 0 <= start <= last:
         raise ValueError(f"start must lie in 0 to {last}, the parameters of these scenes, got {start:g}")

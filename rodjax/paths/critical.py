@@ -8,28 +8,20 @@ parameter alone stays zero, and its derivatives by both, in one sweep backwards,
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.motion import Metric, Motion
-from rodjax.linalg.saddle_point import AnySystem, transposed
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
-from rodjax.paths.branch import (
-    Problem,
-    Regularized,
-    added,
-    left_of,
-    less,
-    nearest_to_zero,
-    neutral_motion,
-    regularized,
-    times,
-)
+from rodjax.paths.branch import count_of, problem_of
+from rodjax.paths.place import MotionMetric, Place, PlaceFactors, added, left_of, less, nearest_to_zero, work
 from rodjax.programs.compilation import compiled
-from rodjax.solving.result import Equilibrium, free_form_and_point
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.result import Equilibrium
 
 # A second motion with less stiffness than this [EI/L^2] is critical too, as in a rod that buckles in all directions.
 DOUBLE = 1e-5
@@ -37,7 +29,7 @@ DOUBLE = 1e-5
 
 @eqx.filter_custom_jvp
 def differentiable_parameter(
-    scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, is_fold: bool
+    scenes: Scene | Harness, parameter: Float[Array, ""], result: Equilibrium | HarnessEquilibrium, is_fold: bool
 ) -> Float[Array, ""]:
     """The parameter of a critical point, with its derivative by the scenes."""
     return parameter
@@ -56,7 +48,7 @@ def _(primals, tangents):
 
 
 @jax.custom_jvp
-def _once(scenes: Scene) -> Scene:
+def _once(scenes: Any) -> Any:
     return scenes
 
 
@@ -66,36 +58,36 @@ def _(primals, tangents):
 
 
 @functools.partial(compiled, static_argnames=("is_fold",))
-def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, is_fold: bool) -> Scene:
+def _gradient(scenes: Any, parameter: Float[Array, ""], result: Any, is_fold: bool) -> Any:
     """The derivative of the parameter by the scenes."""
-    form, point = free_form_and_point(result)
-    here = form.linearized(point)
-    neutral = neutral_motion(form, point, here)
-    _, critical = nearest_to_zero(form, point, here, neutral)
-    left = left_of(form, point, here, neutral, critical)
-    segment = jnp.clip(jnp.floor(parameter), 0, scenes.rod.length.shape[0] - 2).astype(int)
+    segment = jnp.clip(jnp.floor(parameter), 0, count_of(scenes) - 2).astype(int)
+    begin = problem_of(scenes, segment, result)
+    point = begin.point
+    here = begin.located(parameter, point)
+    neutral = here.neutral()
+    _, critical = nearest_to_zero(here, neutral)
+    left = left_of(here, neutral, critical)
 
     nothing = jax.tree.map(jnp.zeros_like, critical)
 
-    def residual(scenes: Scene, parameter: Float[Array, ""], motion: Motion) -> tuple[Motion, Float[Array, ""]]:
+    def residual(scenes: Any, parameter: Float[Array, ""], motion: Any) -> tuple[Any, Float[Array, ""]]:
         """Of a moved point, and its critical eigenvalue."""
-        form, there = Problem(scenes, segment, result).at(parameter, point, motion)
-        here = form.linearized(there)
-        rate = Motion(*here.system.times(critical.rotation, critical.multipliers))
-        return Motion(here.gradient, here.constraint_residual), times(left, rate)
+        problem = problem_of(scenes, segment, result)
+        place = problem.located(parameter, problem.moved(parameter, point, motion))
+        return place.residual, work(left, place.times(critical))
 
     (_, none), derivatives = jax.vjp(residual, scenes, parameter, nothing)
     if is_fold:
         by_scenes, by_parameter, _ = derivatives((left, jnp.zeros_like(none)))
         return jax.tree.map(lambda by: -by / by_parameter, by_scenes)
-    stiffness, second = nearest_to_zero(form, point, here, neutral, (critical,))
-    other = left_of(form, point, here, neutral, second, (left,))
+    stiffness, second = nearest_to_zero(here, neutral, (critical,))
+    other = left_of(here, neutral, second, (left,))
     is_double = jnp.abs(stiffness) < DOUBLE
     second, other = jax.tree.map(lambda x: jnp.where(is_double, x, 0.0), (second, other))
     *of_eigenvalue, by_motion = derivatives((nothing, jnp.ones_like(none)))
-    system = transposed(here.system)
+    place = here.transposed()
     on_right, on_left = (critical, second, neutral), (left, other, neutral)
-    followed = _solved(regularized(form, system, neutral), system, by_motion, Metric.of(form, here), on_right, on_left)
+    followed = _solved(place.regularized(neutral), place, by_motion, here.metric, on_right, on_left)
     # What stays zero: the eigenvalue less the work of the residual in this motion.
     *of_work, _ = derivatives((followed, jnp.zeros_like(none)))
     by_scenes, by_parameter = jax.tree.map(jnp.subtract, of_eigenvalue, of_work)
@@ -103,27 +95,26 @@ def _gradient(scenes: Scene, parameter: Float[Array, ""], result: Equilibrium, i
 
 
 def _solved(
-    factors: Regularized,
-    system: AnySystem,
-    right: Motion,
-    metric: Metric,
-    left_without: tuple[Motion, ...],
-    without: tuple[Motion, ...],
-) -> Motion:
+    factors: PlaceFactors,
+    place: Place,
+    right: Any,
+    metric: MotionMetric,
+    left_without: tuple[Any, ...],
+    without: tuple[Any, ...],
+) -> Any:
     """The solution of a linearised system at right angles to its null vectors, for a right side without what does work
     in its left ones, of length 1 or none.
     """
 
-    def step(right: Motion) -> Motion:
+    def step(right: Any) -> Any:
         for motion in left_without:
-            right = added(right, metric.times(motion), -times(motion, right))
+            right = added(right, metric.times(motion), -work(motion, right))
         found = factors.solve(right)
         for motion in without:
             found = less(found, motion, metric)
         return found
 
-    one = jnp.ones((), metric.mass.dtype)
+    one = jnp.ones((), work(right, right).dtype)
     found = step(right)
     # What the shift, by which the system is regular, has changed.
-    left = added(right, Motion(*system.times(found.rotation, found.multipliers)), -one)
-    return added(found, step(left), one)
+    return added(found, step(added(right, place.times(found), -one)), one)

@@ -1,6 +1,6 @@
 """The softest motion of a harness: of all its rods and joints together."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,18 +9,22 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.contact_gaps import model_compliance
 from rodjax.discretization.form import Form, Linearization
-from rodjax.discretization.joints import generic_field
-from rodjax.discretization.motion import Metric
 from rodjax.discretization.nodal import NodalForm
-from rodjax.geometry.vectors import components
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.harness import Bodies
 from rodjax.model.scene import nondimensional
-from rodjax.model.supports import Clamp
+from rodjax.paths.assembled import (
+    AssembledSystem,
+    GroupSystem,
+    HarnessMotion,
+    LinearizedRod,
+    generic_motion,
+    unit_of_stiffness,
+)
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Assembly, Poses, Rods
-from rodjax.solving.coupling import ENDS, Coupling, RodInBodies, coupling, end_contacts, held
+from rodjax.solving.coupling import Coupling, RodInBodies, end_contacts
 from rodjax.solving.harness import ends_of, split_pressures
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import form_and_point
@@ -40,37 +44,23 @@ class HarnessMode(eqx.Module):
 
 
 class _Group(NamedTuple):
-    """Rods of one structure, stacked: their linearisations, what couples them to bodies, with closed contacts; the
-    squares of their motions, by rotations and by motions of the ends; and the unit of energy in that of all.
-    """
+    """Rods of one structure, stacked, with closed contacts."""
 
     rods: RodInBodies
-    point: object
-    here: Linearization
-    coupling: Coupling
-    mass: Float[Array, "k m"]
-    of_ends: Float[Array, "k 12 12"]
-    body: Array
-    shares: Float[Array, "k"]
+    point: Any
+    linearized: LinearizedRod
 
 
-def _of_rod(rod: RodInBodies, point: object, pressures: Float[Array, "o 2"] | None):
-    form = rod.form
-    released = form.released(point)
-    here, couple = held(form, released), coupling(rod, form, point, released)
-    of_ends = jnp.zeros((2, 6, 2, 6), here.gradient.dtype)
-    for number, (end, support) in enumerate(zip(ENDS, (form.scene.start, form.scene.end), strict=True)):
-        if isinstance(support, Clamp):
-            turn = form.end_turn(point, released, end).rotation
-            of_ends = of_ends.at[number, 3:, number, 3:].set(form.field.weights[end] * turn.T @ turn)
-    if pressures is not None:
-        assert isinstance(form, NodalForm)
-        at_ends, couple = end_contacts(rod, form, pressures, couple)
-        rates = jnp.where(at_ends.is_closed[..., None], at_ends.rates, 0.0)
-        stiff = jnp.einsum("oei,oej->eij", rates, rates) / model_compliance(form)
-        couple = couple._replace(second=couple.second + jax.scipy.linalg.block_diag(*stiff))
-        couple = couple._replace(of_constraints=_with_gaps(here, couple))
-    return here, couple, Metric.of(form, here).mass / rod.units.force, of_ends.reshape(12, 12) / rod.units.force
+def _of_rod(rod: RodInBodies, point: Any, pressures: Float[Array, "o 2"] | None) -> LinearizedRod:
+    found, form = LinearizedRod.of(rod, point), rod.form
+    if pressures is None:
+        return found
+    assert isinstance(form, NodalForm)
+    at_ends, couple = end_contacts(rod, form, pressures, found.coupling)
+    rates = jnp.where(at_ends.is_closed[..., None], at_ends.rates, 0.0)
+    stiff = jnp.einsum("oei,oej->eij", rates, rates) / model_compliance(form)
+    couple = couple._replace(second=couple.second + jax.scipy.linalg.block_diag(*stiff))
+    return found._replace(coupling=couple._replace(of_constraints=_with_gaps(found.here, couple)))
 
 
 def _with_gaps(here: Linearization, couple: Coupling) -> Float[Array, "k 12"]:
@@ -97,7 +87,7 @@ def _groups(result: HarnessEquilibrium) -> tuple[Assembly, list[_Group]]:
     for rods, point, of_ends in zip(all_rods, points, pressures, strict=True):
         each = assembly.rods(rods, poses)
         of_ends = None if of_ends is None else of_ends / rods.units.force[:, None, None]
-        found.append(_Group(each, point, *jax.vmap(_of_rod)(each, point, of_ends), rods.body, assembly.shares(rods)))
+        found.append(_Group(each, point, jax.vmap(_of_rod)(each, point, of_ends)))
     return assembly, found
 
 
@@ -105,95 +95,62 @@ def _groups(result: HarnessEquilibrium) -> tuple[Assembly, list[_Group]]:
 def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
     """See `rodjax.paths.modes.lowest_mode`."""
     assembly, groups = _groups(result)
-    motions, dtype = assembly.bodies.motions, result.positions.dtype
-    _, springs = assembly.body_derivatives(Poses(result.positions, result.frames))
-    springs = motions.T @ jax.scipy.linalg.block_diag(*springs) @ motions
-    at_bodies = jnp.pad(motions, ((0, 6), (0, 0))).reshape(-1, 6, motions.shape[1])
-
-    def along(group: _Group) -> Float[Array, "k 12 q"]:
-        return at_bodies[group.body].reshape(len(group.body), 12, -1)
-
-    def factored(value: Float[Array, ""]):
-        """The factors of all rods, their solutions by motions of the ends, and the stiffness left for the bodies."""
-        stiffness, found = springs, []
-        for group in groups:
-
-            def of_rod(here: Linearization, couple: Coupling, mass: Array, of_ends: Array):
-                factors = factor(here.system.shifted(-value * mass))
-                solved = jax.vmap(factors.solve, (-1, -1), -1)(couple.of_gradient, couple.of_constraints)
-                left = couple.second - value * of_ends - couple.of_constraints.T @ solved[1]
-                return factors, solved, left - jnp.einsum("bmi,bmj->ij", couple.of_gradient, solved[0])
-
-            factors, solved, left = jax.vmap(of_rod)(group.here, group.coupling, group.mass, group.of_ends)
-            stiffness += jnp.einsum("k,kip,kij,kjq->pq", group.shares, along(group), left, along(group))
-            found.append((factors, solved))
-        return found, (stiffness + stiffness.T) / 2
+    system = _system(result, assembly, groups)
 
     def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
-        found, stiffness = factored(value)
-        count = jnp.sum(jnp.linalg.eigvalsh(stiffness) < 0)
-        return count + sum(jnp.sum(factors.negative) for factors, _ in found) > 0
+        return system.shifted(-value).factored(factor).negative > 0
 
-    low = below_lowest(lies_below, assembly.energy / assembly.length)
-    found, stiffness = factored(low)
+    low = below_lowest(lies_below, jnp.ones((), result.positions.dtype))
+    factors, metric = system.shifted(-low).factored(factor), system.metric
 
-    def squared(rotations: list[Array], q: Array, others: list[Array], p: Array) -> Float[Array, ""]:
-        total = jnp.zeros((), dtype)
-        for group, x, y in zip(groups, rotations, others, strict=True):
-            of_q, of_p = along(group) @ q, along(group) @ p
-            each = jnp.sum(group.mass[:, None] * x * y, axis=(1, 2))
-            each += jnp.einsum("ki,kij,kj->k", of_q, group.of_ends, of_p)
-            total += jnp.sum(group.shares * each)
-        return total
+    def closer(_, found: tuple[HarnessMotion, Float[Array, ""]]) -> tuple[HarnessMotion, Float[Array, ""]]:
+        motion = factors.solve(metric.times(found[0]))
+        size = jnp.sqrt(metric.inner(motion, motion))
+        share = metric.inner(motion, found[0])
+        return jax.tree.map(lambda x: x / size, motion), low + share / size**2
 
-    def solved(rotations: list[Array], q: Array) -> tuple[list[Array], list[Array], Array]:
-        force, first = jnp.zeros_like(q), []
-        for group, (factors, _), x in zip(groups, found, rotations, strict=True):
-            right = group.mass[:, None] * x
-            nothing = jnp.zeros_like(group.here.constraint_residual)
-            here = jax.vmap(lambda factors, f, c: factors.solve(f, c))(factors, right, nothing)
-            first.append(here)
-            loads = jnp.einsum("kbmi,kbm->ki", group.coupling.of_gradient, here[0])
-            loads += jnp.einsum("kci,kc->ki", group.coupling.of_constraints, here[1])
-            own = jnp.einsum("kij,kj->ki", group.of_ends, along(group) @ q)
-            force += jnp.einsum("k,kiq,ki->q", group.shares, along(group), own - loads)
-        moved = jnp.linalg.solve(stiffness, force) if len(q) else q
-        results, multipliers = [], []
-        for group, (_, by_motions), (x, y) in zip(groups, found, first, strict=True):
-            of_ends = along(group) @ moved
-            results.append(x - jnp.einsum("kbmi,ki->kbm", by_motions[0], of_ends))
-            multipliers.append(y - jnp.einsum("kci,ki->kc", by_motions[1], of_ends))
-        return results, multipliers, moved
+    linearized = tuple(group.linearized for group in groups)
+    generic = generic_motion(linearized, tuple(group.point for group in groups), system)
+    motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, (generic, low))
+    return _mode(result, assembly, groups, system, motion, stiffness)
 
-    generic = [
-        jax.vmap(lambda here, point: components(here.bases, generic_field(point.tangents)))(group.here, group.point)
-        for group in groups
-    ]
 
-    def closer(_, state):
-        rotations, _, q, _ = state
-        new, multipliers, moved = solved(rotations, q)
-        size = jnp.sqrt(squared(new, moved, new, moved))
-        share = squared(new, moved, rotations, q)
-        scaled = jax.tree.map(lambda value: value / size, (new, multipliers, moved))
-        return *scaled, low + share / size**2
+@compiled
+def mode_of_motion(result: HarnessEquilibrium, stiffness: Float[Array, ""], motion: HarnessMotion) -> HarnessMode:
+    """A motion of an equilibrium in SI units, and its stiffness in the unit of the assembly."""
+    assembly, groups = _groups(result)
+    return _mode(result, assembly, groups, _system(result, assembly, groups), motion, stiffness)
 
-    nothing = [jnp.zeros_like(group.here.constraint_residual) for group in groups]
-    begin = generic, nothing, jnp.ones(motions.shape[1], dtype), low
-    rotations, multipliers, q, value = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, begin)
 
+def _system(result: HarnessEquilibrium, assembly: Assembly, groups: list[_Group]) -> AssembledSystem:
+    _, springs = assembly.body_derivatives(Poses(result.positions, result.frames))
+    all_rods = zip(assembly.groups, groups, strict=True)
+    systems = tuple(GroupSystem.of(assembly, rods, group.linearized) for rods, group in all_rods)
+    return AssembledSystem.of(assembly, systems, springs)
+
+
+def _mode(
+    result: HarnessEquilibrium,
+    assembly: Assembly,
+    groups: list[_Group],
+    system: AssembledSystem,
+    motion: HarnessMotion,
+    stiffness: Float[Array, ""],
+) -> HarnessMode:
     displacements: dict[str, Array] = {}
-    for numbers, group, x, y in zip(result.members, groups, rotations, multipliers, strict=True):
-        moved = jax.vmap(_displaced)(group.rods, group.point, group.here, x, y, along(group) @ q)
+    for numbers, group, of_group, x in zip(result.members, groups, system.groups, motion.rods, strict=True):
+        bases, of_ends = group.linearized.here.bases, of_group.along @ motion.bodies
+        moved = jax.vmap(_displaced)(group.rods, group.point, bases, x.rotation, x.multipliers, of_ends)
         displacements |= {result.names[number]: moved[k] for k, number in enumerate(numbers)}
     largest = jnp.sqrt(jnp.max(jnp.stack([jnp.max(jnp.sum(moved**2, axis=1)) for moved in displacements.values()])))
-    return HarnessMode(value, {name: displacements[name] / largest for name in result.names})
+    stiffness = stiffness * unit_of_stiffness(assembly)
+    return HarnessMode(stiffness, {name: displacements[name] / largest for name in result.names})
 
 
 def _displaced(
     rod: RodInBodies,
-    point: object,
-    here: Linearization,
+    point: Any,
+    bases: Float[Array, "3 b m"],
     rotation: Array,
     multipliers: Array,
     motions: Float[Array, "12"],
@@ -205,7 +162,7 @@ def _displaced(
     def nodes(part: Float[Array, ""]) -> Float[Array, "n+1 3"]:
         there = rod.form_at(part * motions.reshape(2, 6))
         step = jax.tree.map(lambda value: part * value, others)
-        return there.nodes_of(there.holding(there.retract(point, here.bases, part * rotation, part * change, step)))
+        return there.nodes_of(there.holding(there.retract(point, bases, part * rotation, part * change, step)))
 
     zero = jnp.zeros((), motions.dtype)
     return rod.units.length * jax.jvp(nodes, (zero,), (jnp.ones_like(zero),))[1]

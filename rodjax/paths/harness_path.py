@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from rodjax.checks import instance, is_known, sequence
+from rodjax.checks import instance, is_known, leaf, namespace, sequence
 from rodjax.model.harness import Harness, harness_between
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
@@ -77,6 +77,18 @@ def _checked(harnesses: Any, name: str) -> tuple[Harness, ...]:
         if jax.tree.structure(harness) != jax.tree.structure(harnesses[0]):
             raise ValueError(f"scenes[{k}] must have the structure of scenes[0], to be one of a {name}")
     return harnesses
+
+
+def are_harnesses(scenes: Any) -> bool:
+    """Whether what is given for scenes is a list of harnesses."""
+    return isinstance(scenes, (list, tuple)) and len(scenes) > 0 and isinstance(scenes[0], Harness)
+
+
+def stack_harnesses(harnesses: Sequence[Harness]) -> Harness:
+    """Harnesses of one structure as one whose leaves have a leading axis."""
+    harnesses = _checked(harnesses, "path")
+    xp = namespace(harnesses)
+    return jax.tree.map(lambda *leaves: leaf(xp.stack(leaves)), *harnesses)
 
 
 def _on_one_mesh(

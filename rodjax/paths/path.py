@@ -20,7 +20,8 @@ from rodjax.discretization.nodal_point import Nodal
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, between, has_friction, has_node_positions, has_potential, nondimensional
 from rodjax.notes import note
-from rodjax.paths.harness_path import harness_path
+from rodjax.paths.branch import count_of
+from rodjax.paths.harness_path import are_harnesses, harness_path, stack_harnesses
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -36,6 +37,7 @@ from rodjax.solving.equilibrium import (
     solve_from,
 )
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find
 from rodjax.solving.ranges import check_ranges, with_ranges
@@ -102,12 +104,18 @@ def solve_path(
 
     Returns an `Equilibrium`, of harnesses a `HarnessEquilibrium`, with a leading axis, one entry a scene.
     """
-    if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
-        if at_critical != "jump":
-            raise ValueError(f"at_critical must be 'jump' for harnesses, got {at_critical!r}")
+    one_of(at_critical, "at_critical", typing.get_args(AtCritical))
+    if are_harnesses(scenes):
+        harnesses = cast(Sequence[Harness], scenes)
+        if at_critical == "stop":
+            _check_stop(stack_harnesses(harnesses))
         numbers: dict[str, Any] = {"segments": segments, "rtol": rtol, "guess": guess, "strain_limit": strain_limit}
         how: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
-        return harness_path(cast(Sequence[Harness], scenes), **numbers, **how)
+        path = harness_path(harnesses, **numbers, **how)
+        if at_critical == "stop":
+            count = _before_critical(stack_harnesses(harnesses), jax.lax.stop_gradient(path))
+            path = jax.tree.map(lambda leaf: leaf[:count], path)
+        return path
     scenes = cast(Sequence[Scene] | Scene, scenes)
     if guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
@@ -119,7 +127,6 @@ def solve_path(
     check_single(guess)
     options, rtol = checked_options(fixed_scenes, segments, rtol, discretization, solver, guess, planar, find)
     strain_limit = checked_strain_limit(strain_limit)
-    one_of(at_critical, "at_critical", typing.get_args(AtCritical))
     if at_critical == "stop":
         _check_stop(fixed_scenes)
 
@@ -144,22 +151,33 @@ def check_still(scenes: Scene, axis: int = 0) -> None:
             raise ValueError(f"obstacles[{k}] must stay the same along a path, as it has friction")
 
 
-def _check_stop(scenes: Scene) -> None:
+def _check_stop(scenes: Scene | Harness) -> None:
     if not is_known(scenes):
         raise ValueError("at_critical must be 'jump' inside jax.jit or vmap: how many scenes a path has must be known")
-    if not has_potential(scenes):
+    lacking = not_followed(scenes)
+    if lacking == "potential":
         raise ValueError(
             "at_critical must be 'jump' for dead moments, couples and follower loads, which have no potential"
         )
-    if scenes.obstacles:
-        raise ValueError("at_critical must be 'jump' for scenes with obstacles")
-    if scenes.self_contact:
-        raise ValueError("at_critical must be 'jump' for scenes with self_contact")
+    if lacking is not None:
+        raise ValueError(f"at_critical must be 'jump' for scenes with {lacking}")
 
 
-def _before_critical(scenes: Scene, path: Equilibrium) -> int:
+def not_followed(scenes: Scene | Harness) -> str | None:
+    """What keeps branches of scenes from being followed: "potential", where loads have none, "obstacles" or
+    "self_contact"; `None` where nothing does.
+    """
+    each = scenes.scenes if isinstance(scenes, Harness) else (scenes,)
+    if not all(map(has_potential, each)) or (isinstance(scenes, Harness) and not scenes.has_potential):
+        return "potential"
+    if any(scene.obstacles for scene in each):
+        return "obstacles"
+    return "self_contact" if any(scene.self_contact for scene in each) else None
+
+
+def _before_critical(scenes: Scene | Harness, path: Equilibrium | HarnessEquilibrium) -> int:
     """How many scenes of a path come before the first critical point of its branch."""
-    count = scenes.rod.length.shape[0]
+    count = count_of(scenes)
     if count == 1:
         return 1
     first = jax.tree.map(lambda leaf: leaf[0], path)
@@ -181,8 +199,8 @@ def stack_scenes(scenes: Sequence[Scene] | Scene) -> Scene:
     for k, scene in enumerate(scenes):
         if isinstance(scene, Harness):
             raise ValueError(
-                f"scenes[{k}] is a Harness: rodjax.solve_path and solve_batch take lists of these alone; its branches "
-                'are followed by solve_path(..., find="equilibrium") in small steps, whose index tells what they pass'
+                f"scenes[{k}] is a Harness: rodjax.solve_path and solve_batch take lists of these alone, and so do "
+                "follow, critical_point and critical_points"
             )
         instance(scene, f"scenes[{k}]", Scene)
         if jax.tree.structure(scene) != jax.tree.structure(scenes[0]):

@@ -4,15 +4,17 @@ import enum
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.form import NEUTRAL
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, slides
 from rodjax.notes import note
-from rodjax.paths.branch import BranchTangent, Station, is_misplaced, no_motion, on_new_mesh, stepped
+from rodjax.paths.branch import BranchTangent, Station, count_of, is_misplaced, no_motion, on_new_mesh, stepped
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
 # A step that turns the tangent of the branch by more than 26 degrees is halved, and one of 14 is not made longer.
@@ -71,7 +73,7 @@ class Trace(NamedTuple):
 class Line(NamedTuple):
     """The points that steps of several lengths from one station find, or from there to given parameters."""
 
-    scenes: Scene
+    scenes: Scene | Harness
     segment: int
     station: Station
 
@@ -83,37 +85,44 @@ class Line(NamedTuple):
 
 
 def towards(
-    scenes: Scene,
+    scenes: Scene | Harness,
     segment: int,
     parameter: Float[Array, ""],
-    result: Equilibrium,
+    result: Equilibrium | HarnessEquilibrium,
     along: BranchTangent,
     distance: float,
     target: float = math.nan,
 ) -> Station:
-    dtype = scenes.rod.length.dtype
-    number = functools.partial(jnp.asarray, dtype=dtype)
+    number = functools.partial(jnp.asarray, dtype=parameter.dtype)
     return stepped(scenes, jnp.asarray(segment, int), parameter, result, along, number(distance), number(target))
 
 
-def begun(scenes: Scene, parameter: float, result: Equilibrium, direction: float) -> tuple[int, Station]:
+def begun(
+    scenes: Scene | Harness, parameter: float, result: Equilibrium | HarnessEquilibrium, direction: float
+) -> tuple[int, Station]:
     """The station of an equilibrium under the scene of a parameter, which is to grow or to fall from there."""
-    last = scenes.rod.length.shape[0] - 1
+    last = count_of(scenes) - 1
     segment = math.floor(parameter) if direction > 0 else math.ceil(parameter) - 1
     segment = min(max(segment, 0), last - 1)
-    dtype = result.s.dtype
+    dtype = result.energy.dtype
     along = BranchTangent(no_motion(result), jnp.asarray(direction, dtype))
     return segment, towards(scenes, segment, jnp.asarray(parameter, dtype), result, along, 0.0, parameter)
 
 
 def trace(
-    scenes: Scene, start: float, first: Equilibrium, direction: float, steps: StepControl, only_first: bool = False
+    scenes: Scene | Harness,
+    start: float,
+    first: Equilibrium | HarnessEquilibrium,
+    direction: float,
+    steps: StepControl,
+    only_first: bool = False,
 ) -> Trace:
     """The branch from an equilibrium under the scene of the parameter `start`, or that as far as a critical point."""
-    last = scenes.rod.length.shape[0] - 1
+    last = count_of(scenes) - 1
     segment, station = begun(scenes, start, first, direction)
     stations, crossings = [station], []
-    mesh = made = station.equilibrium
+    mesh: Any = station.equilibrium
+    made: Any = mesh
     if not station.equilibrium.converged:
         return Trace(stations, crossings, BranchEnd.NOT_CONVERGED)
     if float(station.parameter) == (last if direction > 0 else 0):
@@ -133,7 +142,7 @@ def trace(
         if only_first and found:
             return Trace(stations, crossings, BranchEnd.FIRST_CRITICAL)
         station = step.there
-        if slides(scenes):
+        if isinstance(scenes, Scene) and slides(scenes):
             station, made = _on_its_mesh(Line(scenes, segment, station), step.bound, made, mesh)
         stations.append(station)
         if step.bound is not None:
@@ -145,11 +154,11 @@ def trace(
     return Trace(stations, crossings, BranchEnd.MAX_POINTS)
 
 
-def _on_its_mesh(line: Line, bound: int | None, made: Equilibrium, mesh: Equilibrium) -> tuple[Station, Equilibrium]:
+def _on_its_mesh(line: Line, bound: int | None, made: Any, mesh: Any) -> tuple[Station, Any]:
     """The station on a mesh that fits where the rod has slid to, and the equilibrium for which that was made; `made`:
     for which the mesh was; `mesh`: of the first equilibrium, as which meshes are made.
     """
-    station = line.station
+    station: Any = line.station
     if not is_misplaced(station.equilibrium, made):
         return station, made
     result, along = on_new_mesh(station.equilibrium, station.along, mesh.state.shape)

@@ -216,6 +216,23 @@ class Assembly(eqx.Module):
         second = jax.vmap(column, out_axes=-1)(jnp.eye(6, dtype=nowhere.dtype))
         return first(nowhere), second
 
+    def balance_of_bodies(
+        self, gradient: Float[Array, "j 6"], forces: tuple[Float[Array, "k 12"], ...]
+    ) -> tuple[Float[Array, "j 6"], Float[Array, ""]]:
+        """The gradient of the bodies, that of springs and loads given, with what the rods of each group give their
+        ends; its largest component along the motions that supports leave, of a body in the unit of its stiffest rod.
+        """
+        gradient, scale = jnp.pad(gradient, ((0, 1), (0, 0))), jnp.zeros(self.count + 1, gradient.dtype)
+        for group, of_group in zip(self.groups, forces, strict=True):
+            shares = self.shares(group)
+            of_ends = shares[:, None, None] * of_group.reshape(-1, 2, 6)
+            for end in range(2):
+                gradient = gradient.at[group.body[:, end]].add(of_ends[:, end])
+                scale = scale.at[group.body[:, end]].max(shares)
+        motions, gradient, scale = self.bodies.motions, gradient[: self.count], scale[: self.count]
+        out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
+        return gradient, jnp.max(jnp.abs(out_of_balance), initial=0.0)
+
     def begin(self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], poses: Poses) -> State:
         dtype = poses.positions.dtype
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
@@ -377,24 +394,15 @@ def _split(all_here: list[_Here], of_all: Any, of_contacts: Any, changed: Any) -
 
 
 def _balance(assembly: Assembly, all_here: list[_Here], state: State, solver: Newton) -> _Balance:
-    count = assembly.count
+    forces = tuple(here.coupling.first for here in all_here)
     gradient, stiffness = assembly.body_derivatives(state.poses)
-    dtype = gradient.dtype
-    gradient, scale = jnp.pad(gradient, ((0, 1), (0, 0))), jnp.zeros(count + 1, dtype)
-    residual, floor, is_closed = jnp.zeros((), dtype), jnp.zeros((), dtype), jnp.array(True)
+    gradient, residual = assembly.balance_of_bodies(gradient, forces)
+    floor, is_closed = jnp.zeros_like(residual), jnp.array(True)
     for group, here in zip(assembly.groups, all_here, strict=True):
-        shares = assembly.shares(group)
-        of_ends = shares[:, None, None] * here.coupling.first.reshape(-1, 2, 6)
-        for end in range(2):
-            gradient = gradient.at[group.body[:, end]].add(of_ends[:, end])
-            scale = scale.at[group.body[:, end]].max(shares)
         residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
         floor = jnp.maximum(floor, jnp.max(here.floor))
         closed = jax.vmap(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
         is_closed &= jnp.all(closed(group.form, here.linearization.constraint_residual))
-    motions, gradient, scale = assembly.bodies.motions, gradient[:count], scale[:count]
-    out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
-    residual = jnp.maximum(residual, jnp.max(jnp.abs(out_of_balance), initial=0.0))
     balanced = jnp.where(residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
     balanced = jnp.where(residual <= solver.tolerance, Status.CONVERGED, balanced)
     stagnates = (state.iterations > 0) & (residual > state.residual / 2) & (residual <= STAGNATION * floor)

@@ -326,9 +326,23 @@ def _solve(
     solver = options[0].solver
     assert isinstance(solver, Newton)
     end = find_assembly(assembly, tuple(points), tuple(at_ends), poses, solver, options[0].find)
+    return harness_equilibrium(harness, members, assembly, end, end_pressures, strain_limit, tuple(all_searches))
+
+
+def harness_equilibrium(
+    harness: Harness,
+    members: Members,
+    assembly: Assembly,
+    end: State,
+    end_pressures: Float[Array, "c"],
+    strain_limit: Float[Array, ""] | float,
+    all_begun: tuple[tuple[Search | None, SolverState | None], ...],
+) -> HarnessEquilibrium:
+    """What a search found, whose rods are those of `assembly`; `all_begun`: where it began, of rods with obstacles."""
+    groups, bodies = assembly.groups, assembly.bodies
     is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
-    for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_searches, strict=True)):
+    for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_begun, strict=True)):
         now = tuple(clamped(harness.scenes[k], harness, *end.poses) for k in numbers)
         rods.append(_equilibria(_stack(list(now)), rod, begun, end, number, is_stable, strain_limit))
     pressures = [
@@ -374,13 +388,15 @@ def ends_of(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, A
 def _equilibria(
     scenes: Scene,
     rods: Rods,
-    begun: tuple[Search, SolverState],
+    begun: tuple[Search | None, SolverState | None],
     end: State,
     group: int,
     is_stable: Array,
     strain_limit: Any,
 ) -> Equilibrium:
-    def one(scene: Scene, rod: Rods, search: Search, begin: SolverState, point: Any, residual: Array) -> Equilibrium:
+    def one(
+        scene: Scene, rod: Rods, search: Search | None, begin: SolverState | None, point: Any, residual: Array
+    ) -> Equilibrium:
         scaled, units = nondimensional(scene)
         form = form_of(scaled, rod.shape)
         if point.nodal is not None:
@@ -393,6 +409,8 @@ def _equilibria(
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
         found = Found(state, point, outcome, is_stable)
         if scene.obstacles:
+            assert search is not None
+            assert begin is not None
             found = on_one_side(search, form, found, begin.before)
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 

@@ -92,12 +92,18 @@ def test_a_path_stops_before_it_buckles(buckling):
 
 NEAR = Scene(Rod(0.5, 1.0, 0.8, EA, radius=0.01), START, Joint("top"), obstacles=[Plane((0, 0, -1), (0, 0, 1))])
 BESIDE = Harness({"rod": NEAR})
+THICK = Rod(1.0, 1.0, 0.8, EA, radius=0.01)
+TOUCHING = Harness(
+    {str(x): Scene(THICK, Clamp((x, 0.0, 0.0), np.eye(3)), Clamp((x, 0.0, 1.0), np.eye(3))) for x in (0.0, 0.1)},
+    contact=True,
+)
 
 
 @pytest.mark.parametrize(
     ("take", "message"),
     [
         (lambda: rj.follow([BESIDE, BESIDE]), "follow needs scenes without obstacles"),
+        (lambda: rj.follow([TOUCHING, TOUCHING]), "follow needs scenes without contact"),
         (lambda: rj.critical_point([cut(0.0)]), "scenes must be at least two"),
         (lambda: rj.follow([cut(0.0), BESIDE]), r"scenes\[1\] must have the structure of scenes\[0\]"),
         (lambda: rj.follow(ends(), guess=rj.Guess([(0, 0, 0), (1, 0, 0)])), "guess must be a HarnessEquilibrium"),

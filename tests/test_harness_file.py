@@ -122,7 +122,7 @@ def test_a_file_has_ends_that_move(written, end, kind):
         ("[joints.y]", "[joints.z]", "joints['z'] has no rod: the ends of the cables name 'y'"),
         ('force = "[0, 0, -0.1] N"', 'mass = "-1 g"', "joints.y.mass must not be negative"),
         ("tangent = [1, 1, 0], d2 = [0, 0, 1]", "tangent = [1, 1, 0]", "cables.left.start.d2 or start.frame is needed"),
-        ("[loads]", "[load]", "load is not allowed here; allowed are cables, joints, loads, obstacles, solve"),
+        ("[loads]", "[load]", "load is not allowed here; allowed are cables, contact, joints, loads, obstacles, solve"),
     ],
 )
 def test_mistakes_in_a_file_are_told_in_one_line(written, old, new, message):

@@ -49,7 +49,7 @@ def test_first_and_second_derivatives_of_gaps_are_those_of_jax():
         across = jnp.cross(turn, curve.tangents, axis=0)
         tangents = curve.tangents + across + jnp.cross(turn, across, axis=0) / 2
         moved = curve._replace(positions=curve.positions + displacements, tangents=tangents)
-        return jnp.where(found.exists, self_contact._gaps(moved, found)[0], 0.0)
+        return jnp.where(found.exists, self_contact.moving_gaps(moved, found)[0], 0.0)
 
     def by_jax(moves, turns):
         nothing = jnp.zeros_like(moves), jnp.zeros_like(turns)

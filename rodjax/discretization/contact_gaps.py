@@ -60,7 +60,8 @@ def pressure_rows(scene: Scene) -> int:
 
 def has_inner_contacts(form: PositionForm) -> bool:
     """Whether the rod may touch something between its nodes."""
-    return bool(smooth_obstacles(form.scene)) or form.scene.self_contact
+    scene = form.scene
+    return bool(smooth_obstacles(scene)) or scene.self_contact or scene.contact_loads is not None
 
 
 def distances_and_normals(

@@ -141,9 +141,9 @@ class NodalForm(PositionForm):
         fields = None
         if self.scene.potentials:
             fields = potentials.on_elements(self.scene, self.field.s, *self.node_lines(point))
-        if not has_inner_contacts(self):
-            return fields
         contacts = contacts_on_elements(self, point)
+        if contacts is None:
+            return fields
         return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:

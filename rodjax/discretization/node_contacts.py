@@ -6,8 +6,10 @@ has its gaps seen larger by half of its depth (`relaxation`): each step leads it
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -18,7 +20,6 @@ from rodjax.discretization.contact_gaps import (
     distances_and_normals,
     far_unit,
     gaps_and_normals,
-    has_inner_contacts,
     inner_rows,
     model_compliance,
     pressure_rows,
@@ -29,7 +30,7 @@ from rodjax.discretization.contact_gaps import (
 from rodjax.discretization.friction import pulled, tangential, within
 from rodjax.discretization.node_friction import friction_at, friction_bounds, slip_rows, sticking, travelled
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.potentials import OnElements
+from rodjax.discretization.potentials import OnElements, at_both
 from rodjax.discretization.self_contact import Exerted, SelfContacts, exerted, on_elements, self_contacts
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
 from rodjax.linalg.unilateral import Unilateral
@@ -206,15 +207,21 @@ def exerted_by_obstacles(
     return pushes, jnp.zeros_like(pushes).at[rough].set(drags), states
 
 
-def contacts_on_elements(form: PositionForm, point: Any) -> OnElements:
-    """The forces of contacts within and between elements, as those of a field along them."""
-    if not form.scene.self_contact:
-        return _middles_on_elements(form, point)
-    on_positions, on_tangents = on_elements(curve(form, point), far_unit(form) * point.nodal.pressures[-1])
-    contacts = OnElements(-on_positions, -on_tangents, jnp.zeros_like(on_positions))
-    if not smooth_obstacles(form.scene):
-        return contacts
-    return OnElements(*map(jnp.add, contacts, _middles_on_elements(form, point)))
+def contacts_on_elements(form: PositionForm, point: Any) -> OnElements | None:
+    """The forces of contacts within and between elements, and with other rods, as those of a field along them; `None`
+    without such.
+    """
+    found = []
+    if smooth_obstacles(form.scene):
+        found.append(_middles_on_elements(form, point))
+    exerted = []
+    if form.scene.self_contact:
+        exerted.append(on_elements(curve(form, point), far_unit(form) * point.nodal.pressures[-1]))
+    if form.scene.contact_loads is not None:
+        exerted.append((form.scene.contact_loads.on_positions, form.scene.contact_loads.on_tangents))
+    for on_positions, on_tangents in exerted:
+        found.append(OnElements(-on_positions, -on_tangents, jnp.zeros_like(on_positions)))
+    return jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *found) if found else None
 
 
 def _middles_on_elements(form: PositionForm, point: Any) -> OnElements:
@@ -228,10 +235,8 @@ def _middles_on_elements(form: PositionForm, point: Any) -> OnElements:
 
 def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:
     """Forces of contacts within elements on the rod, distributed to both nodes."""
-    if not has_inner_contacts(form):
-        return jnp.zeros_like(point.nodal.positions)
-    halves = -contacts_on_elements(form, point).by_position
-    return (jnp.pad(halves[:, 0], ((0, 0), (0, 1))) + jnp.pad(halves[:, 1], ((0, 0), (1, 0)))).T
+    contacts = contacts_on_elements(form, point)
+    return jnp.zeros_like(point.nodal.positions) if contacts is None else at_both(-contacts.by_position).T
 
 
 def larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:

@@ -155,20 +155,33 @@ class PositionForm(Form):
     # --- loads and fields --------------------------------------------------------------------------------------------
 
     def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
-        """The forces of fields on the nodes; `None` without fields."""
-        if not self.scene.potentials:
-            return None
-        return -potentials.by_position(self.scene, self.field.s, *self.node_lines(point)).T
+        """The forces of fields, and of other rods, on the nodes; `None` without such."""
+        loads = None
+        if self.scene.potentials:
+            loads = -potentials.by_position(self.scene, self.field.s, *self.node_lines(point)).T
+        if self.scene.contact_loads is None:
+            return loads
+        of_rods = potentials.at_both(self.scene.contact_loads.on_positions)
+        return of_rods if loads is None else loads + of_rods
 
     def node_lines(self, point: Any) -> tuple[Float[Array, "n+1 3"], Float[Array, "3 n+1"]]:
         """The positions and tangents of the nodes."""
         return point.nodal.positions, point.tangents[:, ::2]
 
     def at_nodes(self, point: Any) -> NodeEnergy | None:
-        """Energies of fields at the nodes and their derivatives by the unknowns; `None` without fields."""
-        if not self.scene.potentials:
+        """Energies of fields at the nodes and their derivatives by the unknowns, with those of the work of other rods,
+        whose energy is not counted; `None` without such.
+        """
+        if not self.scene.potentials and self.scene.contact_loads is None:
             return None
-        return potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), self.node_axes(point))
+        fields, axes = None, self.node_axes(point)
+        if self.scene.potentials:
+            fields = potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), axes)
+        if self.scene.contact_loads is None:
+            return fields
+        pulls = potentials.at_both(self.scene.contact_loads.on_tangents)
+        of_rods = potentials.of_pulls(pulls, point.tangents[:, ::2], axes)
+        return of_rods if fields is None else NodeEnergy(*map(jnp.add, fields, of_rods))
 
     def load_energy(self, point: Any) -> Float[Array, ""]:
         energy = super().load_energy(point)  # pyright: ignore

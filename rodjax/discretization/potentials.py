@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rodjax.geometry.vectors import cross, dot
 from rodjax.model.scene import Scene
 
 
@@ -107,6 +108,25 @@ def at_nodes(
         second[:, 3:, :3].transpose(1, 2, 0),
         second[:, 3:, 3:].transpose(1, 2, 0),
     )
+
+
+def at_both(of_elements: Float[Array, "3 2 n"]) -> Float[Array, "3 n+1"]:
+    """What both ends of the elements have, at the nodes."""
+    return jnp.pad(of_elements[:, 0], ((0, 0), (0, 1))) + jnp.pad(of_elements[:, 1], ((0, 0), (1, 0)))
+
+
+def of_pulls(
+    pulls: Float[Array, "3 n+1"], tangents: Float[Array, "3 n+1"], axes: Float[Array, "3 b n+1"]
+) -> NodeEnergy:
+    """The derivatives of -sum pull . tangent, whose value is not counted."""
+    by_rotation = -dot(pulls[:, None], cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape)))
+    # A tangent t that turns by w, then v, under a pull f: half of both orders, w (v.t) + v (w.t) less 2 t (w.v).
+    pulled, leaned = (jnp.einsum("cbn,cn->bn", axes, v) for v in (pulls, tangents))
+    mixed = (pulled[:, None] * leaned[None] + leaned[:, None] * pulled[None]) / 2
+    by_rotations = dot(pulls, tangents)[None, None] * jnp.einsum("cbn,can->ban", axes, axes) - mixed
+    nothing = jnp.zeros((tangents.shape[1], 3, 3), pulls.dtype)
+    turning = jnp.zeros((axes.shape[1], 3, tangents.shape[1]), pulls.dtype)
+    return NodeEnergy(nothing[:, 0, 0], by_rotation, nothing, turning, by_rotations)
 
 
 def on_elements(

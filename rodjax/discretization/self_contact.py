@@ -13,7 +13,7 @@ Neighbours along the rod are no contact: less than half a turn around the rod's 
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,9 @@ EDGE = 3e-4
 # Places in each element from which the nearest ones are sought, and steps of that search.
 SAMPLES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
 STEPS = 12
+# Steps of a search by the squared distance, before these: by the distance itself Newton's steps lead beyond the nearest
+# place where that is further along the rod than the other part is away.
+FAR_STEPS = 6
 # Of the elements, those nearest to the rod beyond them may touch it: at most so many.
 MOST_CONTACTS = 48
 # A step leads no element nearer to what it is nearest to than this part of the distance at which they touch.
@@ -42,7 +45,9 @@ NOTHING_BEYOND = 1.0
 class Curve(NamedTuple):
     """A rod's centerline on a mesh, and what moves it: axes about which the tangents of the nodes turn, 0 in `free` at
     nodes whose place is given; its radius in the middle of elements. `normal`: of the plane in which it stays, `None`
-    in space.
+    in space; `reach`: from where to where of each element the rod beyond it begins and ends, `None` where that is all
+    but neighbours; `edge`: of each element the length by which the rod counts as thinner at one quarter than at three,
+    `None` for `EDGE` of its radius.
     """
 
     s: Float[Array, "n+1"]
@@ -52,6 +57,8 @@ class Curve(NamedTuple):
     free: Float[Array, "n+1"]
     radius: Float[Array, "n"]
     normal: Float[Array, "3"] | None = None
+    reach: tuple[Float[Array, "n"], Float[Array, "n"]] | None = None
+    edge: Float[Array, "n"] | None = None
 
 
 class Nearest(NamedTuple):
@@ -67,7 +74,7 @@ class Nearest(NamedTuple):
     exists: Bool[Array, "k"]
 
 
-class _Side(NamedTuple):
+class Side(NamedTuple):
     """A place of the curve: position, its first two derivatives by arclength, and the weights in the position and the
     first derivative of both nodes' positions and tangents.
     """
@@ -96,7 +103,7 @@ def nearest(curve: Curve) -> Nearest:
     h, element = jnp.diff(s), jnp.arange(n)
     least, most = _range(curve)
     begin, of_element = _samples(s)
-    differences = [c[:, None] - c[None] for c in _at(curve, of_element, begin).x]
+    differences = [c[:, None] - c[None] for c in side_at(curve, of_element, begin).x]
     squares = functools.reduce(jnp.add, map(jnp.square, differences))
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
     squares = jnp.where(allowed, squares, jnp.inf).reshape(n, -1)
@@ -105,10 +112,10 @@ def nearest(curve: Curve) -> Nearest:
     here, there = best // len(begin), best % len(begin)
     first = begin.reshape(n, -1)[element, here], begin[there]
 
-    def nearer(_, pair: tuple[Array, Array]) -> tuple[Array, Array]:
+    def nearer(k: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         a, b = pair
         other = _element_at(s, b)
-        _, (of_a, of_b), (aa, ab, bb) = _distance(curve, element, other, a, b)
+        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, element, other, a, b, is_far=k < FAR_STEPS)
         bb = jnp.where(bb > 0, bb, 1.0)
         slope, growth = of_a - ab * of_b / bb, aa - ab**2 / bb
         step = jnp.where(growth > 0, -slope / jnp.where(growth > 0, growth, 1.0), -jnp.sign(slope) * h)
@@ -116,9 +123,9 @@ def nearest(curve: Curve) -> Nearest:
         along = jnp.clip(-(of_b + ab * step) / bb, -h[other] / 2, h[other] / 2)
         return a + step, jnp.clip(b + along, least, most)
 
-    a, b = jax.lax.fori_loop(0, STEPS, nearer, first)
+    a, b = jax.lax.fori_loop(0, FAR_STEPS + STEPS, nearer, first)
     other = _element_at(s, b)
-    _, _, (aa, ab, bb) = _distance(curve, element, other, a, b)
+    _, _, (aa, ab, bb) = seen_distance(curve, element, other, a, b)
     is_flat = aa * bb <= ab**2
     at_begin, at_end = a <= s[:-1], a >= s[1:]
     stays = jnp.stack([at_begin | at_end | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
@@ -137,12 +144,12 @@ def self_contacts(curve: Curve, pressures: Float[Array, "n+1"], unit: Float[Arra
     """
     found = nearest(curve)
     n = len(found.s)
-    gaps = jnp.where(found.exists, _gaps(curve, found)[0], NOTHING_BEYOND) * unit
+    gaps = jnp.where(found.exists, moving_gaps(curve, found)[0], NOTHING_BEYOND) * unit
     # Those that push go on doing so.
     order = jnp.argsort(jnp.where(pressures[:-1] > 0, -1.0, jax.lax.stop_gradient(gaps)))
     chosen = order[: min(n, MOST_CONTACTS)]
     found = Nearest(*(leaf[..., chosen] for leaf in found))
-    vectors, nodes, by_rotations = _rows(curve, found, unit * pressures[chosen])
+    vectors, nodes, by_rotations = gap_vectors(curve, found, unit * pressures[chosen])
     vectors = vectors.at[0].multiply(unit)
     count = curve.axes.shape[1]
     rows = FarRows(vectors[:, :count], vectors[:, count:], nodes, chosen, row)
@@ -159,9 +166,9 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     along the line between two of these the distance stays larger than what they represent.
     """
     found = nearest(before)
-    here, there = _at(before, found.element, found.s), _at(before, found.other, found.beyond)
-    distance, normal = _between(here, there)
-    way = _at(after, found.element, found.s).x - _at(after, found.other, found.beyond).x
+    here, there = side_at(before, found.element, found.s), side_at(before, found.other, found.beyond)
+    distance, normal = direction(here, there)
+    way = side_at(after, found.element, found.s).x - side_at(after, found.other, found.beyond).x
     along = dot(normal, way)
     contact_distance = before.radius[found.element] + before.radius[found.other]
     is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, contact_distance)))
@@ -169,7 +176,7 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     least, most = _range(before)
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
     reach = jnp.max(jnp.diff(before.s)) / len(SAMPLES)
-    old, new = ([c[:, None] - c[None] for c in _at(curve, of_element, begin).x] for curve in (before, after))
+    old, new = ([c[:, None] - c[None] for c in side_at(curve, of_element, begin).x] for curve in (before, after))
     squares, products = (functools.reduce(jnp.add, map(jnp.multiply, old, way)) for way in (old, new))
     is_far = allowed & (squares > 4 * reach**2)
     return is_pierced | jnp.any(is_far & (products < reach * jnp.sqrt(squares)))
@@ -187,55 +194,57 @@ class Exerted(NamedTuple):
 
 
 def exerted(curve: Curve, pressures: Float[Array, "n+1"]) -> Exerted:
-    return _exerted(curve, pressures, nearest(curve))
+    return exerted_at(curve, pressures, nearest(curve))
 
 
-def _exerted(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
-    gaps, a, b = _gaps(curve, found)
-    _, normal = _between(_at(curve, found.element, a), _at(curve, found.other, b))
+def exerted_at(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
+    gaps, a, b = moving_gaps(curve, found)
+    _, normal = direction(side_at(curve, found.element, a), side_at(curve, found.other, b))
     forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * normal
     return Exerted(a, b, jnp.where(found.exists, gaps, jnp.inf), forces)
 
 
-def on_elements(curve: Curve, pressures: Float[Array, "n+1"]) -> tuple[Array, Array]:
-    """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both."""
-    found = nearest(curve)
-    a, b, _, forces = _exerted(curve, pressures, found)
+def on_elements(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest | None = None) -> tuple[Array, Array]:
+    """What pressures apply to the nodes at start and end of each element, and to their tangents, (3, 2, n) both.
+    `found`: the nearest places, if they are known.
+    """
+    found = nearest(curve) if found is None else found
+    a, b, _, forces = exerted_at(curve, pressures, found)
     on_positions = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
     for s, element, sign in ((a, found.element, 1), (b, found.other, -1)):
-        side = _at(curve, element, s)
+        side = side_at(curve, element, s)
         on_positions = on_positions.at[..., element].add(sign * forces[:, None] * side.of_positions[0][None])
         on_tangents = on_tangents.at[..., element].add(sign * forces[:, None] * side.of_tangents[0][None])
     return on_positions, on_tangents
 
 
-def _gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array, "k"], Float[Array, "k"]]:
+def moving_gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array, "k"], Float[Array, "k"]]:
     """And the places, as they move with the curve: by two steps of Newton's method, which have the first three
     derivatives.
     """
     a, b = found.s, found.beyond
     a_stays, b_stays = found.stays
     for _ in range(2):
-        _, (of_a, of_b), (aa, ab, bb) = _distance(curve, found.element, found.other, a, b)
+        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, found.element, found.other, a, b)
         of_a, of_b = jnp.where(a_stays, 0.0, of_a), jnp.where(b_stays, 0.0, of_b)
         aa, bb = jnp.where(a_stays, 1.0, aa), jnp.where(b_stays, 1.0, bb)
         ab = jnp.where(a_stays | b_stays, 0.0, ab)
         determinant = aa * bb - ab**2
         a, b = a - (bb * of_a - ab * of_b) / determinant, b - (aa * of_b - ab * of_a) / determinant
-    distance, _, _ = _distance(curve, found.element, found.other, a, b)
+    distance, _, _ = seen_distance(curve, found.element, found.other, a, b)
     return distance - curve.radius[found.element] - curve.radius[found.other], a, b
 
 
-def _rows(
+def gap_vectors(
     curve: Curve, found: Nearest, pressures: Float[Array, "p"]
 ) -> tuple[Float[Array, "5 b+3 4 p"], Int[Array, "4 p"], Float[Array, "b b n+1"]]:
     """The gradient of each gap and the vectors of its curvature, by the rotations and positions of its nodes; these;
     and what of the curvature is by the rotations of one node.
     """
-    _, a, b = _gaps(curve, found)
-    here, there = _at(curve, found.element, a), _at(curve, found.other, b)
+    _, a, b = moving_gaps(curve, found)
+    here, there = side_at(curve, found.element, a), side_at(curve, found.other, b)
     nodes = jnp.stack([found.element, found.element + 1, found.other, found.other + 1])
-    d, normal = _between(here, there)
+    d, normal = direction(here, there)
     tangents, axes = curve.tangents[:, nodes], curve.axes[:, :, nodes]  # [3, 4, p], [3, b, 4, p]
     turned = cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape))
     signs = jnp.array([1.0, 1.0, -1.0, -1.0], d.dtype)[:, None]
@@ -252,7 +261,7 @@ def _rows(
         by_rotation = jnp.einsum("cp,cbkp->bkp", v, turned) * on_tangents[derivative][None]
         return jnp.concatenate([by_rotation, v[:, None] * on_positions[derivative][None]])
 
-    _, _, (aa, ab, bb) = _distance(curve, found.element, found.other, a, b)
+    _, _, (aa, ab, bb) = seen_distance(curve, found.element, found.other, a, b)
     is_own = jnp.array([1.0, 1.0, 0.0, 0.0], d.dtype)[None, :, None]
 
     def across(v: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
@@ -291,7 +300,7 @@ def _rows(
     return vectors, nodes, nothing.at[:, :, nodes].add(-turn)
 
 
-def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
+def side_at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> Side:
     begin, end = curve.s[element], curve.s[element + 1]
     h = end - begin
     t = (s - begin) / h
@@ -311,7 +320,7 @@ def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
     def weighted(of_positions: Float[Array, "2 k"], of_tangents: Float[Array, "2 k"]) -> Float[Array, "3 k"]:
         return jnp.sum(positions * of_positions[None] + tangents * of_tangents[None], axis=1)
 
-    return _Side(
+    return Side(
         weighted(of_positions[0], of_tangents[0]),
         weighted(of_positions[1], of_tangents[1]),
         weighted(second_of_positions, second_of_tangents),
@@ -320,7 +329,7 @@ def _at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> _Side:
     )
 
 
-def _between(here: _Side, there: _Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
+def direction(here: Side, there: Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
     """The distance of two places, and the direction in which it grows."""
     way = here.x - there.x
     across = cross(here.slope, there.slope)
@@ -333,20 +342,29 @@ def _between(here: _Side, there: _Side) -> tuple[Float[Array, "k"], Float[Array,
     return distance, way / distance[None]
 
 
-def _distance(
-    curve: Curve, element: Int[Array, "k"], other: Int[Array, "k"], a: Float[Array, "k"], b: Float[Array, "k"]
+def seen_distance(
+    curve: Curve,
+    element: Int[Array, "k"],
+    other: Int[Array, "k"],
+    a: Float[Array, "k"],
+    b: Float[Array, "k"],
+    is_far: Any = False,
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
-    """The distance and the term that keeps the place in the middle, and its derivatives by both places."""
-    here, there = _at(curve, element, a), _at(curve, other, b)
-    d, normal = _between(here, there)
+    """The distance and the term that keeps the place in the middle, and its derivatives by both places; `is_far`: the
+    second ones as of half of the squared distance, by the distance.
+    """
+    here, there = side_at(curve, element, a), side_at(curve, other, b)
+    d, normal = direction(here, there)
     h = curve.s[element + 1] - curve.s[element]
-    edge, rate = EDGE * curve.radius[element], 2 * jnp.pi / h
+    edge = EDGE * curve.radius[element] if curve.edge is None else curve.edge[element]
+    rate = 2 * jnp.pi / h
     aside = rate * (a - curve.s[element] - 0.75 * h)
     on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
-    aa = (dot(here.slope, here.slope) - on_here**2) / d + dot(normal, here.curvature)
+    across = 1.0 - jnp.asarray(is_far, d.dtype)
+    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature)
     aa += edge * rate**2 * jnp.cos(aside) / 2
-    bb = (dot(there.slope, there.slope) - on_there**2) / d - dot(normal, there.curvature)
-    ab = -(dot(here.slope, there.slope) - on_here * on_there) / d
+    bb = (dot(there.slope, there.slope) - across * on_there**2) / d - dot(normal, there.curvature)
+    ab = -(dot(here.slope, there.slope) - across * on_here * on_there) / d
     slope = on_here + edge * rate * jnp.sin(aside) / 2
     return d + edge * (1 - jnp.cos(aside)) / 2, (slope, -on_there), (aa, ab, bb)
 
@@ -363,6 +381,8 @@ def _range(curve: Curve) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
 
     What is nearer bends around its own radius at most; of a closed ring through its ends too.
     """
+    if curve.reach is not None:
+        return curve.reach
     s = curve.s
     apart = jnp.pi * jnp.max(curve.radius)
     ends = curve.positions[0] - curve.positions[-1]

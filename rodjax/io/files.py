@@ -32,7 +32,7 @@ from rodjax.model.along import Smooth, Steps
 from rodjax.model.harness import ENDS, Body, Harness
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
-from rodjax.model.scene import Scene, has_node_positions
+from rodjax.model.scene import Scene, has_node_positions, under_contact
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Pin, Slider, Spring, Swivel
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -50,9 +50,13 @@ OLDEST_FORMAT = 7
 HARNESS_FORMAT = 15
 # Of a rod that touches itself.
 SELF_CONTACT_FORMAT = 16
+# Of a harness whose rods may touch one another.
+ROD_CONTACT_FORMAT = 17
 
 # What files of harnesses lack until format 14, which had no obstacles.
 _OF_CONTACTS = ("contact_forces", "end_pressures")
+# What those lack whose rods do not touch one another.
+_OF_ROD_CONTACTS = "rod_pressures"
 
 # The name in files of a field that the code names otherwise.
 STORED_AS = {"arclengths": "places"}
@@ -201,6 +205,12 @@ HARNESS_FIELDS = {
     "joint/support/translation": ("N/m", "stiffness of the spring against displacements"),
     "joint/support/rotation": ("N m/rad", "stiffness of the spring against rotations"),
 }
+# The same of harnesses whose rods may touch one another.
+ROD_CONTACT_FIELDS = {
+    "harness/rod_pressures": ("N", "of contacts between rods, of stacks of these by pair and element of the first one"),
+    "scene/contact_loads/on_positions": ("N", "forces of other rods on the nodes at start and end of each element"),
+    "scene/contact_loads/on_tangents": ("N m", "what other rods apply to the tangents of these nodes"),
+}
 DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
 # Loads of which files of older formats have none.
@@ -266,7 +276,7 @@ def file_content(equilibrium: Equilibrium | HarnessEquilibrium) -> bytes:
 def _format_of(equilibrium: Equilibrium | HarnessEquilibrium) -> int:
     """The oldest that can hold it."""
     if isinstance(equilibrium, HarnessEquilibrium):
-        return HARNESS_FORMAT
+        return ROD_CONTACT_FORMAT if equilibrium.harness.contact else HARNESS_FORMAT
     return SELF_CONTACT_FORMAT if equilibrium.scene.self_contact else FORMAT
 
 
@@ -366,7 +376,7 @@ def _check_format(group: h5py.Group, path: Path) -> None:
 def _newest_of(group: h5py.Group) -> int:
     """The format in which this rodjax writes what a file holds."""
     if group.attrs.get("kind") == HarnessEquilibrium.__name__:
-        return HARNESS_FORMAT
+        return ROD_CONTACT_FORMAT if "contact" in group.attrs else HARNESS_FORMAT
     scene = group.get("scene")
     touches_itself = isinstance(scene, h5py.Group) and bool(scene.attrs.get("self_contact"))
     return SELF_CONTACT_FORMAT if touches_itself else FORMAT
@@ -393,9 +403,7 @@ def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
             _write_value(entries, str(k), entry, f"{place}/*")
     elif value is not None:
         dataset = group.create_dataset(name, data=value)
-        dataset.attrs["units"], dataset.attrs["description"] = (
-            FIELDS[place] if place in FIELDS else HARNESS_FIELDS[place]
-        )
+        dataset.attrs["units"], dataset.attrs["description"] = (FIELDS | HARNESS_FIELDS | ROD_CONTACT_FIELDS)[place]
 
 
 def _read(
@@ -507,8 +515,11 @@ def _write_harness(group: h5py.Group, result: HarnessEquilibrium) -> None:
         joint = joints.create_group(str(number))
         joint.attrs["name"] = name
         _write(joint, body, "joint/")
+    if result.harness.contact:
+        group.attrs["contact"] = np.array(result.harness.contact)
     for name in _harness_arrays():
-        _write_value(group, name, getattr(result, name), f"harness/{name}")
+        if name != _OF_ROD_CONTACTS or result.harness.contact:
+            _write_value(group, name, getattr(result, name), f"harness/{name}")
 
 
 def _harness_arrays() -> dict[str, Any]:
@@ -532,6 +543,7 @@ def _read_harness(group: h5py.Group, path: Path) -> HarnessEquilibrium:
         "bodies": tuple(_read(joint, (Body,), path, shape, JOINT_KINDS) for joint in joint_groups),
         "names": tuple(names),
         "joint_names": tuple(_name(joint, path) for joint in joint_groups),
+        "contact": _contact(group, len(names), path),
     }.items():
         object.__setattr__(harness, name, value)
     members = tuple(tuple(groups[k]) for k in sorted(groups))
@@ -544,17 +556,28 @@ def _read_harness(group: h5py.Group, path: Path) -> HarnessEquilibrium:
     arrays = {
         name: _read_value(group, name, annotation, path, shape, KINDS)
         for name, annotation in _harness_arrays().items()
-        if written >= HARNESS_FORMAT or name not in _OF_CONTACTS
+        if (written >= HARNESS_FORMAT or name not in _OF_CONTACTS) and (name != _OF_ROD_CONTACTS or harness.contact)
     }
+    if not harness.contact:
+        arrays[_OF_ROD_CONTACTS] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)
     if written < HARNESS_FORMAT:
         arrays["contact_forces"] = np.zeros_like(arrays["positions"])
         arrays["end_pressures"] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)
     return HarnessEquilibrium(groups=stacked, harness=harness, members=members, **arrays)
 
 
+def _contact(group: h5py.Group, cables: int, path: Path) -> tuple[tuple[int, int], ...]:
+    """The numbers of the cables that may touch one another."""
+    pairs = np.asarray(group.attrs.get("contact", np.zeros((0, 2), int)))
+    fits = pairs.ndim == 2 and pairs.shape[1:] == (2,) and np.issubdtype(pairs.dtype, np.integer)
+    if not fits or np.any(pairs < 0) or np.any(pairs >= cables) or np.any(pairs[:, 0] >= pairs[:, 1]):
+        raise ValueError(f"{path} is damaged: contact must hold pairs of numbers of its {cables} cables")
+    return tuple((int(first), int(second)) for first, second in pairs)
+
+
 def _joined(rod: Equilibrium, cable: h5py.Group, path: Path) -> Scene:
     """The scene of a rod with joints in the place of the clamps that stand for them."""
-    scene = rod.scene
+    scene = under_contact(rod.scene, None)
     for end in ENDS:
         place = cable.get(f"joints/{end}")
         if isinstance(place, h5py.Group):

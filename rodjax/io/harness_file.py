@@ -2,6 +2,8 @@
 
 A complete example: a trunk that branches into two, one of them on a pin.
 
+    contact = [["trunk", "left"]]  # optional: which cables touch one another; or true, for all that share no joint
+
     [cables.trunk.rod]             # the tables of a cable are those of `rodjax.io.scene_file`: rod, start, end, loads,
     section = "circular"           # clips, obstacles
     length = "40 cm"
@@ -61,7 +63,7 @@ from rodjax.model.scene import Scene
 from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
-HARNESS_TABLES = ("cables", "joints", "loads", "obstacles", "solve")
+HARNESS_TABLES = ("cables", "contact", "joints", "loads", "obstacles", "solve")
 CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles")
 
 
@@ -132,8 +134,8 @@ def harness_file(content: dict[str, Any]) -> HarnessFile:
             raise SceneFileError(f"{where}.{error}") from None
     joints = {name: _body(reader, table, f"joints.{name}") for name, table in content.get("joints", {}).items()}
     try:
-        return HarnessFile(Harness(cables, joints), segments, rtol, strain_limit)
-    except ValueError as error:
+        return HarnessFile(Harness(cables, joints, content.get("contact", False)), segments, rtol, strain_limit)
+    except (ValueError, TypeError) as error:
         raise SceneFileError(str(error)) from None
 
 

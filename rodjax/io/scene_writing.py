@@ -41,7 +41,8 @@ def scene_text(scene: Scene | Harness, segments: int | None = None) -> str:
     if not is_known(scene):
         raise ValueError("scene must hold numbers, got a traced one: call write_scene outside jax.jit, vmap and grad")
     if isinstance(scene, Harness):
-        lines = []
+        pairs = ", ".join(f"[{json.dumps(first)}, {json.dumps(second)}]" for first, second in scene.contact_names)
+        lines = [f"contact = [{pairs}]", ""] if pairs else []
         for name, one in zip(scene.names, scene.scenes, strict=True):
             lines += _written_scene(one, f"scene[{name!r}]", f"cables.{json.dumps(name)}.")
         for name, body in zip(scene.joint_names, scene.bodies, strict=True):
@@ -74,6 +75,8 @@ def _written_scene(scene: Scene, where: str, before: str) -> list[str]:
             f"{where}.rod must not be one of Rod.from_centerline to be written: a scene file cannot hold the frames of "
             "its rest_centerline; save writes them with a result"
         )
+    if scene.contact_loads is not None:
+        raise ValueError(f"{where} must be one that was given, got that of a rod touching others: write its Harness")
     lines = ["self_contact = true", ""] if scene.self_contact else []
     lines += [f"[{before}rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):

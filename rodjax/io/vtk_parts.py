@@ -66,7 +66,8 @@ def _parts_of_harness(result: HarnessEquilibrium) -> dict[str, list[Piece]]:
             parts[f"{name}_{number}" if name in parts or name in ("joints", "Assembly") else name] = pieces
     positions = np.asarray(result.positions)
     cells = [np.array([j]) for j in range(positions.shape[-2])]
-    parts["joints"] = [Piece(points, "Vertices", cells, {}) for points in positions.reshape(-1, len(cells), 3)]
+    if cells:
+        parts["joints"] = [Piece(points, "Vertices", cells, {}) for points in positions.reshape(-1, len(cells), 3)]
     return parts
 
 

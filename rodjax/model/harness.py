@@ -1,6 +1,7 @@
 """Harnesses: rods whose ends meet in rigid bodies with unknown poses."""
 
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.checks import instance, is_known, leaf, namespace, not_negative, vector
+from rodjax.checks import instance, is_known, leaf, namespace, not_negative, sequence, vector
 from rodjax.geometry.rotations import rotation_vector
 from rodjax.model.along import largest_beside
 from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
@@ -49,10 +50,14 @@ class Harness(eqx.Module):
 
     - `cables`: `{name: Scene}`; an end that is a `Joint` belongs to the body of that name.
     - `joints`: `{name: Body}`, for bodies with loads or supports; others need not be named.
-    - `contact`: between rods; only `False` so far.
+    - `contact`: which rods, all with a radius, touch one another without friction: `False` for none, `True` for every
+        pair that shares no joint, or pairs of their names, which share none either: there their ends meet. Each element
+        touches another rod where it is nearest to it, at most 32 at a time between rods of two structures. No step of a
+        search leads a rod through another; on which side of one another they lie is that of their first shapes: between
+        the supports, of `guess`, or of the last step of a path.
 
     A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it,
-    unless a support of its own holds it in a direction.
+    unless a support of its own holds it in a direction. Without contact between rods one end must be a `Joint`.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
     and for a scene with friction, a sliding clip or a load without a potential.
@@ -68,17 +73,18 @@ class Harness(eqx.Module):
     bodies: tuple[Body, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
+    # Numbers of rods, the lower one first.
+    contact: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     def __init__(
-        self, cables: Mapping[str, Scene], joints: Mapping[str, Body] | None = None, contact: Any = False
+        self,
+        cables: Mapping[str, Scene],
+        joints: Mapping[str, Body] | None = None,
+        contact: bool | Sequence[tuple[str, str]] = False,
     ) -> None:
         instance(cables, "cables", Mapping)
         joints = {} if joints is None else joints
         instance(joints, "joints", Mapping)
-        if contact is not False:
-            raise ValueError(
-                f"contact must be False: that between the rods of a harness is not computed, got {contact!r}"
-            )
         for name, scene in cables.items():
             instance(name, "the name of a cable", str)
             instance(scene, f"cables[{name!r}]", Scene)
@@ -89,8 +95,11 @@ class Harness(eqx.Module):
             if name not in found:
                 known = ", ".join(map(repr, dict.fromkeys(found))) or "none"
                 raise ValueError(f"joints[{name!r}] has no rod: the ends of the cables name {known}")
-        if not found:
-            raise ValueError("a harness must have an end that is a Joint; rodjax.solve takes scenes without one")
+        self.contact = _checked_contact(contact, cables)
+        if not found and not self.contact:
+            raise ValueError(
+                "a harness must have an end that is a Joint, or contact between rods; rodjax.solve takes scenes without"
+            )
         self.names = tuple(cables)
         self.scenes = tuple(cables.values())
         self.joint_names = tuple(dict.fromkeys(found))
@@ -103,6 +112,11 @@ class Harness(eqx.Module):
     def __getitem__(self, name: str) -> Scene:
         return self.scenes[self.names.index(name)]
 
+    @property
+    def contact_names(self) -> list[tuple[str, str]]:
+        """Of the rods that may touch one another."""
+        return [(self.names[first], self.names[second]) for first, second in self.contact]
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
 
@@ -113,6 +127,50 @@ class Harness(eqx.Module):
     def has_potential(self) -> bool:
         """Whether all loads have one: a dead moment has none on a body that may turn about more than one axis."""
         return all(body.moment is None or _motions(body.support).rotations.shape[1] < 2 for body in self.bodies)
+
+
+def _checked_contact(contact: Any, cables: Mapping[str, Scene]) -> tuple[tuple[int, int], ...]:
+    names = tuple(cables)
+    if isinstance(contact, bool):
+        every = itertools.combinations(range(len(names)), 2) if contact else ()
+        pairs = tuple((a, b) for a, b in every if not _shared(cables[names[a]], cables[names[b]]))
+        if contact and not pairs:
+            raise ValueError("contact must be False in a harness of which no two cables are without a common joint")
+    else:
+        pairs = tuple(sorted({_checked_pair(pair, names) for pair in sequence(contact, "contact", "pair of names")}))
+    for first, second in pairs:
+        shared = _shared(cables[names[first]], cables[names[second]])
+        if shared:
+            raise ValueError(
+                f"contact must be of cables without a common joint, as their ends meet there, got {names[first]!r} and "
+                f"{names[second]!r}, which both end in {min(shared)!r}"
+            )
+    for number in sorted({number for pair in pairs for number in pair}):
+        scene, name = cables[names[number]], f"cables[{names[number]!r}]"
+        if scene.rod.radius is None:
+            raise ValueError(f"{name}.rod must have a radius, as it may touch another cable, got None")
+    return pairs
+
+
+def _shared(first: Scene, second: Scene) -> set[str]:
+    """The joints in which both rods end."""
+    one, other = ({end.name for end in (scene.start, scene.end) if isinstance(end, Joint)} for scene in (first, second))
+    return one & other
+
+
+def _checked_pair(pair: Any, names: tuple[str, ...]) -> tuple[int, int]:
+    if not isinstance(pair, list | tuple) or len(pair) != 2:
+        raise ValueError(f"contact must be True, False or pairs of names of cables, got {pair!r} among them")
+    for name in pair:
+        if name not in names:
+            known = ", ".join(map(repr, names))
+            raise ValueError(f"contact names the cable {name!r}, but the cables are {known}")
+    if pair[0] == pair[1]:
+        raise ValueError(
+            f"contact must be of different cables, got {pair[0]!r} twice: self_contact=True in its scene is that"
+        )
+    first, second = sorted(names.index(name) for name in pair)
+    return first, second
 
 
 def _check_scene(scene: Scene, name: str) -> None:
@@ -289,6 +347,8 @@ class Bodies(eqx.Module):
     def motions(self) -> Float[Array, "6j k"]:
         """The directions (u, r) in which the bodies can move, one column each; rows of body after body."""
         count = len(self.position)
+        if not self.columns:
+            return jnp.zeros((6 * count, 0), self.position.dtype)
         each = jnp.zeros((count, 6, count, 6), self.position.dtype)
         j = np.arange(count)
         each = each.at[j, :3, j, :3].set(self.translations).at[j, 3:, j, 3:].set(self.rotations)
@@ -317,6 +377,8 @@ class Bodies(eqx.Module):
         self, others: "Bodies", positions: Float[Array, "j 3"], frames: Float[Array, "j 3 3"]
     ) -> tuple[Float[Array, "j 3"], Float[Array, "j 3 3"]]:
         """Poses under these supports, of those under others: displaced and turned from them as before."""
+        if not len(positions):
+            return positions, frames
         away = jnp.einsum("jik,jlk,jl->ji", self.translations, others.translations, positions - others.position)
         turned = rotation_vectors(frames, others.frame)
         turned = jnp.einsum("jik,jlk,jl->ji", self.rotations, others.rotations, turned)
@@ -349,6 +411,8 @@ def _matrix(stiffness: Any) -> Any:
 
 
 def _stacked(values: list[Any], default: np.ndarray, dtype: Any) -> Array:
+    if not values:
+        return jnp.zeros((0, *default.shape), dtype)
     return jnp.stack([jnp.asarray(default, dtype) if value is None else value for value in values])
 
 

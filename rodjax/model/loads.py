@@ -35,6 +35,21 @@ class PointForce(eqx.Module):
         return PointForce(self.at / units.length, self.force / units.force, self.follower)
 
 
+class ContactLoads(eqx.Module):
+    """What other rods of a harness apply to a rod in contact, on a mesh of n elements: forces [N] on the nodes at start
+    and end of each element, and what is conjugate to their tangents [N m].
+    """
+
+    on_positions: Float[Array, "3 2 n"]
+    on_tangents: Float[Array, "3 2 n"]
+
+    def in_units(self, units: Units) -> "ContactLoads":
+        return self.times(1 / units.force, 1 / units.energy)
+
+    def times(self, force: Float[Array, ""], energy: Float[Array, ""]) -> "ContactLoads":
+        return ContactLoads(self.on_positions * force, self.on_tangents * energy)
+
+
 class PointCouple(eqx.Module):
     """A couple at an arclength inside the rod; it has no potential. `at`: arclength s [m]; `couple`: (3,) [N m], along
     global axes, or, where `follower` is True, along the material frame (d1, d2, t) of the section.

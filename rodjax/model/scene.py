@@ -1,5 +1,6 @@
 """The scene: a rod, what holds its ends and what loads it, in SI units or in the units of the rod."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +13,15 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import instance, is_known, leaf, number_array, sequence, vector
 from rodjax.geometry.rotations import rotation_vector
-from rodjax.model.loads import DistributedCouple, DistributedForce, PointCouple, PointForce, Potential, check_potential
+from rodjax.model.loads import (
+    ContactLoads,
+    DistributedCouple,
+    DistributedForce,
+    PointCouple,
+    PointForce,
+    Potential,
+    check_potential,
+)
 from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
 from rodjax.model.summaries import scene_text
@@ -76,6 +85,8 @@ class Scene(eqx.Module):
     obstacles: tuple[Obstacle, ...]
     potentials: tuple[Potential, ...]
     point_couples: tuple[PointCouple, ...]
+    # Of a rod of a harness whose rods may touch, where they were found; `None` in a scene that is given.
+    contact_loads: ContactLoads | None
     self_contact: bool = eqx.field(static=True, default=False)
 
     def __init__(
@@ -119,7 +130,7 @@ class Scene(eqx.Module):
         self.rod, self.start, self.end, self.gravity, self.point_forces, self.turns, *rest = parts
         self.distributed, self.clips, self.obstacles, self.potentials, self.point_couples = rest
         instance(self_contact, "self_contact", bool)
-        self.self_contact = self_contact
+        self.self_contact, self.contact_loads = self_contact, None
         for k, potential in enumerate(self.potentials):
             check_potential(potential, f"potentials[{k}]")
         _check_supports(self)
@@ -387,7 +398,7 @@ def needs_frames(scene: Scene) -> bool:
         return True
     if scene.clips and any(clip.frame is not None for clip in scene.clips):
         return True
-    return bool(has_contacts(scene) or scene.potentials) and dead_end_moment(scene) is not None
+    return has_fields(scene) and dead_end_moment(scene) is not None
 
 
 def with_plain_rod(scene: Scene) -> Scene:
@@ -419,7 +430,22 @@ def has_node_positions(scene: Scene) -> bool:
     force in each element, are unknowns: where the rod may touch obstacles or itself, in fields of forces, and of rods
     by frames under loads without a potential.
     """
-    return bool(has_contacts(scene) or scene.potentials) or (needs_frames(scene) and not has_potential(scene))
+    return has_fields(scene) or (needs_frames(scene) and not has_potential(scene))
+
+
+def has_fields(scene: Scene) -> bool:
+    """Whether forces along the rod depend on where it is: those of contacts, and of fields."""
+    return bool(has_contacts(scene) or scene.potentials) or scene.contact_loads is not None
+
+
+def under_contact(scene: Scene, loads: ContactLoads | None) -> Scene:
+    """The same scene with what other rods apply to it."""
+    # `eqx.tree_at` would take longer than the solve.
+    new = object.__new__(Scene)
+    for field in dataclasses.fields(Scene):
+        object.__setattr__(new, field.name, getattr(scene, field.name))
+    object.__setattr__(new, "contact_loads", loads)
+    return new
 
 
 def has_contacts(scene: Scene) -> bool:
@@ -472,4 +498,6 @@ def nondimensional(scene: Scene) -> tuple[Scene, Units]:
         [couple.in_units(units) for couple in scene.point_couples],
         scene.self_contact,
     )
+    if scene.contact_loads is not None:
+        scaled = under_contact(scaled, scene.contact_loads.in_units(units))
     return scaled, units

@@ -49,14 +49,14 @@ class CriticalPoint(eqx.Module):
     - `parameter`: where in the sequence of scenes, from 0 to m - 1
     - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; or `"branch"`,
       where another branch of equilibria crosses, as where a straight strut buckles
-    - `equilibrium`: there; its scene is that of the parameter
+    - `equilibrium`: there, of harnesses a `HarnessEquilibrium`; its scene is that of the parameter
     - `mode`: the critical motion, whose stiffness [N] is what is left of zero, of a harness a `HarnessMode`. Where a
       rod may buckle in all directions at once, one of them
     - `index_before`, `index_after`: the number of motions along which the energy falls, on both sides along the branch
     """
 
     parameter: Float[Array, ""]
-    equilibrium: Equilibrium | HarnessEquilibrium
+    equilibrium: Any
     mode: Mode | HarnessMode
     kind: Kind = eqx.field(static=True)
     index_before: int = eqx.field(static=True)
@@ -66,14 +66,15 @@ class CriticalPoint(eqx.Module):
 class Branch(eqx.Module):
     """A sequence of k equilibria on one branch.
 
-    - `parameter` [k]: where in the sequence of scenes, from 0 to m - 1; `equilibria`: with a leading axis of k
+    - `parameter` [k]: where in the sequence of scenes, from 0 to m - 1; `equilibria`: with a leading axis of k, of
+      harnesses a `HarnessEquilibrium`
     - `index` [k]: the number of motions along which the energy falls; 0 where stable
     - `critical_points`: those between the equilibria, in their order
     - `ended`: why it was followed no further
     """
 
     parameter: Float[Array, "k"]
-    equilibria: Equilibrium | HarnessEquilibrium
+    equilibria: Any
     index: Int[Array, "k"]
     critical_points: tuple[CriticalPoint, ...]
     ended: BranchEnd = eqx.field(static=True)

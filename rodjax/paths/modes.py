@@ -60,6 +60,8 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
             raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.energy.shape}")
         if not equilibrium.harness.has_potential:
             raise ValueError("equilibrium must have a potential: a dead moment on a joint has none")
+        if equilibrium.harness.contact:
+            raise ValueError("equilibrium must be of a harness with contact=False: with it no softest motion is sought")
         return harness_mode(jax.lax.stop_gradient(equilibrium))
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")

@@ -27,21 +27,25 @@ from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.self_contact import Curve
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.vectors import components
+from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
-from rodjax.model.scene import held_position, scene_axes
+from rodjax.model.loads import ContactLoads
+from rodjax.model.scene import held_position, scene_axes, under_contact
 from rodjax.solving.coupling import (
     Coupling,
     EndContacts,
     RodInBodies,
     end_contact_energy,
     end_contacts,
+    free_points,
     linearized_with_ends,
 )
-from rodjax.solving.harness_contact import ContactModel, ContactStep, RodsInContact, contact_step
+from rodjax.solving.harness_contact import BetweenStep, ContactModel, ContactStep, RodsInContact, contact_step
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -57,6 +61,19 @@ from rodjax.solving.newton import (
     SUFFICIENT_DECREASE,
     Find,
     Newton,
+)
+from rodjax.solving.rod_contact import (
+    Columns,
+    Contacts,
+    Pairs,
+    between,
+    columns_of,
+    contact_energy,
+    contacts_between,
+    curves_of,
+    in_contact,
+    loads_of,
+    passes,
 )
 from rodjax.solving.status import Status
 from rodjax.units import Units
@@ -94,9 +111,14 @@ class Rods(eqx.Module):
 
     def under(self, poses: Poses) -> tuple[Float[Array, "k 2 3"], Float[Array, "k 2 3 3"]]:
         """The poses of the bodies at both ends."""
-        positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
-        frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
+        positions = jnp.pad(poses.positions, ((0, 1), (0, 0)))
+        frames = jnp.pad(poses.frames, ((0, 1), (0, 0), (0, 0)))
         return positions[self.body], frames[self.body]
+
+    def touched(self, loads: ContactLoads) -> "Rods":
+        """The same under forces of other rods."""
+        scene = under_contact(self.form.scene, loads)
+        return dataclasses.replace(self, form=eqx.tree_at(lambda form: form.scene, self.form, scene))
 
 
 class RodStep(NamedTuple):
@@ -149,11 +171,12 @@ def eliminated(here: Linearization, coupling: Coupling, shift: Float[Array, ""],
 
 class State(NamedTuple):
     """What a turn leaves to the next one; of each group of rods points, pressures of the bodies where these end (`None`
-    without obstacles), and shifts of their systems.
+    of rods that touch nothing), and shifts of their systems; pressures of the contacts of each kind of `Pairs`.
     """
 
     points: tuple[Any, ...]
     at_ends: tuple[Float[Array, "k o 2"] | None, ...]
+    pairs: tuple[Float[Array, "p n"], ...]
     poses: Poses
     shifts: tuple[Float[Array, "k"], ...]
     damping: Float[Array, ""]
@@ -168,19 +191,74 @@ class State(NamedTuple):
 
 class Assembly(eqx.Module):
     """All rods and bodies of a harness, with the units of its system: `energy` that of the stiffest rod, `length` the
-    mean of all.
+    mean of all. `pairs`: of rods that may touch.
     """
 
     groups: tuple[Rods, ...]
     bodies: Bodies
     energy: Float[Array, ""]
     length: Float[Array, ""]
+    pairs: tuple[Pairs, ...] = eqx.field(static=True)
 
     @staticmethod
-    def of(groups: tuple[Rods, ...], bodies: Bodies) -> "Assembly":
+    def of(groups: tuple[Rods, ...], bodies: Bodies, pairs: tuple[Pairs, ...] = ()) -> "Assembly":
         energies = jnp.concatenate([rods.units.energy for rods in groups])
         lengths = jnp.concatenate([rods.units.length for rods in groups])
-        return Assembly(groups, bodies, jnp.max(energies), jnp.mean(lengths))
+        return Assembly(groups, bodies, jnp.max(energies), jnp.mean(lengths), pairs)
+
+    @property
+    def force(self) -> Float[Array, ""]:
+        """The unit of pressures between rods."""
+        return self.energy / self.length
+
+    def curves(self, forms: tuple[Form, ...], points: tuple[Any, ...]) -> dict[int, Curve]:
+        """Of the groups of which a rod may touch another one; forms with their ends where the bodies are."""
+        origin, found = self.groups[0].units.origin[0], {}
+        for number in in_contact(self.pairs):
+            units, form = self.groups[number].units, forms[number]
+            assert isinstance(form, NodalForm)
+            found[number] = curves_of(form, points[number], units, self.length, origin)
+        return found
+
+    def forms(self, poses: Poses, motions: tuple[Float[Array, "k 2 6"], ...] | None = None) -> tuple[Form, ...]:
+        """Of the groups, with their ends where the bodies are after these motions of their ends."""
+        found = []
+        for number, group in enumerate(self.groups):
+            rods = self.rods(group, poses)
+            if motions is None:
+                found.append(jax.vmap(lambda rod: rod.form_at())(rods))
+            else:
+                found.append(jax.vmap(lambda rod, moved: rod.form_at(moved))(rods, motions[number]))
+        return tuple(found)
+
+    def contacts(self, state: "State") -> tuple[Contacts, ...]:
+        """Between rods."""
+        if not self.pairs:
+            return ()
+        curves = self.curves(self.forms(state.poses), state.points)
+        each = zip(self.pairs, state.pairs, strict=True)
+        return tuple(contacts_between(pairs, curves, pressures) for pairs, pressures in each)
+
+    def touched(self, contacts: tuple[Contacts, ...]) -> "Assembly":
+        """With the loads of contacts between rods."""
+        groups = list(self.groups)
+        for number in in_contact(self.pairs):
+            loads = self.contact_loads(contacts, number)
+            per_force = self.force / groups[number].units.force
+            per_length = self.length / groups[number].units.length
+            groups[number] = groups[number].touched(
+                ContactLoads(
+                    loads.on_positions * per_force[:, None, None, None],
+                    loads.on_tangents * (per_force * per_length)[:, None, None, None],
+                )
+            )
+        return dataclasses.replace(self, groups=tuple(groups))
+
+    def contact_loads(self, contacts: tuple[Contacts, ...], number: int) -> ContactLoads:
+        """Of a group, in the units of the assembly."""
+        like = self.groups[number].form.scene.contact_loads
+        assert like is not None
+        return loads_of(self.pairs, contacts, number, like)
 
     @property
     def count(self) -> int:
@@ -233,24 +311,29 @@ class Assembly(eqx.Module):
         out_of_balance = (motions.T @ gradient.reshape(-1)) / (jnp.repeat(scale, 6) @ jnp.abs(motions))
         return gradient, jnp.max(jnp.abs(out_of_balance), initial=0.0)
 
-    def begin(self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], poses: Poses) -> State:
+    def begin(
+        self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], pairs: tuple[Array, ...], poses: Poses
+    ) -> State:
         dtype = poses.positions.dtype
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
         nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
         status = jnp.full((), Status.RUNNING, int)
-        return State(points, at_ends, poses, nothing, zero, zero, nothing, count, count, count, status, count)
+        return State(points, at_ends, pairs, poses, nothing, zero, zero, nothing, count, count, count, status, count)
 
 
 def find_assembly(
     assembly: Assembly,
     points: tuple[Any, ...],
     at_ends: tuple[Float[Array, "k o 2"] | None, ...],
+    pairs: tuple[Float[Array, "p n"], ...],
     poses: Poses,
     solver: Newton,
     find: Find,
 ) -> State:
-    """The equilibrium reached from points of the rods, pressures of the bodies where these end, and poses of them."""
-    begin = assembly.begin(points, at_ends, poses)
+    """The equilibrium reached from points of the rods, pressures of the bodies where these end, and of contacts between
+    rods, and poses of the bodies.
+    """
+    begin = assembly.begin(points, at_ends, pairs, poses)
     return jax.lax.while_loop(
         lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
     )
@@ -310,6 +393,7 @@ class _Steps(NamedTuple):
     bodies: Float[Array, "j 6"]
     part: Float[Array, ""]
     is_finite: Bool[Array, ""]
+    between: BetweenStep | None
 
 
 class _Trial(NamedTuple):
@@ -326,20 +410,23 @@ class _Trial(NamedTuple):
 
 def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State:
     """One linearisation, the step that follows from it, and the part of it that is taken."""
+    touching = assembly.contacts(state)
+    assembly = assembly.touched(touching)
     all_here = []
     for group, points, pressures in zip(assembly.groups, state.points, state.at_ends, strict=True):
         rods = assembly.rods(group, state.poses)
         all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points, pressures)))
-    balance = _balance(assembly, all_here, state, solver)
+    balance = _balance(assembly, all_here, touching, state, solver)
     rods = _eliminated_rods(all_here, state, balance, find)
     if all(here.at_ends is None for here in all_here):
         bodies, contacts = _condensed(assembly, all_here, rods, state, balance, find), None
     else:
-        rods, bodies, contacts = _with_contacts(assembly, all_here, rods, state, balance, find)
+        rods, bodies, contacts = _with_contacts(assembly, all_here, touching, rods, state, balance, find)
     steps = _steps(assembly, all_here, rods, bodies, contacts, balance, solver)
     is_sought = (rods.is_definite & (bodies.below == 0)) if find == "minimum" else jnp.array(True)
     is_pushed = rods.is_pushed | bodies.is_pushed
-    trial = _searched(assembly, all_here, state, steps, balance, is_pushed | (find != "minimum"), is_sought)
+    is_unjudged = is_pushed | (find != "minimum")
+    trial = _searched(assembly, all_here, touching, state, steps, balance, is_unjudged, is_sought)
     status = _status(state, balance, trial, steps, is_sought, solver)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
@@ -350,9 +437,14 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     at_ends = state.at_ends
     if contacts is not None:
         at_ends = _split(all_here, at_ends, contacts.at_ends, lambda pressures, change: pressures + taken * change)
+    pairs = state.pairs
+    if contacts is not None and contacts.between is not None:
+        changes = contacts.between.changed(state.pairs)
+        pairs = tuple(pressures + taken * change for pressures, change in zip(pairs, changes, strict=True))
     return State(
         points=points,
         at_ends=at_ends,
+        pairs=pairs,
         poses=poses,
         shifts=rods.shifts,
         damping=_damping(state, trial),
@@ -393,7 +485,9 @@ def _split(all_here: list[_Here], of_all: Any, of_contacts: Any, changed: Any) -
 # --- balance ---------------------------------------------------------------------------------------------------------
 
 
-def _balance(assembly: Assembly, all_here: list[_Here], state: State, solver: Newton) -> _Balance:
+def _balance(
+    assembly: Assembly, all_here: list[_Here], touching: tuple[Contacts, ...], state: State, solver: Newton
+) -> _Balance:
     forces = tuple(here.coupling.first for here in all_here)
     gradient, stiffness = assembly.body_derivatives(state.poses)
     gradient, residual = assembly.balance_of_bodies(gradient, forces)
@@ -403,6 +497,8 @@ def _balance(assembly: Assembly, all_here: list[_Here], state: State, solver: Ne
         floor = jnp.maximum(floor, jnp.max(here.floor))
         closed = jax.vmap(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
         is_closed &= jnp.all(closed(group.form, here.linearization.constraint_residual))
+    for contacts in touching:
+        residual = jnp.maximum(residual, contacts.residual)
     balanced = jnp.where(residual <= floor, Status.ROUNDING_FLOOR, Status.RUNNING)
     balanced = jnp.where(residual <= solver.tolerance, Status.CONVERGED, balanced)
     stagnates = (state.iterations > 0) & (residual > state.residual / 2) & (residual <= STAGNATION * floor)
@@ -539,14 +635,22 @@ def _generic(count: int, dtype: Any) -> Float[np.ndarray, "k"]:
 
 
 def _with_contacts(
-    assembly: Assembly, all_here: list[_Here], rods: _Rods, state: State, balance: _Balance, find: Find
+    assembly: Assembly,
+    all_here: list[_Here],
+    touching: tuple[Contacts, ...],
+    rods: _Rods,
+    state: State,
+    balance: _Balance,
+    find: Find,
 ) -> tuple[_Rods, _Bodies, ContactStep]:
     """The same with the contacts of rods and bodies, which are sought with both."""
     stiffness, force = _condensed_system(assembly, all_here, rods, balance)
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
     may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
     groups, shifts, is_pushed = [], [], rods.is_pushed
-    for group, here, last in zip(assembly.groups, all_here, state.shifts, strict=True):
+    together, chosen = between(touching) if touching else (None, ())
+    of_pairs = in_contact(assembly.pairs)
+    for number, (group, here, last) in enumerate(zip(assembly.groups, all_here, state.shifts, strict=True)):
         if here.at_ends is None:
             continue
         shift = _first_shift(last, state, balance) if find == "minimum" else jnp.full_like(last, least)
@@ -555,17 +659,21 @@ def _with_contacts(
         pushes = (PUSH / here.aside.shape[2] * pushing)[:, None, None] * here.aside
         forms = jax.vmap(lambda rod: rod.form_at())(here.rods)
         parts = forms, here.points, here.linearization, here.coupling, here.at_ends, pushes
-        groups.append(RodsInContact.of(*parts, group.body, assembly.shares(group)))
+        touched = RodsInContact.of(*parts, group.body, assembly.shares(group))
+        if together is not None and number in of_pairs:
+            columns = _columns(assembly, number, here, forms, chosen)
+            touched = touched.touched(columns, together.pressures)
+        groups.append(touched)
         shifts.append(shift)
     push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
     pattern = jnp.asarray(_generic(len(force), dtype))
     motions = assembly.bodies.motions
-    model = ContactModel(tuple(groups), motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum")
-    found = contact_step(model, tuple(shifts), state.damping)
+    parts = motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"
+    found = contact_step(ContactModel(tuple(groups), *parts, together), tuple(shifts), state.damping)
     is_definite = rods.is_definite & found.is_found
     for shift in found.shifts:
         is_definite &= jnp.all(shift <= least)
-    together = _Rods(
+    all_rods = _Rods(
         rods.found,
         _split(all_here, rods.shifts, found.shifts, lambda _, shift: shift),
         is_definite,
@@ -574,7 +682,15 @@ def _with_contacts(
     )
     pushes_bodies = (found.below > 0) & (push > 0)
     bodies = _Bodies((motions @ found.bodies).reshape(assembly.count, 6), found.below, pushes_bodies)
-    return together, bodies, found
+    return all_rods, bodies, found
+
+
+def _columns(assembly: Assembly, number: int, here: _Here, forms: NodalForm, chosen: Any) -> Columns:
+    group, system = assembly.groups[number], here.linearization.system
+    assert isinstance(system, ChainSystem)
+    free = jax.vmap(free_points)(forms, here.linearization)
+    scales = group.units.length / assembly.length, assembly.shares(group)
+    return columns_of(number, assembly.pairs, chosen, system, here.coupling, free, scales)
 
 
 # --- the step --------------------------------------------------------------------------------------------------------
@@ -608,12 +724,14 @@ def _steps(
         largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
     part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
     steps = [step._replace(force_change=part * step.force_change) for step in steps]
-    return _Steps(steps, ends, bodies.motions, part, jnp.isfinite(balance.residual) & jnp.isfinite(largest))
+    is_finite = jnp.isfinite(balance.residual) & jnp.isfinite(largest)
+    return _Steps(steps, ends, bodies.motions, part, is_finite, None if contacts is None else contacts.between)
 
 
 def _searched(
     assembly: Assembly,
     all_here: list[_Here],
+    touching: tuple[Contacts, ...],
     state: State,
     steps: _Steps,
     balance: _Balance,
@@ -621,6 +739,9 @@ def _searched(
     is_sought: Bool[Array, ""],
 ) -> _Trial:
     """The part of a step that is taken: the first of ever shorter ones that lowers the merit, or that is not judged."""
+
+    def curves_at(part: Float[Array, ""], points: tuple[Any, ...]) -> dict[int, Curve]:
+        return assembly.curves(assembly.forms(state.poses, tuple(part * ends for ends in steps.ends)), points)
 
     def merit_at(part: Float[Array, ""]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
         """The energy, with L of the rods and the squared closures, and the points of the rods."""
@@ -634,9 +755,15 @@ def _searched(
             energy += jnp.sum(shares * value)
             lacking += jnp.sum(shares[:, None] * constraint_residual**2) / 2
             points.append(point)
+        if touching:
+            curves = curves_at(part, tuple(points))
+            for pairs, contacts in zip(assembly.pairs, touching, strict=True):
+                energy += contact_energy(pairs, curves, contacts)
         return energy + weight * lacking, tuple(points)
 
     slope, rate = _slopes(assembly, all_here, steps, balance.gradient)
+    if steps.between is not None:
+        slope += steps.between.slope
     weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
     slope += weight * rate
 
@@ -650,10 +777,14 @@ def _searched(
         is_better = (tries > 0) & (is_unjudged | (merit <= bound))
         for group, here, point in zip(assembly.groups, all_here, points, strict=True):
             if here.at_ends is not None:
-                passes = jax.vmap(
+                stays = jax.vmap(
                     lambda form, here, there, is_better: form.accepts(here, there, is_better), (0, 0, 0, None)
                 )
-                is_better &= jnp.all(passes(group.form, here.points, point, is_better))
+                is_better &= jnp.all(stays(group.form, here.points, point, is_better))
+        if touching:
+            curves = curves_at(jnp.where(tries == 0, 0.0, next_part), points)
+            for pairs, contacts in zip(assembly.pairs, touching, strict=True):
+                is_better &= passes(pairs, contacts, curves)
         return _Trial(next_part, tries, jnp.where(tries == 0, merit, trial.first), is_better, points)
 
     # At the end no step is tried.

@@ -76,7 +76,8 @@ class RodInBodies(NamedTuple):
 
 class Coupling(NamedTuple):
     """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and constraint residual;
-    those of the gaps of contacts apart, `None` without obstacles.
+    those of the gaps of contacts apart, `None` without obstacles. `of_nodes`: how rotation and position of the node at
+    each end follow, `None` where nodes have no positions.
     """
 
     first: Float[Array, "12"]
@@ -84,6 +85,7 @@ class Coupling(NamedTuple):
     of_gradient: Float[Array, "b m 12"]
     of_constraints: Float[Array, "k 12"]
     of_gaps: Float[Array, "r n+1 12"] | None
+    of_nodes: Float[Array, "2 b+3 6"] | None
 
 
 class EndContacts(NamedTuple):
@@ -101,11 +103,14 @@ class EndContacts(NamedTuple):
     def residual(self) -> Float[Array, ""]:
         """Of a gap and a pressure one is zero, none is negative."""
         weighted = GAP_WEIGHT * self.found
-        return jnp.max(jnp.abs(jnp.where(self.pressures < weighted, self.pressures, weighted)))
+        return jnp.max(jnp.abs(jnp.where(self.pressures < weighted, self.pressures, weighted)), initial=0.0)
 
 
 def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Float[Array, "o 2 3"]]:
     """Gaps between obstacles and the ends of a rod in bodies that these push, else 1, and the directions of growth."""
+    if not form.scene.obstacles:
+        nothing = jnp.zeros((0, 2, 3), form.field.s.dtype)
+        return nothing[..., 0], nothing
     distances, normals = distances_and_normals(form.scene, _places(form))
     radius = form.radius[np.array([0, -1])]
     touches = rod.touches[None]
@@ -135,7 +140,9 @@ def end_contacts(
     carried = jnp.stack([rod.carried(0), rod.carried(1)])
     rates = jnp.einsum("oec,eci->oei", normals, carried)
     pulls = -jnp.einsum("oe,oec->ec", pressures, normals)
-    curved = -jnp.einsum("oe,oecd->ecd", pressures, curvatures(form.scene, _places(form)))
+    curved = jnp.zeros((2, 3, 3), pulls.dtype)
+    if form.scene.obstacles:
+        curved -= jnp.einsum("oe,oecd->ecd", pressures, curvatures(form.scene, _places(form)))
     first = jnp.einsum("ec,eci->ei", pulls, carried)
     second = jnp.einsum("eci,ecd,edj->eij", carried, curved, carried)
     second = second.at[:, 3:, 3:].add(jnp.stack([lifted(pulls[e], rod.arm(e)) for e in range(2)]))
@@ -162,7 +169,7 @@ def linearized_with_ends(rod: RodInBodies, form: Form, point: Any) -> tuple[Line
 
 def held(form: Form, released: Linearization) -> Linearization:
     """With the ends held that clamps hold."""
-    free, system = _free(form, released), released.system
+    free, system = free_points(form, released), released.system
     gradient, bases = released.gradient * free[None], released.bases * free[None, None]
     released = dataclasses.replace(released, bases=bases, gradient=gradient)
     if isinstance(system, ChainSystem):
@@ -187,7 +194,7 @@ def held(form: Form, released: Linearization) -> Linearization:
     return dataclasses.replace(released, system=system)
 
 
-def _free(form: Form, released: Linearization) -> Float[Array, "m"]:
+def free_points(form: Form, released: Linearization) -> Float[Array, "m"]:
     """1 at points that may turn, 0 at clamped ends."""
     free = np.ones(released.gradient.shape[1])
     for end, support in zip(ENDS, (form.scene.start, form.scene.end), strict=True):
@@ -211,6 +218,11 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         columns = columns.at[:, end, number, -3:].set(turn.rotation)
         if isinstance(system, ChainSystem):
             others = others.at[_rows_of(system, end), number].set(rod.carried(number))
+    of_nodes = None
+    if isinstance(system, ChainSystem):
+        of_nodes = jnp.zeros((2, b + 3, 6), dtype)
+        for number, _, turn in ends:
+            of_nodes = of_nodes.at[number, :b, 3:].set(turn.rotation).at[number, b:].set(rod.carried(number))
     columns, others = columns.reshape(b, m, 2 * width), others.reshape(-1, 2 * width)
     turned, lacking = jax.vmap(released.system.times, (-1, -1), -1)(columns, others)
     bent = jnp.einsum("bmk,bml->kl", columns, turned)
@@ -219,7 +231,7 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         bent += others.T @ lacking
         lacking, of_gaps = _without_gaps(system, ends, columns, others, lacking)
     bent = bent.reshape(2, width, 2, width)
-    turned = turned * _free(form, released)[None, :, None]
+    turned = turned * free_points(form, released)[None, :, None]
     before = 6 - width
     first = jnp.zeros((2, 6), dtype)
     second = jnp.zeros((2, 6, 2, 6), dtype).at[:, before:, :, before:].set(bent)
@@ -242,6 +254,7 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         of_gradient.reshape(b, m, 12),
         of_constraints.reshape(-1, 12),
         of_gaps,
+        of_nodes,
     )
 
 

@@ -384,6 +384,8 @@ def checked_options(
     find: Find = "minimum",
 ) -> tuple[Options, float | None]:
     """The options with the library's choice for `None`, and the tolerance to refine for: `None` where there is none."""
+    if scene.contact_loads is not None:
+        raise ValueError("scene must be one that was given, got that of a rod which touches others: solve its Harness")
     if scene.rod.length.dtype == np.float32:
         warn_of_single_precision()
     if guess is not None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,8 @@ from rodjax.model.harness import (
     of_one_rod,
     rotated,
 )
-from rodjax.model.scene import Scene, nondimensional
+from rodjax.model.loads import ContactLoads
+from rodjax.model.scene import Scene, nondimensional, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
@@ -61,10 +63,13 @@ from rodjax.solving.result import (
     warn_if_coarse,
     warn_of_outcome,
 )
+from rodjax.solving.rod_contact import Members, Pairs, in_contact, pairs_of
+from rodjax.solving.rod_contact_results import touching_rods
 from rodjax.solving.status import Outcome, is_converged
 from rodjax.warn import warn
 
-Members = tuple[tuple[int, ...], ...]
+# Motions of the bodies, what is unknown of contacts between rods, pressures of those of bodies with obstacles.
+Unknown = tuple[Float[Array, "k"], Float[Array, "t"], Float[Array, "c"]]
 
 # Of contacts of bodies, beside the stiffest motion of these, and how often what it gives way by is asked for again.
 ENDS_COMPLIANCE = 1e-4
@@ -102,7 +107,11 @@ def solve_harness(
             raise ValueError("guess must be an equilibrium of a harness with the same cables and joints in this order")
     fixed, guess = not_differentiated(harness, guess)
     strain_limit = checked_strain_limit(strain_limit)
-    poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
+    if not harness.bodies:
+        bodies = Bodies.of(harness)
+        poses = Poses(bodies.position, bodies.frame)
+    else:
+        poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
     kept = [None] * len(fixed) if guess is None else guess.segments
     counts = segments if isinstance(segments, list) else [segments] * len(fixed)
     all_options, tolerance = [], rtol
@@ -158,6 +167,7 @@ def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
         residual=guess.residual,
         contact_forces=jnp.zeros((len(harness.bodies), 3), guess.energy.dtype),
         end_pressures=no_pressures(harness, ((0,),)),
+        rod_pressures=jnp.zeros(0, guess.energy.dtype),
         harness=harness,
         members=((0,),),
     )
@@ -195,8 +205,10 @@ def _followed(harness: Harness, guess: HarnessEquilibrium) -> Poses:
     return Poses(*Bodies.of(harness).followed(Bodies.of(guess.harness), guess.positions, guess.frames))
 
 
-def _structures(harness: Harness) -> list[Scene]:
-    """The scenes of the rods with clamps, at no place in particular, where their ends are joints."""
+def _structures(harness: Harness, counts: Sequence[int] | None = None) -> list[Scene]:
+    """The scenes of the rods with clamps, at no place in particular, where their ends are joints; `counts`: of elements
+    of each rod, where they are known.
+    """
     clamp = _clamp(harness.scenes[0].rod.length.dtype)
 
     def structure(scene: Scene) -> Scene:
@@ -207,7 +219,20 @@ def _structures(harness: Harness) -> list[Scene]:
             object.__setattr__(new, field.name, clamp if isinstance(value, Joint) else value)
         return new
 
-    return [structure(scene) for scene in harness.scenes]
+    found = [structure(scene) for scene in harness.scenes]
+    return (
+        found
+        if counts is None
+        else [_touchable(harness, *each) for each in zip(range(len(found)), found, counts, strict=True)]
+    )
+
+
+def _touchable(harness: Harness, number: int, scene: Scene, elements: int) -> Scene:
+    """The scene of a rod on a mesh, with what others apply to it, nothing at first, if it may touch any."""
+    if not any(number in pair for pair in harness.contact):
+        return scene
+    nothing = np.zeros((3, 2, elements), scene.rod.length.dtype)
+    return under_contact(scene, ContactLoads(leaf(nothing), leaf(nothing)))
 
 
 @functools.cache
@@ -239,7 +264,7 @@ def _solved(
     shape: Guess | None = None,
 ) -> HarnessEquilibrium:
     """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
-    structures = _structures(harness)
+    structures = _structures(harness, [options.segments for options in all_options])
     members = _members(structures, all_options)
     starts = []
     for group in members:
@@ -255,7 +280,8 @@ def _solved(
                     assert isinstance(rod, Equilibrium)
                     each.append((finer[number], last_twist(rod)))
                 else:
-                    scene = _at(harness.scenes[number], _bodies_of(harness, number), poses)
+                    scene = _touchable(harness, number, harness.scenes[number], options.segments)
+                    scene = _at(scene, _bodies_of(harness, number), poses)
                     each.append(first_state(scene, rod, options))
             start = _stacked_starts(tuple(each))
         starts.append(start)
@@ -263,7 +289,10 @@ def _solved(
     pressures = no_pressures(harness, members) if guess is None else guess.end_pressures
     if guess is not None and (guess.members != members or pressures.shape != no_pressures(harness, members).shape):
         pressures = no_pressures(harness, members)
-    return _solve(harness, poses, tuple(starts), pressures, strain_limit, options, members=members)
+    of_rods = no_rod_pressures(harness, members, options)
+    if guess is not None and guess.members == members and guess.rod_pressures.shape == of_rods.shape:
+        of_rods = guess.rod_pressures
+    return _solve(harness, poses, tuple(starts), pressures, of_rods, strain_limit, options, members=members)
 
 
 @compiled
@@ -303,6 +332,7 @@ def _solve(
     poses: Poses,
     starts: tuple[tuple[SolverState, FirstTwist], ...],
     end_pressures: Float[Array, "c"],
+    rod_pressures: Float[Array, "c"],
     strain_limit: Float[Array, ""] | float,
     options: tuple[Options, ...],
     members: Members,
@@ -310,7 +340,10 @@ def _solve(
     groups, points, all_searches, at_ends = [], [], [], []
     of_groups = split_pressures(harness, members, end_pressures)
     for numbers, (states, firsts), option, pressures in zip(members, starts, options, of_groups, strict=True):
-        stacked = _stack([clamped(harness.scenes[number], harness, *poses) for number in numbers])
+        elements = option.segments
+        stacked = _stack(
+            [_touchable(harness, k, clamped(harness.scenes[k], harness, *poses), elements) for k in numbers]
+        )
 
         def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
             return Search.of(*in_units_of(scene, state), first, option)
@@ -321,11 +354,13 @@ def _solve(
         points.append(searches.point)
         all_searches.append((searches, states))
         at_ends.append(None if pressures is None else pressures / searches.units.force[:, None, None])
-    bodies = Bodies.of(harness)
-    assembly = Assembly.of(tuple(groups), bodies)
+    bodies, pairs = Bodies.of(harness), pairs_of(harness.contact, members)
+    assembly = Assembly.of(tuple(groups), bodies, pairs)
+    counts = [option.segments for option in options]
+    between = split_rod_pressures(pairs, counts, rod_pressures / assembly.force)
     solver = options[0].solver
     assert isinstance(solver, Newton)
-    end = find_assembly(assembly, tuple(points), tuple(at_ends), poses, solver, options[0].find)
+    end = find_assembly(assembly, tuple(points), tuple(at_ends), between, poses, solver, options[0].find)
     return harness_equilibrium(harness, members, assembly, end, end_pressures, strain_limit, tuple(all_searches))
 
 
@@ -339,18 +374,23 @@ def harness_equilibrium(
     all_begun: tuple[tuple[Search | None, SolverState | None], ...],
 ) -> HarnessEquilibrium:
     """What a search found, whose rods are those of `assembly`; `all_begun`: where it began, of rods with obstacles."""
-    groups, bodies = assembly.groups, assembly.bodies
+    groups, bodies, pairs = assembly.groups, assembly.bodies, assembly.pairs
+    loads = assembly.contacts(end)
     is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
     for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_begun, strict=True)):
-        now = tuple(clamped(harness.scenes[k], harness, *end.poses) for k in numbers)
-        rods.append(_equilibria(_stack(list(now)), rod, begun, end, number, is_stable, strain_limit))
+        now = _stack([clamped(harness.scenes[k], harness, *end.poses) for k in numbers])
+        if number in in_contact(pairs):
+            now = under_contact(now, assembly.contact_loads(loads, number).times(assembly.force, assembly.energy))
+        rods.append(_equilibria(now, rod, begun, end, number, is_stable, strain_limit))
     pressures = [
         (pressures * rod.units.force[:, None, None]).reshape(-1)
         for rod, pressures in zip(groups, end.at_ends, strict=True)
         if pressures is not None
     ]
     end_pressures = jnp.concatenate(pressures) if pressures else end_pressures
+    between = [jnp.zeros(0, end.poses.positions.dtype), *(pressures.reshape(-1) for pressures in end.pairs)]
+    rod_pressures = assembly.force * jnp.concatenate(between)
     status = end.status
     for rod in rods:
         # A strain beyond the limit in one of them is said of the whole.
@@ -370,6 +410,7 @@ def harness_equilibrium(
         residual=end.residual,
         contact_forces=contact_forces(harness, members, end.poses, end_pressures)[0][:, :3],
         end_pressures=end_pressures,
+        rod_pressures=rod_pressures,
         harness=harness,
         members=members,
     )
@@ -436,13 +477,33 @@ def no_pressures(harness: Harness, members: Members) -> Float[Array, "c"]:
 
 
 def split_pressures(harness: Harness, members: Members, pressures: Float[Array, "c"]) -> list[Array | None]:
-    """Of each group (rods, obstacles, ends); `None` without obstacles."""
-    found, first = [], 0
-    for count, numbers in zip(_of_obstacles(harness, members), members, strict=True):
+    """Of each group (rods, obstacles, ends); `None` of rods that touch neither obstacles nor other rods."""
+    found, first, touched = [], 0, in_contact(pairs_of(harness.contact, members))
+    for group, (count, numbers) in enumerate(zip(_of_obstacles(harness, members), members, strict=True)):
         size = 2 * count * len(numbers)
-        found.append(pressures[first : first + size].reshape(len(numbers), count, 2) if count else None)
+        of_group = pressures[first : first + size].reshape(len(numbers), count, 2)
+        found.append(of_group if count or group in touched else None)
         first += size
     return found
+
+
+def no_rod_pressures(harness: Harness, members: Members, options: tuple[Options, ...]) -> Float[Array, "c"]:
+    """Of contacts between rods, of each kind of pairs by pair and element of its first rod."""
+    pairs = pairs_of(harness.contact, members)
+    count = sum(len(each.places) * options[each.groups[0]].segments for each in pairs)
+    return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype))
+
+
+def split_rod_pressures(
+    pairs: tuple[Pairs, ...], counts: Sequence[int], pressures: Float[Array, "c"]
+) -> tuple[Float[Array, "p n"], ...]:
+    """`counts`: of elements of the rods of each group."""
+    found, first = [], 0
+    for each in pairs:
+        shape = len(each.places), counts[each.groups[0]]
+        found.append(pressures[first : first + shape[0] * shape[1]].reshape(shape))
+        first += shape[0] * shape[1]
+    return tuple(found)
 
 
 def contact_forces(
@@ -574,27 +635,36 @@ def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harn
         each = (bodies.motions @ motions).reshape(count, 6)
         return Poses(positions + each[:, :3], rotated(frames, each[:, 3:]))
 
-    def rods_at(harness: Harness, motions: Float[Array, "k"]) -> list[Equilibrium]:
-        there = poses(harness, motions)
-        return [
-            differentiable(_stack([clamped(harness.scenes[k], harness, *there) for k in numbers]), group)
-            for numbers, group in zip(result.members, result.groups, strict=True)
-        ]
+    touching = touching_rods(*jax.lax.stop_gradient((harness, result.groups, result.rod_pressures)), result.members)
+
+    def rods_at(harness: Harness, motions: Float[Array, "k"], touches: Float[Array, "t"]) -> list[Equilibrium]:
+        there, found = poses(harness, motions), []
+        for number, (numbers, group) in enumerate(zip(result.members, result.groups, strict=True)):
+            scenes = _stack([clamped(harness.scenes[k], harness, *there) for k in numbers])
+            if touching is not None:
+                scenes = touching.loaded(scenes, number, touches)
+            found.append(differentiable(scenes, group))
+        return found
 
     is_closed = jax.lax.stop_gradient(result.end_pressures > 0)
 
-    def out_of_balance(harness: Harness, unknown: tuple[Float[Array, "k"], Float[Array, "c"]]) -> Float[Array, "k+c"]:
-        """And the gaps that are closed, pressures where they are open."""
-        motions, pressures = unknown
+    def out_of_balance(harness: Harness, unknown: Unknown) -> Float[Array, "k+t+c"]:
+        """Of the bodies, what contacts between rods lack, and the gaps of bodies that are closed, pressures where they
+        are open.
+        """
+        motions, touches, pressures = unknown
         bodies, there = Bodies.of(harness), poses(harness, motions)
-        forces = body_forces(harness, rods_at(harness, motions), bodies, there, result.members)
+        rods = rods_at(harness, motions, touches)
+        forces = body_forces(harness, rods, bodies, there, result.members)
         pushes, gaps = contact_forces(harness, result.members, there, pressures)
         balance = bodies.motions.T @ (forces + pushes).reshape(-1)
-        return jnp.concatenate([balance, jnp.where(is_closed, gaps, pressures)])
+        lacking = touches if touching is None else touching.lacking(rods, touches)
+        return jnp.concatenate([balance, lacking, jnp.where(is_closed, gaps, pressures)])
 
-    def whole(harness: Harness, unknown: tuple[Float[Array, "k"], Float[Array, "c"]]) -> HarnessEquilibrium:
-        motions, pressures = unknown
-        rods, there, bodies = rods_at(harness, motions), poses(harness, motions), Bodies.of(harness)
+    def whole(harness: Harness, unknown: Unknown) -> HarnessEquilibrium:
+        motions, touches, pressures = unknown
+        rods, there, bodies = rods_at(harness, motions, touches), poses(harness, motions), Bodies.of(harness)
+        rod_pressures = result.rod_pressures if touching is None else touching.pressures(result.rod_pressures, touches)
         return dataclasses.replace(
             result,
             groups=tuple(rods),
@@ -603,28 +673,30 @@ def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harn
             energy=_energy(rods, bodies, there),
             contact_forces=contact_forces(harness, result.members, there, pressures)[0][:, :3],
             end_pressures=pressures,
+            rod_pressures=rod_pressures,
             harness=harness,
         )
 
-    nowhere = jnp.zeros(len(others.columns), result.positions.dtype), result.end_pressures
+    touches = jnp.zeros(0, result.positions.dtype) if touching is None else touching.values
+    nowhere = jnp.zeros(len(others.columns), result.positions.dtype), touches, result.end_pressures
     stiffness = jax.jacfwd(lambda unknown: out_of_balance(harness, unknown))(nowhere)
     stiffness = jnp.concatenate(stiffness, axis=1)
     _, lacking = jax.jvp(lambda harness: out_of_balance(harness, nowhere), (harness,), (change,))
-    unknown = _solved_with_contacts(stiffness, -lacking, len(nowhere[0]))
-    unknown = unknown[: len(nowhere[0])], unknown[len(nowhere[0]) :]
+    sizes = np.cumsum([len(part) for part in nowhere])
+    unknown = tuple(jnp.split(_solved_with_contacts(stiffness, -lacking, *sizes[:2]), sizes[:2]))
     _, found = jax.jvp(whole, (harness, nowhere), (change, unknown))
     return jax.tree.map(lambda leaf: None if leaf.dtype == jax.dtypes.float0 else leaf, found)
 
 
 def _solved_with_contacts(
-    matrix: Float[Array, "k+c k+c"], right: Float[Array, "k+c"], count: int
-) -> Float[Array, "k+c"]:
+    matrix: Float[Array, "k+t+c k+t+c"], right: Float[Array, "k+t+c"], bodies: int, count: int
+) -> Float[Array, "k+t+c"]:
     """Where contacts of several rods with a body are one, who bears it is undetermined: softened, and what that gives
-    way by asked for again.
+    way by asked for again. `bodies`: how many unknowns are motions of these; `count`: how many are no pressures.
     """
     if len(right) == count:
-        return jnp.linalg.solve(matrix, right)
-    stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]))
+        return jnp.linalg.solve(matrix, right) if count else right
+    stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:bodies]))
     is_pressure = np.arange(len(right)) >= count
     soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_COMPLIANCE / stiffest, 0.0).astype(right.dtype))
     found = jnp.linalg.solve(soft, right)
@@ -641,8 +713,7 @@ def body_forces(
     """
     count = len(harness.bodies)
     total = jnp.zeros((count + 1, 6), poses.positions.dtype)
-    positions = jnp.concatenate([poses.positions, jnp.zeros_like(poses.positions[:1])])
-    frames = jnp.concatenate([poses.frames, jnp.zeros_like(poses.frames[:1])])
+    frames = jnp.pad(poses.frames, ((0, 1), (0, 0), (0, 0)))
     for numbers, group in zip(members, rods, strict=True):
         body, _, offset = ends_of(harness, numbers)
         of_ends = (group.start_force, group.start_moment), (group.end_force, group.end_moment)
@@ -650,7 +721,6 @@ def body_forces(
             arms = jnp.einsum("kij,kj->ki", frames[body[:, end]], offset[:, end])
             about = moment + jnp.cross(arms, force)
             total = total.at[body[:, end]].add(sign * jnp.concatenate([force, about], axis=1))
-    del positions
 
     def energy(motions: Float[Array, "j 6"]) -> Float[Array, ""]:
         there = poses.positions + motions[:, :3], rotated(poses.frames, motions[:, 3:])

@@ -5,8 +5,15 @@ last iterate, eliminated to the motions of the bodies. Contacts of a rod know of
 ends; contacts of a body, where a rod ends in it, of these motions alone. Where the stiffness of the bodies is negative
 along a motion, it is reversed for the rest of the search, and a rod without a minimum becomes stiffer, so that the
 model only gains stiffness while its minimum is sought.
+
+Contacts between rods are unknowns beside the motions of the bodies: the forces -p of closed ones, with the compliance
+of the model, and what their curvature takes and adds (`linalg.far_rows`). Each rod is eliminated to its columns of
+these as it is to the motions of its ends. Rods and contacts have a minimum between held bodies where all negative
+eigenvalues are those of compliances (Haynsworth 1968): a rod alone need not have one, as where it leans on another.
 """
 
+import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,6 +28,7 @@ from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
 from rodjax.solving.coupling import Coupling, EndContacts
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
+from rodjax.solving.rod_contact import Between, BetweenStep, Columns
 
 
 class RodsInContact(eqx.Module):
@@ -28,7 +36,8 @@ class RodsInContact(eqx.Module):
 
     `contacts`: at nodes and within elements; `f`, `c`: right sides without them; `at_ends`: contacts of the bodies in
     which the rods end; `first`: the derivative of L by the motions of the ends without contacts; `body`: of each end;
-    `shares`: the unit of energy of each rod, in that of the bodies.
+    `shares`: the unit of energy of each rod, in that of the bodies; `columns`: of contacts with other rods, `None`
+    without such.
     """
 
     system: ChainSystem
@@ -40,6 +49,7 @@ class RodsInContact(eqx.Module):
     first: Float[Array, "k 12"]
     body: Int[Array, "k 2"]
     shares: Float[Array, "k"]
+    columns: Columns | None = None
 
     @staticmethod
     def of(
@@ -58,16 +68,25 @@ class RodsInContact(eqx.Module):
             system, forces = here.system, point.nodal.contact_forces
             assert isinstance(system, ChainSystem)
             assert here.gaps is not None
-            assert coupling.of_gaps is not None
             moments, c = form.without_contacts(here, forces)
             contacts = contact_model(form, point, here.gaps, here.reference_displacements)
             system = system.closed_where(form.first_closed(system.contacts.is_closed, contacts))
-            first = coupling.first + jnp.einsum("rni,rn->i", coupling.of_gaps, forces)
+            first = coupling.first + jnp.einsum("rni,rn->i", _of_gaps(system, coupling), forces)
             first += jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12)
             return system, contacts, push + moments, c, first
 
         system, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
         return RodsInContact(system, coupling, contacts, f, c, at_ends, first, body, shares)
+
+    def touched(self, columns: Columns, pressures: Float[Array, "c"]) -> "RodsInContact":
+        """By other rods, whose pressures are among the loads so far."""
+        gaps = columns.gaps(len(pressures))
+        f, c, first = (
+            self.f - gaps.rotation @ pressures,
+            self.c - gaps.rows @ pressures,
+            self.first + gaps.ends @ pressures,
+        )
+        return dataclasses.replace(self, f=f, c=c, first=first, columns=columns)
 
     @property
     def size(self) -> int:
@@ -102,8 +121,7 @@ class RodsInContact(eqx.Module):
         of_ends = self.of_ends(motions)
 
         def of_rod(system: ChainSystem, coupling: Coupling, x: Array, y: Array, q: Array) -> Array:
-            assert coupling.of_gaps is not None
-            return system.contacts.rates(x, system.split(y)[2]) + coupling.of_gaps @ q
+            return system.contacts.rates(x, system.split(y)[2]) + _of_gaps(system, coupling) @ q
 
         rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, of_ends)
         return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, of_ends.reshape(-1, 2, 6)))
@@ -111,15 +129,23 @@ class RodsInContact(eqx.Module):
 
 class Eliminated(NamedTuple):
     """Rods with some contacts closed, under a shift: whether they have a minimum, negative eigenvalues, solutions
-    without motions of the ends and by these, and what is left for the ends: stiffness, and forces.
+    without motions of the ends and by these, and what is left for the ends: stiffness, and forces. After the motions of
+    the ends stand the unknowns of contacts with other rods.
     """
 
     is_minimum: Bool[Array, "k"]
     negative: Int[Array, "k"]
     motion: tuple[Array, Array]
     by_motions: tuple[Array, Array]
-    stiffness: Float[Array, "k 12 12"]
-    force: Float[Array, "k 12"]
+    stiffness: Float[Array, "k 12+z 12+z"]
+    force: Float[Array, "k 12+z"]
+
+
+def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12"]:
+    """None of a rod without obstacles."""
+    if coupling.of_gaps is not None:
+        return coupling.of_gaps
+    return jnp.zeros((*system.contacts.is_closed.shape, 12), coupling.first.dtype)
 
 
 def _eliminated(
@@ -129,32 +155,40 @@ def _eliminated(
         rod: RodsInContact, is_closed: Array, closed_end: Array, contact_compliance: Array, shift: Array
     ) -> Eliminated:
         coupling, at_ends, m = rod.coupling, rod.at_ends, rod.f.shape[1]
-        assert coupling.of_gaps is not None
         system = closed_softly(rod.system, is_closed, contact_compliance)
         f, c = with_pressures(system, rod.contacts, rod.f, rod.c)
         factors = factor_chain(system.shifted(shift / m))
-        rates = jnp.where(is_closed[..., None], coupling.of_gaps, 0.0)
+        rates = jnp.where(is_closed[..., None], _of_gaps(system, coupling), 0.0)
         size = len(system.compliance)
+        of_gradient, second = coupling.of_gradient, coupling.second
         of_constraints = coupling.of_constraints.at[size : size + is_closed.size].add(-rates.reshape(-1, 12))
-        x, y = factors.solve_softly(f, c)
-        by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(coupling.of_gradient, of_constraints)
-        stiffness = coupling.second - jnp.einsum("bmi,bmj->ij", coupling.of_gradient, by_motions[0])
-        stiffness -= of_constraints.T @ by_motions[1]
         force = jnp.einsum("rni,rn->i", rates, rod.contacts.pressures) - rod.first
-        force -= jnp.einsum("bmi,bm->i", coupling.of_gradient, x) + of_constraints.T @ y
+        if rod.columns is not None:
+            of_gradient = jnp.concatenate([of_gradient, rod.columns.rotation], axis=2)
+            of_constraints = jnp.concatenate([of_constraints, rod.columns.rows], axis=1)
+            count = rod.columns.ends.shape[1]
+            force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
+            second = second.at[:12, 12:].set(rod.columns.ends).at[12:, :12].set(rod.columns.ends.T)
+        x, y = factors.solve_softly(f, c)
+        by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(of_gradient, of_constraints)
+        stiffness = second - jnp.einsum("bmi,bmj->ij", of_gradient, by_motions[0])
+        stiffness -= of_constraints.T @ by_motions[1]
+        force -= jnp.einsum("bmi,bm->i", of_gradient, x) + of_constraints.T @ y
         # Contacts of the bodies have no unknowns of the rod.
         rates = jnp.where(closed_end[..., None], at_ends.rates, 0.0)
         pressures = at_ends.pressures - at_ends.gaps / contact_compliance
         stiff = jnp.einsum("oei,oej->eij", rates, rates) / contact_compliance
         pushed = jnp.einsum("oei,oe->ei", rates, pressures)
-        stiffness += jax.scipy.linalg.block_diag(*stiff)
-        return Eliminated(
-            factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force + pushed.reshape(12)
-        )
+        stiffness = stiffness.at[:12, :12].add(jax.scipy.linalg.block_diag(*stiff))
+        force = force.at[:12].add(pushed.reshape(12))
+        return Eliminated(factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force)
 
     closed_rods, closed_ends = rods.split(is_closed)
     of_rods, _ = rods.split(contact_compliance)
-    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, of_rods[:, 0, 0], shift)
+    count = len(shift)
+    # Of a rod without obstacles there is none.
+    soft = of_rods[:, 0, 0] if of_rods.size else rods.system.contacts.contact_compliance
+    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, jnp.broadcast_to(soft, (count,)), shift)
 
 
 class BodyContacts(eqx.Module):
@@ -203,7 +237,8 @@ class ContactModel(eqx.Module):
     """The model of a step. `stiffness`, `force`: of the bodies and of the rods that touch nothing, along `motions`.
 
     `push`: by how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
-    negative; `may_reverse`: whether a minimum is sought.
+    negative; `may_reverse`: whether a minimum is sought; `between`: the contacts of rods with one another, `None`
+    without such.
     """
 
     groups: tuple[RodsInContact, ...]
@@ -214,6 +249,7 @@ class ContactModel(eqx.Module):
     pattern: Float[Array, "q"]
     least: float = eqx.field(static=True)
     may_reverse: bool = eqx.field(static=True)
+    between: Between | None = None
 
     is_symmetric = True
 
@@ -236,11 +272,12 @@ class ContactModel(eqx.Module):
         return jnp.concatenate(parts)
 
     def split(self, row: Array) -> list[Array]:
+        """Of the groups, then of contacts between rods."""
         found, first = [], 0
         for rods in self.groups:
             found.append(row[first : first + rods.size])
             first += rods.size
-        return found
+        return [*found, row[first:]]
 
     def _regularized(
         self, rods: RodsInContact, is_closed: Array, contact_compliance: Array, shift: Float[Array, "k"]
@@ -267,18 +304,27 @@ class ContactModel(eqx.Module):
     def solved(
         self, is_closed: Array, trial: Array, contact_compliance: Array, memory: Memory
     ) -> tuple[Array, Any, Memory]:
-        stiffness, force = self.stiffness + memory.reversal, self.force + memory.push
-        all_found, shifts, is_minimum = [], [], jnp.array(True)
-        for rods, closed, soft, last in zip(
-            self.groups, self.split(is_closed), self.split(contact_compliance), memory.shifts, strict=True
-        ):
-            found, shift = self._regularized(rods, closed, soft, last)
-            all_found.append(found)
-            shifts.append(shift)
-            is_minimum &= jnp.all(found.is_minimum)
-            at_bodies = self._at_ends(rods)
-            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, at_bodies, found.stiffness, at_bodies)
-            force += jnp.einsum("k,kiq,ki->q", rods.shares, at_bodies, found.force)
+        stiffness, force, touching = self.stiffness + memory.reversal, self.force + memory.push, None
+        *of_groups, of_pairs = self.split(is_closed)
+        *softness, soft_pairs = self.split(contact_compliance)
+        if self.between is None:
+            each = zip(self.groups, of_groups, softness, memory.shifts, strict=True)
+            all_found, shifts = zip(*(self._regularized(*given) for given in each), strict=True)
+        else:
+            closed = self._with_closed(of_pairs)
+            all_found, shifts, touching = self._together(
+                closed, of_groups, softness, (of_pairs, soft_pairs), memory.shifts
+            )
+        is_minimum = jnp.array(True) if touching is None else touching.is_minimum
+        for rods, found in zip(self.groups, all_found, strict=True):
+            if touching is None:
+                is_minimum &= jnp.all(found.is_minimum)
+            at_bodies, of_ends = self._at_ends(rods), found.stiffness[:, :12, :12]
+            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, at_bodies, of_ends, at_bodies)
+            force += jnp.einsum("k,kiq,ki->q", rods.shares, at_bodies, found.force[:, :12])
+        if touching is not None:
+            stiffness -= touching.by_bodies.T @ touching.inverse @ touching.by_bodies
+            force -= touching.by_bodies.T @ touching.inverse @ touching.force
         values, vectors = jnp.linalg.eigh((stiffness + stiffness.T) / 2)
         is_below = values < -self.least
         reversal, push = memory.reversal, memory.push
@@ -295,23 +341,107 @@ class ContactModel(eqx.Module):
             is_minimum &= ~jnp.any(is_below)
         q = vectors @ ((vectors.T @ force) / regularized)
         bodies, motions = self.bodies(q), []
+        between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):
             of_ends = rods.of_ends(bodies)
+            if between is not None:
+                of_ends = jnp.concatenate([of_ends, jnp.tile(between[None], (len(of_ends), 1))], axis=1)
             by_ends = (jnp.einsum("k...i,ki->k...", by, of_ends) for by in found.by_motions)
             motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_ends))))
         negative = tuple(found.negative for found in all_found)
+        if touching is not None:
+            # What contacts take from them counts with the first group.
+            negative = (negative[0].at[0].add(touching.excess), *negative[1:])
         below = jnp.where(jnp.any(is_below), jnp.sum(is_below), memory.below)
         return is_minimum, (tuple(motions), q), Memory(tuple(shifts), negative, reversal, below, push)
 
     def _at_ends(self, rods: RodsInContact) -> Float[Array, "k 12 q"]:
         """The motions of the ends of rods by q."""
-        padded = jnp.pad(self.motions, ((0, 6), (0, 0))).reshape(-1, 6, self.motions.shape[1])
-        return padded[rods.body].reshape(len(rods.body), 12, -1)
+        rows, columns = self.motions.shape
+        padded = jnp.pad(self.motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, columns)
+        return padded[rods.body].reshape(len(rods.body), 12, columns)
+
+    def _with_closed(self, is_closed: Bool[Array, "c"]) -> list[RodsInContact]:
+        """The rods with the columns of closed contacts between them."""
+        found = []
+        for rods in self.groups:
+            columns = None if rods.columns is None else jax.vmap(lambda columns: columns.where(is_closed))(rods.columns)
+            found.append(dataclasses.replace(rods, columns=columns))
+        return found
+
+    def _together(
+        self,
+        groups: list[RodsInContact],
+        is_closed: list[Array],
+        contact_compliance: list[Array],
+        pairs: tuple[Array, Array],
+        shifts: tuple[Float[Array, "k"], ...],
+    ) -> tuple[list[Eliminated], tuple[Float[Array, "k"], ...], "_Touching"]:
+        """Stiffer until all rods and their contacts have a minimum between held bodies. `pairs`: which contacts between
+        rods are closed, and their compliance.
+        """
+
+        def of_all(shifts: tuple[Array, ...]) -> tuple[list[Eliminated], _Touching]:
+            found = [_eliminated(*given) for given in zip(groups, is_closed, contact_compliance, shifts, strict=True)]
+            return found, self._touching(found, *pairs)
+
+        if not self.may_reverse:
+            found, touching = of_all(shifts)
+            return found, shifts, touching
+
+        def again(trial: tuple[Any, Array, list[Eliminated], _Touching]):
+            shifts, tries, found, _ = trial
+            is_first, alone = tries == 0, [each.is_minimum for each in found]
+            # Where each rod alone has a minimum, the curvature of contacts takes it away.
+            none = functools.reduce(jnp.logical_and, [jnp.all(each) for each in alone])
+            stiffer = tuple(
+                jnp.where(~is_first & (~each | none), jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT), shift)
+                for shift, each in zip(shifts, alone, strict=True)
+            )
+            return stiffer, tries + 1, *of_all(stiffer)
+
+        blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), jax.eval_shape(of_all, shifts))
+        shifts, _, found, touching = jax.lax.while_loop(
+            lambda trial: (trial[1] == 0) | (~trial[3].is_minimum & (trial[1] < MAX_FACTORS)),
+            again,
+            (shifts, jnp.zeros((), int), *blank),
+        )
+        return found, shifts, touching
+
+    def _touching(self, all_found: list[Eliminated], is_closed: Array, contact_compliance: Array) -> "_Touching":
+        between = self.between
+        assert between is not None
+        compliances = between.compliances(is_closed, contact_compliance)
+        matrix, by_bodies, negative = -jnp.diag(compliances), 0.0, jnp.zeros((), int)
+        given = jnp.where(is_closed, contact_compliance * between.pressures - between.gaps, 0.0)
+        force = jnp.pad(given, (0, 4 * len(given)))
+        for rods, found in zip(self.groups, all_found, strict=True):
+            negative += jnp.sum(found.negative)
+            if rods.columns is None:
+                continue
+            matrix += jnp.einsum("k,kzy->zy", rods.shares, found.stiffness[:, 12:, 12:])
+            by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.stiffness[:, 12:, :12], self._at_ends(rods))
+            force += jnp.einsum("k,kz->z", rods.shares, found.force[:, 12:])
+        excess = jnp.sum(jnp.linalg.eigvalsh(matrix) < 0) - between.positive
+        is_minimum = (negative + excess == 0) & jnp.isfinite(jnp.sum(matrix))
+        return _Touching(is_minimum, excess, jnp.linalg.inv(matrix), jnp.asarray(by_bodies), force)
 
     def opening(self, motion: Any) -> Array:
         of_rods, q = motion
         bodies = self.bodies(q)
-        return self.rows([rods.opening(each, bodies) for rods, each in zip(self.groups, of_rods, strict=True)])
+        rows = [rods.opening(each, bodies) for rods, each in zip(self.groups, of_rods, strict=True)]
+        if self.between is not None:
+            rows.append(self.rates(motion)[: len(self.between.gaps)])
+        return self.rows(rows)
+
+    def rates(self, motion: Any) -> Float[Array, "5c"]:
+        """Of the gaps between rods, and along the vectors of their curvature."""
+        of_rods, q = motion
+        total = 0.0
+        for rods, (x, y) in zip(self.groups, of_rods, strict=True):
+            if rods.columns is not None:
+                total += rods.shares @ rods.columns.rates(x, y, rods.of_ends(self.bodies(q)))
+        return jnp.asarray(total)
 
     def along(self, motion: Any, change: Any, memory: Memory) -> tuple[Float[Array, ""], Float[Array, ""]]:
         stiffness = self.stiffness + memory.reversal
@@ -324,7 +454,25 @@ class ContactModel(eqx.Module):
             )
             slope += jnp.sum(rods.shares * slopes)
             curvature += jnp.sum(rods.shares * curvatures)
+        if self.between is not None:
+            count, signs = len(self.between.gaps), self.between.signs.astype(slope.dtype)
+            here, ahead = self.rates(motion)[count:], self.rates(change)[count:]
+            slope += jnp.sum(signs * here * ahead)
+            curvature += jnp.sum(signs * ahead**2)
         return slope, curvature
+
+
+class _Touching(NamedTuple):
+    """Contacts between rods with these eliminated: whether all have a minimum between held bodies, by how many more
+    eigenvalues than compliances are negative, the inverse of what is left, that by the motions of the bodies, and the
+    right side.
+    """
+
+    is_minimum: Bool[Array, ""]
+    excess: Int[Array, ""]
+    inverse: Float[Array, "z z"]
+    by_bodies: Float[Array, "z q"]
+    force: Float[Array, "z"]
 
 
 def _along_rod(
@@ -356,7 +504,8 @@ def _along_rod(
 
 class ContactStep(NamedTuple):
     """The step that a search found: of each group rotations, multipliers, the pressures at the ends, shifts, and
-    negative eigenvalues; motions of the bodies; whether the contacts were found and the rods have a minimum.
+    negative eigenvalues; motions of the bodies; whether the contacts were found and the rods have a minimum; `between`:
+    of contacts between rods, `None` without such.
     """
 
     motions: tuple[tuple[Array, Array], ...]
@@ -366,29 +515,32 @@ class ContactStep(NamedTuple):
     bodies: Float[Array, "q"]
     below: Int[Array, ""]
     is_found: Bool[Array, ""]
+    between: BetweenStep | None
 
 
 def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> ContactStep:
     """The minimum of a model."""
-    groups = model.groups
-    contacts = BodyContacts(
-        *(
-            model.rows(list(row))
-            for row in (
-                [rods.row(rods.contacts.gaps, rods.at_ends.gaps) for rods in groups],
-                [rods.row(rods.contacts.pressures, rods.at_ends.pressures) for rods in groups],
-                [rods.weights for rods in groups],
-            )
-        )
-    )
-    is_closed = model.rows([rods.row(rods.system.contacts.is_closed, rods.at_ends.is_closed) for rods in groups])
-    contact_compliance = model.rows([rods.contact_compliance for rods in groups])
+    groups, between = model.groups, model.between
+    rows = [
+        [rods.row(rods.contacts.gaps, rods.at_ends.gaps) for rods in groups],
+        [rods.row(rods.contacts.pressures, rods.at_ends.pressures) for rods in groups],
+        [rods.weights for rods in groups],
+        [rods.row(rods.system.contacts.is_closed, rods.at_ends.is_closed) for rods in groups],
+        [rods.contact_compliance for rods in groups],
+    ]
+    if between is not None:
+        of_pairs = between.gaps, between.pressures, jnp.ones_like(between.gaps), between.is_closed
+        for row, part in zip(rows, (*of_pairs, between.contact_compliance), strict=True):
+            row.append(part)
+    *of_contacts, is_closed, contact_compliance = map(model.rows, rows)
+    contacts = BodyContacts(*of_contacts)
     end = sought(model, contacts, is_closed, contact_compliance, model.nowhere(), model.begin(shifts, damping))
     of_rods, q = end.motion
     change = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
     change -= contacts.pressures
     motions, at_ends = [], []
-    for rods, (x, y), row in zip(groups, of_rods, model.split(change), strict=True):
+    *changes, of_pairs = model.split(change)
+    for rods, (x, y), row in zip(groups, of_rods, changes, strict=True):
         in_rods, in_ends = rods.split(row)
         size = rods.system.compliance.shape[-1]
         y = y.at[:, size : size + in_rods[0].size].set(in_rods.reshape(len(y), -1))
@@ -403,4 +555,5 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         q,
         end.memory.below,
         end.is_minimum & end.is_done,
+        None if between is None else between.step(of_pairs, model.rates(end.motion)[: len(of_pairs)]),
     )

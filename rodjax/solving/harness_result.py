@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
 from rodjax.solving.result import Described, Equilibrium, describe
+from rodjax.solving.rod_contact_results import RodContacts, rod_contacts
 from rodjax.solving.status import Status
 
 
@@ -40,6 +41,9 @@ class HarnessEquilibrium(Described):
     - `iterations`, `evaluations` [...] of the solver; `residual` [...] largest component of the gradient, in EI/L^2 of
       each rod, of a body in that of its stiffest rod
     - `end_pressures` [..., c] N: of the contacts of bodies, of each stack of `groups` by rod, obstacle and end
+    - `rod_contacts`: of rods that may touch, by both names in the order of the harness, the `RodContacts` of elements
+      of the first one with the second one. Computed when asked for
+    - `rod_pressures` [..., c] N: of contacts between rods, by the stacks of both, pair and element of the first one
     """
 
     # In the place of an equilibrium.
@@ -58,6 +62,7 @@ class HarnessEquilibrium(Described):
     residual: Float[Array, "..."]
     contact_forces: Float[Array, "... j 3"]
     end_pressures: Float[Array, "... c"]
+    rod_pressures: Float[Array, "... c"]
     harness: Harness
     members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
@@ -71,6 +76,12 @@ class HarnessEquilibrium(Described):
             name: BodyPose(self.positions[..., j, :], self.frames[..., j, :, :], self.contact_forces[..., j, :])
             for j, name in enumerate(self.harness.joint_names)
         }
+
+    @property
+    def rod_contacts(self) -> dict[tuple[str, str], RodContacts]:
+        if not self.harness.contact:
+            return {}
+        return rod_contacts(self.harness, self.groups, self.rod_pressures, members=self.members)
 
     @property
     def segments(self) -> list[int]:
@@ -120,7 +131,27 @@ class HarnessEquilibrium(Described):
             lines[0] += f"; a saddle: {int(self.index)} motions lower the energy"
         if bool(self.converged) and not self.harness.has_potential:
             lines[0] += "; under a dead moment without a potential, so that no energy tells whether it is stable"
-        return "\n".join(lines + [f"{name}: {describe(rod)}" for name, rod in self.items()])
+        return "\n".join(lines + self._contacts_told() + [f"{name}: {describe(rod)}" for name, rod in self.items()])
+
+    def _contacts_told(self) -> list[str]:
+        """Of one equilibrium, which rods touch one another, with which force and where."""
+        if not bool(self.converged) or not self.harness.contact:
+            return []
+        told = []
+        for (first, second), found in self.rod_contacts.items():
+            found = jax.tree.map(np.asarray, found)
+            touching = np.linalg.norm(found.forces, axis=-1) > 0
+            if np.any(touching):
+                s, other_s = found.s[touching], found.other_s[touching]
+                where = f"{_range(first, s)} and {_range(second, other_s)}"
+                force = np.linalg.norm(found.forces.sum(0))
+                told.append(f"{first} and {second} touch, {where}, and push one another with {force:.4g} N")
+        return told if told else ["no rods touch one another"]
+
+
+def _range(name: str, s: np.ndarray) -> str:
+    where = f"{s[0]:.4g} m" if len(s) == 1 else f"{s.min():.4g} to {s.max():.4g} m"
+    return f"{name} at s = {where}"
 
 
 def _taken(stacked: Equilibrium, place: int, axis: int) -> Equilibrium:

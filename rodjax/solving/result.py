@@ -40,6 +40,7 @@ from rodjax.discretization.motion import neutral_axis
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.node_contacts import SLIPS, STICKS, exerted_by_itself, exerted_by_obstacles, shares
+from rodjax.discretization.potentials import at_both
 from rodjax.discretization.shape import Shape
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
@@ -174,8 +175,8 @@ class Equilibrium(eqx.Module):
       position, zero where it holds no direction, without a torque where it holds no twist; the moments are computed
       when they are asked for. Of rods whose frames are unknown curvature, twist, axial and shear strain are those just
       beyond a node where they jump, at a clip, a load or another section, and tension the mean of both sides
-    - `contact_forces` [..., n+1, 3] N: what obstacles, and the rod itself, apply to the rod at each node, and its part
-      of what they apply in each element beside it; `obstacle_forces` [..., obstacles,
+    - `contact_forces` [..., n+1, 3] N: what obstacles, other rods of a harness and the rod itself apply to the rod at
+      each node, and its part of what they apply in each element beside it; `obstacle_forces` [..., obstacles,
       n+1, 3] N: what each of them does, friction included; `friction_forces` [..., obstacles, n+1, 3] N: the tangential
       part of that, at most `friction` times the rest; `contact_states` [..., obstacles, n+1] int: 0 where a node does
       not touch an obstacle, 1 where it sticks, 2 where it has slipped since the last equilibrium, or is without
@@ -267,7 +268,7 @@ class Equilibrium(eqx.Module):
 
     @property
     def contact_forces(self) -> Float[Array, "... n+1 3"]:
-        if not has_contacts(self.scene):
+        if not has_contacts(self.scene) and self.scene.contact_loads is None:
             return jnp.zeros_like(self.nodes)
         return _node_forces(self)[1]
 
@@ -528,7 +529,10 @@ def _node_forces(equilibrium: Equilibrium) -> tuple[Float[Array, "clips 3"], Flo
     """What clips and what obstacles apply to the rod, of a scene whose nodes have positions of their own."""
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
-    forces = form.applied(point).T * equilibrium.state.units.force
+    forces = form.applied(point)
+    if form.scene.contact_loads is not None:
+        forces += at_both(form.scene.contact_loads.on_positions)
+    forces = forces.T * equilibrium.state.units.force
     clips = jnp.zeros(0, int) if form.field.clip_nodes is None else form.field.clip_nodes
     within = shares(form, point) * equilibrium.state.units.force
     return (forces - within)[clips], jnp.where(form.is_held[:, None], within, forces)

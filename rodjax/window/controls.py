@@ -275,7 +275,7 @@ def scene_of(scene: Scene | Harness, controls: Controls) -> Any:
             support = _support_moved(supports[key], controls.poses[key])
             body = eqx.tree_at(lambda body: body.support, body, support)
         joints[name] = body
-    return Harness(dict(zip(scene, rods, strict=True)), joints)
+    return Harness(dict(zip(scene, rods, strict=True)), joints, scene.contact_names)
 
 
 def _of_rod(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:

@@ -1,0 +1,296 @@
+"""Contact between the rods of a harness: pairs of rods, stacked by the groups to which both belong.
+
+Lengths are those of the assembly and forces its energy by its length. The pressure of each contact is a number that all
+have in common; what the pressures apply to a rod are loads of its scene (`model.loads.ContactLoads`), so that a rod by
+itself, its balance and its results, know nothing of others. What couples two rods in the model of a step are columns of
+their systems (`columns_of`): gradients of gaps and vectors of their curvature, five for each contact.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.discretization.contact_gaps import FAR_COMPLIANCE, curve
+from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
+from rodjax.discretization.rod_pairs import (
+    found_between,
+    gaps_between,
+    joined,
+    loads_between,
+    pair_contacts,
+)
+from rodjax.discretization.self_contact import Curve, Nearest, comes_through
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.far_rows import SIGNS
+from rodjax.model.loads import ContactLoads
+from rodjax.solving.coupling import Coupling
+
+# The numbers of the rods of each group.
+Members = tuple[tuple[int, ...], ...]
+# Of all contacts between rods of two groups, at most so many are sought in the model of a step.
+MOST_BETWEEN = 32
+
+
+class Pairs(NamedTuple):
+    """Rods that may touch, of two groups: the numbers of these, and the place of both rods of each pair in them."""
+
+    groups: tuple[int, int]
+    places: tuple[tuple[int, int], ...]
+
+    @property
+    def first(self) -> np.ndarray:
+        return np.array([place for place, _ in self.places])
+
+    @property
+    def second(self) -> np.ndarray:
+        return np.array([place for _, place in self.places])
+
+
+def pairs_of(contact: tuple[tuple[int, int], ...], members: Members) -> tuple[Pairs, ...]:
+    """Of pairs of numbers of rods."""
+    where = {number: (group, place) for group, numbers in enumerate(members) for place, number in enumerate(numbers)}
+    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for pair in contact:
+        (first, place), (second, other) = (where[number] for number in pair)
+        found.setdefault((first, second), []).append((place, other))
+    return tuple(Pairs(groups, tuple(places)) for groups, places in found.items())
+
+
+def in_contact(pairs: tuple[Pairs, ...]) -> list[int]:
+    """The numbers of the groups of which a rod may touch another one."""
+    return sorted({group for between in pairs for group in between.groups})
+
+
+class Contacts(NamedTuple):
+    """Of p pairs of rods: their curves, where these are nearest, gaps and pressures of the n elements of the first
+    ones, and what is added to the gaps in a step.
+    """
+
+    curves: Curve
+    found: Nearest
+    gaps: Float[Array, "p n"]
+    pressures: Float[Array, "p n"]
+    relaxed: Float[Array, "p n"]
+
+    @property
+    def residual(self) -> Float[Array, ""]:
+        """Of a gap and a pressure one is zero, none is negative."""
+        weighted = GAP_WEIGHT * self.gaps
+        return jnp.max(jnp.abs(jnp.where(self.pressures < weighted, self.pressures, weighted)))
+
+
+class Between(NamedTuple):
+    """The contacts of a model, c of all pairs: gaps, pressures, whether they count as closed at first; and where each
+    stands in the row of the pressures of its pairs.
+    """
+
+    gaps: Float[Array, "c"]
+    pressures: Float[Array, "c"]
+    is_closed: Bool[Array, "c"]
+    places: tuple[Int[Array, "c"], ...]
+
+    @property
+    def contact_compliance(self) -> Float[Array, "c"]:
+        return jnp.full_like(self.gaps, FAR_COMPLIANCE)
+
+    def step(self, change: Float[Array, "c"], rates: Float[Array, "c"]) -> "BetweenStep":
+        """That changes the pressures, and the gaps at these rates."""
+        pushing = self.pressures - self.gaps / FAR_COMPLIANCE
+        return BetweenStep(change, self.places, -jnp.sum(jnp.where(pushing > 0, pushing, 0.0) * rates))
+
+    @property
+    def signs(self) -> np.ndarray:
+        """Compliances of the columns of curvature."""
+        return np.repeat(SIGNS, len(self.gaps))
+
+    def compliances(self, is_closed: Bool[Array, "c"], contact_compliance: Float[Array, "c"]) -> Float[Array, "5c"]:
+        """Of all columns; an open contact is a number by itself."""
+        return jnp.concatenate([jnp.where(is_closed, contact_compliance, 1.0), self.signs.astype(self.gaps.dtype)])
+
+    @property
+    def positive(self) -> int:
+        """How many of them are positive."""
+        return len(self.gaps) + int(np.sum(self.signs > 0))
+
+
+class BetweenStep(NamedTuple):
+    """Of the contacts of a model: the change of their pressures, where they stand, and the rate of their energy."""
+
+    change: Float[Array, "c"]
+    places: tuple[Int[Array, "c"], ...]
+    slope: Float[Array, ""]
+
+    def changed(self, like: tuple[Float[Array, "p n"], ...]) -> list[Float[Array, "p n"]]:
+        """The changes of the pressures of all pairs."""
+        found, first = [], 0
+        for pressures, places in zip(like, self.places, strict=True):
+            change = self.change[first : first + len(places)]
+            first += len(places)
+            found.append(jnp.zeros(pressures.size, change.dtype).at[places].set(change).reshape(pressures.shape))
+        return found
+
+
+class Columns(NamedTuple):
+    """Of rods of one group what their gaps and the vectors of curvature are by the unknowns of their systems, and by
+    the motions of their ends, in the units of each system: [gaps, then the four vectors of all contacts].
+    """
+
+    rotation: Float[Array, "k b m 5c"]
+    rows: Float[Array, "k j 5c"]
+    ends: Float[Array, "k 12 5c"]
+
+    def gaps(self, count: int) -> "Columns":
+        return Columns(*(part[..., :count] for part in self))
+
+    def where(self, is_closed: Bool[Array, "c"]) -> "Columns":
+        """Without those of open contacts."""
+        kept = jnp.concatenate([is_closed, jnp.ones(4 * len(is_closed), bool)])
+        return Columns(*(jnp.where(kept, part, 0.0) for part in self))
+
+    def rates(
+        self, x: Float[Array, "k b m"], y: Float[Array, "k j"], of_ends: Float[Array, "k 12"]
+    ) -> Float[Array, "k 5c"]:
+        return (
+            jnp.einsum("kbmz,kbm->kz", self.rotation, x)
+            + jnp.einsum("kjz,kj->kz", self.rows, y)
+            + jnp.einsum("kiz,ki->kz", self.ends, of_ends)
+        )
+
+
+def curves_of(forms: NodalForm, points: Any, units: Any, length: Float[Array, ""], origin: Float[Array, "3"]) -> Curve:
+    """Of stacked rods, with ends that bodies may move."""
+
+    def of_rod(form: NodalForm, point: Any, units: Any) -> Curve:
+        found = curve(dataclasses.replace(form, ends_move=True), form.holding(point))
+        ratio, b = units.length / length, found.axes.shape[1]
+        return Curve(
+            ratio * found.s,
+            (units.origin - origin)[None] / length + ratio * found.positions,
+            found.tangents,
+            jnp.pad(found.axes, ((0, 0), (0, 3 - b), (0, 0))),
+            jnp.ones_like(found.free),
+            ratio * found.radius,
+        )
+
+    return jax.vmap(of_rod)(forms, points, units)
+
+
+def joined_curves(pairs: Pairs, curves: dict[int, Curve]) -> Curve:
+    first, second = (
+        jax.tree.map(lambda leaf, places=places: leaf[places], curves[group])
+        for group, places in zip(pairs.groups, (pairs.first, pairs.second), strict=True)
+    )
+    return jax.vmap(joined)(first, second)
+
+
+def contacts_between(pairs: Pairs, curves: dict[int, Curve], pressures: Float[Array, "p n"]) -> Contacts:
+    both, elements = joined_curves(pairs, curves), pressures.shape[1]
+
+    def of_pair(curve: Curve) -> tuple[Nearest, Array]:
+        found = found_between(curve, elements)
+        return found, gaps_between(curve, found)
+
+    found, gaps = jax.vmap(of_pair)(both)
+    return Contacts(both, found, gaps, pressures, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
+
+
+def contact_energy(pairs: Pairs, curves: dict[int, Curve], here: Contacts) -> Float[Array, ""]:
+    """As of `NodalForm.contact_energy`, where a step leads that begins here."""
+    there = contacts_between(pairs, curves, here.pressures)
+    pressures = here.pressures - (there.gaps + here.relaxed) / FAR_COMPLIANCE
+    return FAR_COMPLIANCE / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+
+
+def passes(pairs: Pairs, before: Contacts, curves: dict[int, Curve]) -> Bool[Array, ""]:
+    """Whether a step leads no rod through another one."""
+    return ~jnp.any(jax.vmap(comes_through)(before.curves, joined_curves(pairs, curves)))
+
+
+def loads_of(
+    all_pairs: tuple[Pairs, ...], all_contacts: tuple[Contacts, ...], group: int, like: ContactLoads
+) -> ContactLoads:
+    """What contacts apply to the rods of a group."""
+    on_positions, on_tangents = jnp.zeros_like(like.on_positions), jnp.zeros_like(like.on_tangents)
+    for pairs, contacts in zip(all_pairs, all_contacts, strict=True):
+        if group not in pairs.groups:
+            continue
+        both = jax.vmap(loads_between)(contacts.curves, contacts.found, contacts.pressures)
+        for of_rods, places, side in zip(both, (pairs.first, pairs.second), pairs.groups, strict=True):
+            if side == group:
+                on_positions, on_tangents = (
+                    on_positions.at[places].add(of_rods[0]),
+                    on_tangents.at[places].add(of_rods[1]),
+                )
+    return ContactLoads(on_positions, on_tangents)
+
+
+class _Chosen(NamedTuple):
+    """Of the contacts of a model between two groups: the pair to which each belongs, and its vectors and nodes."""
+
+    pair: Int[Array, "c"]
+    vectors: Float[Array, "5 6 4 c"]
+    nodes: Int[Array, "4 c"]
+
+
+def between(all_contacts: tuple[Contacts, ...]) -> tuple[Between, tuple[_Chosen, ...]]:
+    """Of all pairs those contacts that are nearest to touching."""
+    parts, all_chosen = [], []
+    for contacts in all_contacts:
+        found = jax.vmap(pair_contacts)(contacts.curves, contacts.found, contacts.pressures)
+        count, (_, elements) = found.chosen.shape[1], contacts.gaps.shape
+        at = (jnp.arange(len(found.chosen))[:, None] * elements + found.chosen).reshape(-1)
+        gaps, pressures = (contacts.gaps + contacts.relaxed).reshape(-1)[at], contacts.pressures.reshape(-1)[at]
+        pick = jnp.argsort(jnp.where(pressures > 0, -1.0, gaps))[: min(len(at), MOST_BETWEEN)]
+        vectors = jnp.moveaxis(found.vectors, 0, 3).reshape(5, 6, 4, -1)[..., pick]
+        nodes = jnp.moveaxis(found.nodes, 0, 1).reshape(4, -1)[:, pick]
+        all_chosen.append(_Chosen(pick // count, vectors, nodes))
+        parts.append((gaps[pick], pressures[pick], at[pick]))
+    gaps, pressures = (jnp.concatenate([part[k] for part in parts]) for k in (0, 1))
+    is_closed = (pressures > GAP_WEIGHT * gaps) | (gaps < LIES_ON)
+    return Between(gaps, pressures, is_closed, tuple(part[2] for part in parts)), tuple(all_chosen)
+
+
+def columns_of(
+    group: int,
+    all_pairs: tuple[Pairs, ...],
+    all_chosen: tuple[_Chosen, ...],
+    system: ChainSystem,
+    coupling: Coupling,
+    free: Float[Array, "k m"],
+    scales: tuple[Float[Array, "k"], Float[Array, "k"]],
+) -> Columns:
+    """Of the rods of a group. `free`: 0 where clamps hold rotations, else 1; `scales`: the unit of length and that of
+    energy of each rod, in those of the assembly.
+    """
+    lengths, shares = scales
+    (k, b), nodes = system.diagonal.shape[:2], system.held.shape[1]
+    count = sum(chosen.nodes.shape[1] for chosen in all_chosen)
+    by_node, first = jnp.zeros((k, 5, count, 6, nodes), lengths.dtype), 0
+    for pairs, chosen in zip(all_pairs, all_chosen, strict=True):
+        numbers = first + np.arange(chosen.nodes.shape[1])
+        first += len(numbers)
+        for side, places, of_side in zip(
+            pairs.groups, (pairs.first, pairs.second), (slice(0, 2), slice(2, 4)), strict=True
+        ):
+            if side == group:
+                rods, at = jnp.asarray(places)[chosen.pair], chosen.nodes[of_side]
+                vectors = chosen.vectors[:, :, of_side].transpose(2, 3, 0, 1)
+                by_node = by_node.at[rods[None], :, numbers[None], :, at].add(vectors)
+    by_node = by_node.reshape(k, 5 * count, 6, nodes) / shares[:, None, None, None]
+    by_rotation = by_node[:, :, :b]
+    by_position = lengths[:, None, None, None] * by_node[:, :, 3:]
+    at_ends = jnp.concatenate([by_rotation, by_position], axis=2)[..., np.array([0, -1])]
+    assert coupling.of_nodes is not None
+    ends = jnp.einsum("kzie,keij->kejz", at_ends, coupling.of_nodes).reshape(k, 12, -1)
+    rotation = jnp.zeros((k, b, 2 * nodes - 1, 5 * count), by_node.dtype)
+    rotation = rotation.at[:, :, ::2].set(by_rotation.transpose(0, 2, 3, 1) * free[:, None, ::2, None])
+    moving = jnp.where(system.held[:, None, :, None], 0.0, by_position.transpose(0, 1, 3, 2))
+    # Among the multipliers of the system: border, contacts with obstacles, nodes, elements.
+    before = system.compliance.shape[1] + system.contacts.is_closed[0].size
+    moving = jnp.swapaxes(moving.reshape(k, 5 * count, -1), 1, 2)
+    return Columns(rotation, jnp.pad(moving, ((0, 0), (before, 3 * (nodes - 1)), (0, 0))), ends)

@@ -1,0 +1,220 @@
+"""Rods of a harness that touch one another: against one rod under a point force, balance, and differences."""
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import rodjax
+from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene
+
+RADIUS, LENGTH, YOUNGS_MODULUS = 0.01, 1.0, 1e7
+TIGHT = Newton(tolerance=1e-11)
+ALONG, ACROSS = rodjax.frame((1, 0, 0), d2=(0, 0, 1)), rodjax.frame((0, 1, 0), d2=(0, 0, 1))
+EI = YOUNGS_MODULUS * np.pi * RADIUS**4 / 4
+
+
+def rod(youngs_modulus=YOUNGS_MODULUS, length=LENGTH) -> Rod:
+    return Rod.circular(length, RADIUS, youngs_modulus, poisson_ratio=0.5)
+
+
+def beam(axis, frame, height, rod) -> Scene:
+    half = 0.5 * LENGTH * np.asarray(axis, float)
+    up = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(height, float)])
+    return Scene(rod, Clamp(up - half, frame), Clamp(up + half, frame))
+
+
+def crossing(pressed, youngs_modulus=YOUNGS_MODULUS, contact=True) -> Harness:
+    """Two beams between clamps, at right angles in their middles, one on the other, each pressed by half of this."""
+    cables = {
+        "upper": beam((1, 0, 0), ALONG, RADIUS - pressed / 2, rod(youngs_modulus)),
+        "lower": beam((0, 1, 0), ACROSS, pressed / 2 - RADIUS, rod()),
+    }
+    return Harness(cables, contact=contact)
+
+
+def force_alone(deflection: float, segments: int) -> float:
+    """That deflects one beam so far in its middle."""
+
+    def missing(force: float) -> float:
+        scene = beam((1, 0, 0), ALONG, 0.0, rod())
+        scene = Scene(scene.rod, scene.start, scene.end, point_forces=[PointForce(LENGTH / 2, (0, 0, -force))])
+        alone = rodjax.solve(scene, segments=segments, solver=TIGHT)
+        return -float(alone.nodes[segments // 2, 2]) - deflection
+
+    return float(brentq(missing, 1e-6, 1.0, xtol=1e-13))
+
+
+def solved(pressed, *given, guess=None) -> rodjax.HarnessEquilibrium:
+    return rodjax.solve(crossing(pressed, *given), segments=8, solver=TIGHT, guess=guess)
+
+
+@pytest.fixture(scope="module")
+def pressed() -> rodjax.HarnessEquilibrium:
+    return solved(0.016)
+
+
+def test_crossing_beams_press_one_another_as_a_point_force_presses_one(pressed):
+    """Each is deflected by half of what both are pressed by: 0.8 of its radius, where it is a seventh stiffer than at
+    first, as it is stretched.
+    """
+    assert pressed.converged
+    assert pressed.stable
+    upper, lower = (pressed[name].contact_forces.sum(0) for name in ("upper", "lower"))
+    expected = force_alone(0.008, 8)
+    assert expected > 1.1 * 192 * EI * 0.008 / LENGTH**3
+    # The gap is seen smaller by at most 3e-6 of the radius: 4e-6 of the deflection.
+    np.testing.assert_allclose(float(upper[2]), expected, rtol=1e-5)
+    np.testing.assert_allclose(expected, force_alone(0.008, 32), rtol=1e-3)  # the mesh, of fourth order
+    np.testing.assert_allclose(upper, -lower, atol=1e-12)
+    for name, force in (("upper", upper), ("lower", lower)):
+        np.testing.assert_allclose(pressed[name].start_force - pressed[name].end_force, force, atol=1e-9 * expected)
+    # Without friction, but for the direction in which a contact point is drawn, 3e-6 pi radii by an element's length.
+    assert np.linalg.norm(upper[:2]) < 1e-5 * expected
+
+
+def test_contacts_are_told(pressed):
+    (names, found), *others = pressed.rod_contacts.items()
+    assert names == ("upper", "lower")
+    assert not others
+    touching = np.flatnonzero(np.linalg.norm(found.forces, axis=1) > 0)
+    assert len(touching) == 1
+    np.testing.assert_allclose(found.forces.sum(0), pressed["upper"].contact_forces.sum(0), atol=1e-12)
+    # Where the residual is 1e-11, gaps are zero to 1e-15; elsewhere there is no penetration.
+    np.testing.assert_allclose(float(found.gaps[touching[0]]), 0.0, atol=1e-13)
+    assert np.min(found.gaps) > -1e-13
+    middles = float(found.s[touching[0]]), float(found.other_s[touching[0]])
+    np.testing.assert_allclose(middles, LENGTH / 2, atol=1e-5)
+    places = [pressed[name].position_at(jnp.array([s]))[0] for name, s in zip(names, middles, strict=True)]
+    np.testing.assert_allclose(np.linalg.norm(places[0] - places[1]), 2 * RADIUS, rtol=1e-5)
+    assert "upper and lower touch, upper at s = 0.5 m and lower at s = 0.5 m, and push one another with " in str(
+        rodjax.describe(pressed)
+    )
+
+
+def test_small_deflections_have_the_force_of_the_closed_form():
+    """192 EI w/L^3 of a beam between clamps; stretch adds some 0.55 (w/2 radius)^2 of it, and the mesh nothing."""
+    deflection = 0.01 * RADIUS
+    found = solved(2 * deflection)
+    force = float(found["upper"].contact_forces[:, 2].sum())
+    np.testing.assert_allclose(force, 192 * EI * deflection / LENGTH**3, rtol=1e-3)
+
+
+def test_beams_that_do_not_reach_one_another_do_not_touch():
+    apart = solved(-0.001)
+    assert apart.converged
+    assert jnp.all(apart.rod_pressures == 0)
+    assert float(apart.rod_contacts["upper", "lower"].gaps.min()) == pytest.approx(0.001, rel=1e-4)
+    assert "no rods touch one another" in rodjax.describe(apart)
+
+
+def test_derivatives_are_those_of_differences(pressed):
+    """By the stiffness of one, and by how far both are pressed."""
+
+    def numbers(modulus, down, guess=None):
+        found = solved(down, modulus, guess=guess)
+        forces = found["upper"].end_force[2], found.rod_pressures.sum(), found["lower"].start_moment[0]
+        return jnp.stack([*forces, found["lower"].nodes[3, 2], found.energy])
+
+    given = jnp.array(YOUNGS_MODULUS), jnp.array(0.016)
+    derivatives = jax.jacrev(numbers, argnums=(0, 1))(*given)
+    for k, step in enumerate((3e4, 1e-6)):
+        ahead, behind = ([x + sign * step * (j == k) for j, x in enumerate(given)] for sign in (1, -1))
+        difference = (numbers(*ahead, pressed) - numbers(*behind, pressed)) / (2 * step)
+        # Steps of 3e-3 and 6e-5 of the numbers: second-order errors of some 1e-6 and 1e-9.
+        np.testing.assert_allclose(derivatives[k], difference, rtol=1e-6 if k else 1e-5, atol=1e-12)
+
+
+def test_no_beam_is_led_through_the_other():
+    """Ends that are led past one another: in steps of a quarter of the radius the upper one stays the upper one."""
+    path = rodjax.solve_path([crossing(down) for down in np.linspace(0.0, 6 * RADIUS, 13)], segments=8)
+    assert jnp.all(path.converged)
+    assert jnp.all(path["upper"].nodes[:, 4, 2] - path["lower"].nodes[:, 4, 2] > 1.99 * RADIUS)
+    assert jnp.all(jnp.diff(path.rod_pressures.sum(1)) > 0)
+
+
+def test_what_touches_comes_back_from_a_file_to_the_last_bit(pressed, tmp_path):
+    rodjax.save(pressed, tmp_path / "harness.vtkhdf")
+    with h5py.File(tmp_path / "harness.vtkhdf", "r") as file:
+        assert file["rodjax"].attrs["format"] == 17
+        for place in (
+            "rod_pressures",
+            *(f"cables/1/scene/contact_loads/on_{name}" for name in ("positions", "tangents")),
+        ):
+            attributes = file[f"rodjax/{place}"].attrs
+            assert attributes["units"]
+            assert attributes["description"]
+    loaded = rodjax.load(tmp_path / "harness.vtkhdf")
+    assert loaded.harness.contact == pressed.harness.contact
+    for one, other in zip(jax.tree.leaves(loaded), jax.tree.leaves(pressed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    again = rodjax.solve(loaded.harness, segments=8, solver=TIGHT, guess=loaded)
+    assert again.iterations == 0
+    np.testing.assert_array_equal(again.rod_pressures, pressed.rod_pressures)
+
+
+def test_a_scene_file_says_which_cables_touch(tmp_path):
+    harness = crossing(0.0, contact=[("lower", "upper")])
+    rodjax.write_scene(harness, tmp_path / "harness.toml")
+    read = rodjax.read_scene(tmp_path / "harness.toml")
+    assert isinstance(read, Harness)
+    assert read.contact == harness.contact == ((0, 1),)
+    assert 'contact = [["upper", "lower"]]' in (tmp_path / "harness.toml").read_text()
+
+
+def test_what_does_not_know_of_other_rods_says_so(pressed):
+    with pytest.raises(ValueError, match="got that of a rod which touches others: solve its Harness"):
+        rodjax.solve(pressed["upper"].scene)
+    with pytest.raises(ValueError, match="equilibrium must be of a harness with contact=False"):
+        rodjax.lowest_mode(pressed)
+
+
+@pytest.mark.parametrize(
+    ("contact", "message"),
+    [
+        ([("upper", "middle")], "contact names the cable 'middle', but the cables are 'upper', 'lower'"),
+        ([("upper", "upper")], "contact must be of different cables, got 'upper' twice: self_contact=True"),
+        (["upper"], "contact must be True, False or pairs of names of cables, got 'upper' among them"),
+        ([("upper", "lower", "upper")], "contact must be True, False or pairs of names of cables"),
+        (False, "a harness must have an end that is a Joint, or contact between rods"),
+    ],
+)
+def test_contact_between_what_cannot_touch_is_refused(contact, message):
+    with pytest.raises(ValueError, match=message):
+        crossing(0.0, contact=contact)
+
+
+def test_cables_that_end_in_one_joint_and_rods_without_a_radius_are_refused():
+    first, second = Scene(rod(), Clamp((0, 0, 0), ALONG), Joint("j")), Scene(rod(), Joint("j"), Pin((1.9, 0, 0)))
+    with pytest.raises(ValueError, match="without a common joint, as their ends meet there, got 'a' and 'b'"):
+        Harness({"a": first, "b": second}, contact=[("b", "a")])
+    with pytest.raises(ValueError, match="no two cables are without a common joint"):
+        Harness({"a": first, "b": second}, {"j": Body()}, contact=True)
+    thin = beam((0, 1, 0), ACROSS, 0.0, Rod(LENGTH, 1.0, 1.0, 1e4))
+    with pytest.raises(ValueError, match=r"cables\['b'\].rod must have a radius, as it may touch another cable"):
+        Harness({"a": first, "b": thin, "c": second}, contact=[("a", "b")])
+
+
+@pytest.mark.slow
+def test_a_beam_of_two_parts_is_pressed_by_one_by_frames(pressed):
+    """A joint beside the contact changes nothing but the mesh; a section that is stiffer in one direction, by frames,
+    presses no less.
+    """
+    whole, scenes = crossing(0.016), {}
+    scenes["left"] = Scene(rod(length=0.6), whole["upper"].start, Joint("j", ALONG))
+    scenes["right"] = Scene(rod(length=0.4), Joint("j", ALONG), whole["upper"].end)
+    round_one = whole["lower"].rod
+    stiffnesses = (2 * round_one.EI, round_one.EI), round_one.GJ, round_one.EA
+    flat = Rod(LENGTH, *stiffnesses, radius=RADIUS)
+    scenes["lower"] = Scene(flat, whole["lower"].start, whole["lower"].end)
+    found = rodjax.solve(Harness(scenes, contact=[("left", "lower")]), segments=8, solver=TIGHT)
+    assert found.converged
+    assert found.stable
+    force = found.rod_contacts["left", "lower"].forces.sum(0)
+    assert float(force[2]) > 0.99 * float(pressed.rod_pressures.sum())
+    supports = found["right"].end_force - found["left"].start_force
+    # Residuals of 1e-11 EI/L^2.
+    np.testing.assert_allclose(supports, -force, atol=1e-9)
+    np.testing.assert_allclose(found["lower"].end_force - found["lower"].start_force, force, atol=1e-9)

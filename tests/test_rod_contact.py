@@ -127,6 +127,7 @@ def test_derivatives_are_those_of_differences(pressed):
         np.testing.assert_allclose(derivatives[k], difference, rtol=1e-6 if k else 1e-5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_beam_is_led_through_the_other():
     """Ends that are led past one another: in steps of a quarter of the radius the upper one stays the upper one."""
     path = rodjax.solve_path([crossing(down) for down in np.linspace(0.0, 6 * RADIUS, 13)], segments=8)

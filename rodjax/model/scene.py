@@ -86,7 +86,7 @@ class Scene(eqx.Module):
     potentials: tuple[Potential, ...]
     point_couples: tuple[PointCouple, ...]
     # Of a rod of a harness whose rods may touch, where they were found; `None` in a scene that is given.
-    contact_loads: ContactLoads | None
+    contact_loads: ContactLoads | None = eqx.field(init=False)
     self_contact: bool = eqx.field(static=True, default=False)
 
     def __init__(

@@ -804,7 +804,9 @@ def _slopes(
         shares = assembly.shares(group)
         if isinstance(group.form, NodalForm):
             (_, closing), (along, rates) = _rates(here, step, of_ends)
-            slope += jnp.sum(shares * along)
+            # What the motions of the ends do without contacts is in the gradient of the bodies.
+            known = jnp.sum(here.coupling.first * of_ends.reshape(-1, 12), axis=1)
+            slope += jnp.sum(shares * (along - known))
             rate += jnp.sum(shares[:, None] * closing * rates)
             continue
 

@@ -8,6 +8,7 @@ import pytest
 
 import rodjax
 from rodjax import Clamp, Harness, Joint, Newton, Plane, Potential, Rod, Scene
+from rodjax.solving import assembly
 
 GRAVITY = (0.0, 0.0, -9.81)
 ALONG = rodjax.frame((1, 0, 0))
@@ -177,3 +178,30 @@ def test_sensitivities_of_a_harness_are_its_derivatives(lying):
     at = lying.harness["a"].rod.EI
     expected = jax.jacfwd(height)(at)
     np.testing.assert_allclose(table["cables.b.end_force"]["cables.a.rod.EI"], expected, rtol=1e-9)
+
+
+def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
+    """Of rods with positions of nodes, whose ends move with a body, under the new forces of the step."""
+    slopes, known = [], assembly._slopes
+
+    def noted(whole, all_here, steps, gradient):
+        def energy(part):
+            found = jnp.zeros_like(part)
+            for group, here, step, of_ends in zip(whole.groups, all_here, steps.rods, steps.ends, strict=True):
+                value = jax.vmap(lambda step, rod, of_ends: step.value(rod, part * of_ends, part)[0])
+                found += jnp.sum(whole.shares(group) * value(step, here.rods, of_ends))
+            return found
+
+        slope, rate = known(whole, all_here, steps, gradient)
+        # The body has no weight and no spring, so that all energy is that of the rods.
+        jax.debug.callback(lambda *found: slopes.append(found), slope, jax.grad(energy)(jnp.zeros_like(slope)))
+        return slope, rate
+
+    monkeypatch.setattr(assembly, "_slopes", noted)
+    with rodjax.numpy_first(False):
+        assert rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=5, solver=TIGHT).converged
+        jax.effects_barrier()
+    assert len(slopes) > 3
+    slope, rate = np.array(slopes).T
+    # The same terms summed in another order.
+    np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-12 * np.max(np.abs(rate)))

@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 import rodjax
 from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene
+from rodjax.solving.rod_contact_results import touching_rods
 
 RADIUS, LENGTH, YOUNGS_MODULUS = 0.01, 1.0, 1e7
 TIGHT = Newton(tolerance=1e-11)
@@ -125,6 +126,16 @@ def test_derivatives_are_those_of_differences(pressed):
         difference = (numbers(*ahead, pressed) - numbers(*behind, pressed)) / (2 * step)
         # Steps of 3e-3 and 6e-5 of the numbers: second-order errors of some 1e-6 and 1e-9.
         np.testing.assert_allclose(derivatives[k], difference, rtol=1e-6 if k else 1e-5, atol=1e-12)
+
+
+def test_derivatives_of_too_many_contacts_are_no_numbers(pressed, monkeypatch):
+    monkeypatch.setattr("rodjax.solving.rod_contact_results.MOST_TOUCHING", 4)
+    for count, is_known in ((4, True), (5, False)):
+        pressures = jnp.where(jnp.arange(8) < count, 1.0, 0.0)
+        found = touching_rods(pressed.harness, pressed.groups, pressures, pressed.members)
+        assert found is not None
+        assert bool(jnp.all(jnp.isfinite(found.values))) == is_known
+        assert bool(jnp.isfinite(found.force)) == is_known
 
 
 @pytest.mark.slow

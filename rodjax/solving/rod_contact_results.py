@@ -31,7 +31,7 @@ from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.rod_contact import Members, Pairs, in_contact, joined_curves, pairs_of
 
-# Of the contacts between rods of two groups, at most so many that push have derivatives.
+# Of the contacts between rods of two groups, at most so many that push have derivatives; of more they are NaN.
 MOST_TOUCHING = 32
 
 
@@ -224,7 +224,7 @@ def _at(s: Array, nodes: Array, tangents: Array, element: Array, place: Array):
 def touching_rods(
     harness: Harness, groups: tuple[Equilibrium, ...], rod_pressures: Float[Array, "c"], members: Members
 ) -> TouchingRods | None:
-    """At a result; `None` of a harness whose rods do not touch."""
+    """At a result; `None` of a harness whose rods do not touch. `values` are NaN where too many push."""
     pairs = pairs_of(harness.contact, members)
     if not pairs:
         return None
@@ -244,6 +244,7 @@ def touching_rods(
 
         found, a, b, normal = jax.vmap(of_pair)(both)
         pick = jnp.argsort(-pressures.reshape(-1))[:MOST_TOUCHING]
+        force = jnp.where(jnp.sum(pressures > 0) > MOST_TOUCHING, jnp.nan, force)
         pair, element = pick // elements, pick % elements
         rods = jnp.stack([jnp.asarray(each.first)[pair], jnp.asarray(each.second)[pair]])
         normal = normal[pair, :, element].T
@@ -253,8 +254,8 @@ def touching_rods(
         there = found.other[pair, element] - elements - 1
         stays, pushing = found.stays[pair, :, element].T, pressures[pair, element]
         touches.append(_Touch(rods, jnp.stack([element, there]), stays, across, normal, pushing > 0, first + pick))
-        values += [pushing[None] * normal / force, jnp.stack([a[pair, element], b[pair, element]])]
-        values[-2:] = [jnp.concatenate(values[-2:]).reshape(-1)]
+        each_place = jnp.stack([a[pair, element], b[pair, element]])
+        values.append(jnp.concatenate([pushing[None] * normal / force, each_place]).reshape(-1))
         first += pressures.size
     meshes = tuple(group.s / group.s[:, -1:] for group in groups)
     return TouchingRods(pairs, tuple(touches), jnp.concatenate(values), meshes, length, force)

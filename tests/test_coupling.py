@@ -133,7 +133,7 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
             value, _, there = step.value(rod, motions.reshape(2, 6), jnp.ones(()))
             near = rod.form_at(motions.reshape(2, 6))
             assert isinstance(near, NodalForm)
-            gaps = jnp.concatenate([gaps_and_normals(near, there.nodal.positions)[0], within_elements(near, there)[1]])
+            gaps = jnp.concatenate([gaps_and_normals(near, there.nodal.positions)[0], within_elements(near, there)[2]])
             return value - jnp.sum(pressures * gaps), gaps
 
         nowhere = jnp.zeros_like(here.gradient), jnp.zeros((3, 3)), jnp.zeros(form.layout.size)

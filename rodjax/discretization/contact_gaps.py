@@ -1,18 +1,17 @@
 """Gaps between a rod whose nodes have positions of their own and the obstacles of its scene, at nodes and in elements.
 
-Obstacles without friction (`smooth_obstacles`) touch the middles of elements too. A node that a support holds has no
-gaps: they count as 1. Rows of pressures are, in this order, those of all obstacles at nodes, those of obstacles without
-friction within elements, and one between elements (`self_contact`).
+Obstacles without friction (`smooth_obstacles`) touch elements too, where these come nearest to them. A node that a
+support holds has no gaps: they count as 1. Rows of pressures are, in this order, those of all obstacles at nodes, those
+of obstacles without friction within elements, and one between elements (`self_contact`).
 """
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from rodjax.discretization.inner_contacts import Middles
+from rodjax.discretization.inner_contacts import Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve
@@ -22,15 +21,12 @@ from rodjax.model.scene import Scene
 # Compliance of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change,
 # times some 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
 CONTACT_COMPLIANCE = 1e-5
-# And at least this times the rounding unit [L^3/EI] where elements are touched in their middles: elimination goes from
-# one node of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
+# And at least this times the rounding unit [L^3/EI] where elements are touched: elimination goes from one node
+# of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
 LEAST_COMPLIANCE = 5e4
 # Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
 # would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
 FAR_COMPLIANCE = 1e-6
-# In the middle of elements the rod counts as thinner by this part. Where it lies along an obstacle, nodes and middles
-# would say the same, and who bears it would be undetermined: so nodes do.
-THINNER = 1e-5
 
 
 def friction_coefficient(obstacle: Obstacle) -> Any:
@@ -39,8 +35,13 @@ def friction_coefficient(obstacle: Obstacle) -> Any:
 
 
 def smooth_obstacles(scene: Scene) -> tuple[int, ...]:
-    """The numbers of the obstacles without friction: those that elements touch in their middles too."""
+    """The numbers of the obstacles without friction: those that are touched within elements too."""
     return tuple(k for k, obstacle in enumerate(scene.obstacles) if friction_coefficient(obstacle) is None)
+
+
+def touched_within(scene: Scene) -> tuple[Obstacle, ...]:
+    """The obstacles without friction."""
+    return tuple(scene.obstacles[k] for k in smooth_obstacles(scene))
 
 
 def rough_obstacles(scene: Scene) -> tuple[int, ...]:
@@ -78,12 +79,11 @@ def curvatures(scene: Scene, positions: Float[Array, "p 3"]) -> Float[Array, "k 
 
 
 def curvature_terms(
-    scene: Scene, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"], which: tuple[int, ...] | None = None
+    scene: Scene, positions: Float[Array, "p 3"], pressures: Float[Array, "k p"]
 ) -> Float[Array, "p 3 3"]:
-    """Second derivatives of -sum p g by the positions of nodes or middles; `which`: the obstacles, if not all."""
+    """Second derivatives of -sum p g by the positions of nodes."""
     total = jnp.zeros((len(positions), 3, 3), positions.dtype)
-    obstacles = scene.obstacles if which is None else [scene.obstacles[k] for k in which]
-    for obstacle, pressure in zip(obstacles, pressures, strict=True):
+    for obstacle, pressure in zip(scene.obstacles, pressures, strict=True):
         # Where the rod touches nothing of an obstacle, its curvature is not computed.
         total = jax.lax.cond(
             jnp.any(pressure != 0),
@@ -112,18 +112,18 @@ def gaps_and_normals(
     return jnp.where(form.is_at_support[None], 1.0, distances - form.radius[None]), normals
 
 
-def within_elements(form: PositionForm, point: Any) -> tuple[Middles, Float[Array, "q n+1"], Float[Array, "q n 3"]]:
-    """The middles of the elements, their gaps, and the directions in which these grow."""
-    s = form.field.s
+def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | None, Float[Array, "q n+1"]]:
+    """The elements, where they come nearest to the obstacles without friction, `None` if there are none, and the gaps
+    there.
+    """
+    s, obstacles = form.field.s, touched_within(form.scene)
     free = jnp.where(form.is_held, 0.0, 1.0).astype(s.dtype)
-    middles = Middles.of(point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, jnp.diff(s))
-    if not smooth_obstacles(form.scene):
-        return middles, jnp.zeros((0, len(s)), s.dtype), jnp.zeros((0, len(s) - 1, 3), s.dtype)
-    distances, normals = distances_and_normals(form.scene, middles.points)
-    smooth = np.array(smooth_obstacles(form.scene))
-    radius = (1 - THINNER) * form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
-    gaps = distances[smooth] - radius[None]
-    return middles, jnp.pad(gaps, ((0, 0), (0, 1)), constant_values=1.0), normals[smooth]
+    nodes = point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, form.is_at_support
+    elements = Elements.of(*nodes, s)
+    if not obstacles:
+        return elements, None, jnp.zeros((0, len(s)), s.dtype)
+    places = Places.of(elements, obstacles, form.radius_along)
+    return elements, places, jnp.pad(places.gaps, ((0, 0), (0, 1)), constant_values=1.0)
 
 
 def curve(form: PositionForm, point: Any) -> Curve:

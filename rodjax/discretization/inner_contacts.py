@@ -1,77 +1,257 @@
-"""Contact points in the middle of elements, as functions of the positions and tangents of both nodes.
+"""Contact points within elements, as functions of the positions and tangents of both nodes.
 
-With e = a - c the difference of the tangents at start and end of an element of length h, the point is
+With u = 1 - t and e = a - c the difference of the tangents at start and end of an element of length h, the centerline
+at the part t of the element is
 
-    x = (x_start + x_end)/2 + h/8 (1 + |e|^2/48) e
+    x = (1 + 2 t) u^2 x_start + t^2 (3 - 2 t) x_end + h t u (u a - t c) + h t^2 u^2/24 |e|^2 e
 
-that of the cubic through both nodes, and on circles of sixth order. A force p n there is virtual work on both nodes:
-half of it on each, and couples.
+the cubic through both nodes, and on circles of sixth order. Of each element the contact point with an obstacle is the
+place where
+
+    g = distance(x) - (1 - THINNER - at_nodes (2 t - 1)^2) radius,    at_nodes = AT_NODES max(1, (COARSE h/L)^4)
+
+is least, so that it follows an edge or a thin pipe along the element; beside a support, which may hold the rod within
+an obstacle, it is in the middle. First derivatives of g are those at a fixed
+place; the second ones count that the place moves. A force p n there is virtual work on both nodes: forces and couples.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from rodjax.geometry.vectors import cross, dot
+from rodjax.model.along import Value, value_at
+from rodjax.model.obstacles import Obstacle
 
-# Of the cubic's part of x that depends on e, e^2 of this more; and twice of it in its derivative.
-ON_CIRCLES = 1 / 48
+# Within elements the rod counts as thinner by these parts, in their middle and more at their nodes. Where it lies along
+# an obstacle, nodes and places between them would say the same, and who bears it would be undetermined: so nodes do;
+# and the place is in the middle then. On coarse meshes more, as a rod sags between nodes by the fourth power of their
+# distance: the place would go from one end of an element to the other with what a step changes.
+THINNER = 1e-5
+AT_NODES = 8e-5
+COARSE = 16
+# Places of an element among which the nearest one is, and steps of the search from there.
+SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
+STEPS = 8
+# An obstacle of more numbers, as a mesh, is touched in the middle of elements: its distances take too much time.
+MOST_NUMBERS = 1000
 
 
-class Middles(NamedTuple):
-    """The points in the middle of n elements, their first derivatives by what moves the nodes: b rotations about `axes`
-    and the place of the first, then of the second node; and what second derivatives are made of.
+class Elements(NamedTuple):
+    """What the centerline within n elements depends on: position and tangent of the first and the last node of each,
+    `axes` about which the tangents turn; `free`: 0 at nodes whose place is given, else 1; `beside`: whether a support
+    holds one of both.
     """
 
-    points: Float[Array, "n 3"]
-    rates: Float[Array, "3 2 b+3 n"]
-    bulge: Float[Array, "3 n"]  # h/8 e
-    turned: Float[Array, "3 2 b n"]  # by which e changes
-    by_difference: Float[Array, "3 3 n"]  # dx/de
-    ends: Float[Array, "3 2 n"]
+    positions: Float[Array, "3 2 n"]
+    tangents: Float[Array, "3 2 n"]
     axes: Float[Array, "3 2 b n"]
+    free: Float[Array, "2 n"]
+    beside: Bool[Array, "n"]
+    s: Float[Array, "n+1"]
 
     @staticmethod
     def of(
         positions: Float[Array, "n+1 3"],
         tangents: Float[Array, "3 n+1"],
         axes: Float[Array, "3 b n+1"],
-        held: Float[Array, "n+1"],
-        h: Float[Array, "n"],
-    ) -> "Middles":
-        """`held`: 0 at nodes whose place is given, else 1."""
-        ends = jnp.stack([tangents[:, :-1], tangents[:, 1:]], axis=1)
-        about = jnp.stack([axes[..., :-1], axes[..., 1:]], axis=1)
-        difference = ends[:, 0] - ends[:, 1]
-        squared = dot(difference, difference)
-        bulge = h[None] / 8 * difference
-        identity = jnp.eye(3, dtype=h.dtype)[..., None]
-        factor = 1 + ON_CIRCLES * squared
-        by_difference = (h / 8 * factor)[None, None] * identity
-        by_difference += 2 * ON_CIRCLES * bulge[:, None] * difference[None]
-        turned = cross(about, jnp.broadcast_to(ends[:, :, None], about.shape))
-        turned = turned * jnp.array([1.0, -1.0], h.dtype)[None, :, None, None]
-        by_rotation = jnp.einsum("cdn,debn->cebn", by_difference, turned)
-        by_position = jnp.stack([held[:-1], held[1:]])[None, :, None] * identity[:, None] / 2
-        points = (positions[:-1] + positions[1:]) / 2 + (factor[None] * bulge).T
-        rates = jnp.concatenate([by_rotation, by_position], axis=2)
-        return Middles(points, rates, bulge, turned, by_difference, ends, about)
+        free: Float[Array, "n+1"],
+        is_at_support: Bool[Array, "n+1"],
+        s: Float[Array, "n+1"],
+    ) -> "Elements":
+        def at_ends(of_nodes: Float[Array, "*c n+1"], axis: int) -> Float[Array, "*d n"]:
+            return jnp.stack([of_nodes[..., :-1], of_nodes[..., 1:]], axis=axis)
 
-    def second(self, forces: Float[Array, "3 n"]) -> Float[Array, "2b+6 2b+6 n"]:
-        """The second derivatives of forces . x."""
-        b, n = self.turned.shape[2:]
-        along = dot(forces, self.bulge)[None, None] * jnp.eye(3, dtype=forces.dtype)[..., None]
-        curving = forces[:, None] * self.bulge[None] + self.bulge[:, None] * forces[None] + along
-        both = 2 * ON_CIRCLES * jnp.einsum("cebn,cdn,dfan->ebfan", self.turned, curving, self.turned)
-        on_tangents = jnp.einsum("cn,cdn->dn", forces, self.by_difference)
+        nodes = at_ends(positions.T, 1), at_ends(tangents, 1), at_ends(axes, 1), at_ends(free, 0)
+        return Elements(*nodes, is_at_support[:-1] | is_at_support[1:], s)
+
+    @property
+    def difference(self) -> Float[Array, "3 n"]:
+        return self.tangents[:, 0] - self.tangents[:, 1]
+
+    @property
+    def turned(self) -> Float[Array, "3 2 b n"]:
+        """The rates of the tangents, by rotations about the axes."""
+        return cross(self.axes, jnp.broadcast_to(self.tangents[:, :, None], self.axes.shape))
+
+    def weights(
+        self, t: Float[Array, "n"], derivative: int = 0
+    ) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "n"]]:
+        """Of the positions and tangents of both nodes, and of |e|^2 e, in the point or its derivatives by t."""
+        h, u = jnp.diff(self.s), 1 - t
+        if derivative == 0:
+            of_positions = (1 + 2 * t) * u**2, t**2 * (3 - 2 * t)
+            of_tangents = t * u**2, -(t**2) * u
+            of_bulge = t**2 * u**2 / 24
+        elif derivative == 1:
+            of_positions = -6 * t * u, 6 * t * u
+            of_tangents = u * (1 - 3 * t), t * (3 * t - 2)
+            of_bulge = t * u * (1 - 2 * t) / 12
+        else:
+            of_positions = 12 * t - 6, 6 - 12 * t
+            of_tangents = 6 * t - 4, 6 * t - 2
+            of_bulge = (1 - 6 * t * u) / 12
+        return jnp.stack(of_positions), h[None] * jnp.stack(of_tangents), h * of_bulge
+
+    def at(self, t: Float[Array, "n"], derivative: int = 0) -> Float[Array, "3 n"]:
+        """Points at the parts t of the elements, or their derivatives by t."""
+        of_positions, of_tangents, of_bulge = self.weights(t, derivative)
+        e = self.difference
+        cubic = jnp.sum(self.positions * of_positions[None] + self.tangents * of_tangents[None], axis=1)
+        return cubic + (of_bulge * dot(e, e))[None] * e
+
+    def by_tangents(self, t: Float[Array, "n"], forces: Float[Array, "3 n"], derivative: int = 0) -> Array:
+        """The derivatives of forces . x by the tangents of both nodes, (3, 2, n)."""
+        _, of_tangents, of_bulge = self.weights(t, derivative)
+        e = self.difference
+        along = of_bulge[None] * (dot(e, e)[None] * forces + 2 * dot(forces, e)[None] * e)
+        return forces[:, None] * of_tangents[None] + jnp.stack([along, -along], axis=1)
+
+    def rates(self, t: Float[Array, "n"], forces: Float[Array, "3 n"], derivative: int = 0) -> Float[Array, "2 b+3 n"]:
+        """The derivatives of forces . x by what moves the nodes: rotations about the axes, then the place."""
+        of_positions, _, _ = self.weights(t, derivative)
+        by_rotation = jnp.sum(self.by_tangents(t, forces, derivative)[:, :, None] * self.turned, axis=0)
+        by_position = (of_positions * self.free)[:, None] * forces[None]
+        return jnp.concatenate([by_rotation, by_position], axis=1)
+
+    def second(self, t: Float[Array, "n"], forces: Float[Array, "3 n"]) -> Float[Array, "2 b+3 2 b+3 n"]:
+        """The second derivatives of forces . x at fixed places."""
+        b, n = self.axes.shape[2:]
+        _, _, of_bulge = self.weights(t)
+        e = self.difference
+        bulge = of_bulge[None] * e
+        curving = forces[:, None] * bulge[None] + bulge[:, None] * forces[None]
+        curving += dot(forces, bulge)[None, None] * jnp.eye(3, dtype=forces.dtype)[..., None]
+        signed = self.turned * jnp.array([1.0, -1.0], forces.dtype)[None, :, None, None]
+        both = 2 * jnp.einsum("cebn,cdn,dfan->ebfan", signed, curving, signed)
         total = jnp.zeros((2, b + 3, 2, b + 3, n), forces.dtype).at[:, :b, :, :b].set(both)
-        for k, sign in ((0, 1), (1, -1)):
+        by_tangents = self.by_tangents(t, forces)
+        for k in range(2):
             # Half of both orders in which a tangent t turns: w (v.t) + v (w.t) less 2 t (w.v).
-            axes, tangent = self.axes[:, k], self.ends[:, k]
-            pulled = jnp.einsum("cbn,cn->bn", axes, on_tangents)
-            leaned = jnp.einsum("cbn,cn->bn", axes, tangent)
+            axes, tangent, force = self.axes[:, k], self.tangents[:, k], by_tangents[:, k]
+            pulled, leaned = (jnp.einsum("cbn,cn->bn", axes, v) for v in (force, tangent))
             mixed = (pulled[:, None] * leaned[None] + leaned[:, None] * pulled[None]) / 2
-            turn = mixed - dot(on_tangents, tangent)[None, None] * jnp.einsum("cbn,can->ban", axes, axes)
-            total = total.at[k, :b, k, :b].add(sign * turn)
-        return total.reshape(2 * (b + 3), 2 * (b + 3), n)
+            turn = mixed - dot(force, tangent)[None, None] * jnp.einsum("cbn,can->ban", axes, axes)
+            total = total.at[k, :b, k, :b].add(turn)
+        return total
+
+
+class Places(NamedTuple):
+    """Where n elements come nearest to each of q obstacles: the part t of the element, point, gap and its gradient by
+    the point; of the gap the derivatives by t, and how the first of them changes with the point; `stays`: where t does
+    not move with the rod.
+    """
+
+    t: Float[Array, "q n"]
+    points: Float[Array, "q 3 n"]
+    gaps: Float[Array, "q n"]
+    normals: Float[Array, "q 3 n"]
+    slope: Float[Array, "q n"]
+    growth: Float[Array, "q n"]
+    of_slope: Float[Array, "q 3 n"]
+    stays: Bool[Array, "q n"]
+
+    @staticmethod
+    def of(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value) -> "Places":
+        numbers = [sum(leaf.size for leaf in jax.tree.leaves(obstacle)) for obstacle in obstacles]
+        in_middle = elements.beside[None] | jnp.asarray(np.array(numbers) > MOST_NUMBERS)[:, None]
+        if min(numbers) > MOST_NUMBERS:
+            nearest = jnp.full(in_middle.shape, 0.5, elements.s.dtype)
+        else:
+            nearest = jnp.where(in_middle, 0.5, _nearest(elements, obstacles, radius))
+        there = _seen(elements, obstacles, radius, nearest)
+        return there._replace(stays=there.stays | in_middle)
+
+    def rates(self, elements: Elements) -> Float[Array, "q 2 b+3 n"]:
+        """The gradient of the gaps."""
+        return jax.vmap(elements.rates)(self.t, self.normals)
+
+    def second(
+        self, elements: Elements, obstacles: tuple[Obstacle, ...], pressures: Float[Array, "q n"]
+    ) -> Float[Array, "2 b+3 2 b+3 n"]:
+        """The second derivatives of -sum p g."""
+        axes = jnp.eye(3, dtype=pressures.dtype)[..., None]
+
+        def motions(t: Float[Array, "n"]) -> Float[Array, "3 2 b+3 n"]:
+            return jnp.stack([elements.rates(t, jnp.broadcast_to(axis, (3, len(t)))) for axis in axes])
+
+        found = [
+            jax.vmap(jax.hessian(obstacle.at), in_axes=-1, out_axes=-1)(points)
+            for obstacle, points in zip(obstacles, self.points, strict=True)
+        ]
+        curving, moving = pressures[:, None, None] * jnp.stack(found), jax.vmap(motions)(self.t)
+        total = -jnp.sum(jax.vmap(elements.second)(self.t, pressures[:, None] * self.normals), axis=0)
+        total -= jnp.einsum("qcean,qcdn,qdfbn->eafbn", moving, curving, moving)
+        slopes = jax.vmap(elements.rates)(self.t, self.of_slope)
+        slopes += jax.vmap(lambda *place: elements.rates(*place, 1))(self.t, self.normals)
+        weights = jnp.where(self.stays, 0.0, pressures / jnp.where(self.stays, 1.0, self.growth))
+        return total + jnp.einsum("qn,qean,qfbn->eafbn", weights, slopes, slopes)
+
+
+def _seen(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value, t: Float[Array, "q n"]) -> Places:
+    """At the parts t of the elements."""
+    points, along, curving = (jax.vmap(lambda t, k=k: elements.at(t, k))(t) for k in range(3))
+    found = []
+    for obstacle, point, rate in zip(obstacles, points, along, strict=True):
+        of_points = jax.vmap(jax.value_and_grad(obstacle.at), in_axes=-1, out_axes=(0, -1))
+        found.append(jax.jvp(of_points, (point,), (rate,)))
+    (distances, normals), (_, of_slope) = jax.tree.map(lambda *parts: jnp.stack(parts), *found)
+
+    def rate(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        return lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
+
+    def seen_radius(t: Float[Array, "q n"]) -> Float[Array, "q n"]:
+        return _seen_radius(radius, elements.s, t)
+
+    slope = jnp.sum(normals * along, axis=1) - rate(seen_radius)(t)
+    growth = jnp.sum(of_slope * along + normals * curving, axis=1) - rate(rate(seen_radius))(t)
+    stays = ((t <= 0) & (slope >= 0)) | ((t >= 1) & (slope <= 0)) | (growth <= 0)
+    return Places(t, points, distances - seen_radius(t), normals, slope, growth, of_slope, stays)
+
+
+@eqx.filter_custom_jvp
+def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value) -> Float[Array, "q n"]:
+    """The parts of the elements at which gaps are least, from the least of samples, by Newton's method where it stays
+    between the samples beside that, else by halves.
+    """
+    samples, spacing = jnp.asarray(SAMPLES, elements.s.dtype), SAMPLES[1] - SAMPLES[0]
+    everywhere = jnp.broadcast_to(samples[:, None], (len(samples), len(elements.s) - 1))
+    points, seen_radius = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements.s, everywhere)
+    seen = jnp.stack([jax.vmap(jax.vmap(obstacle.at, in_axes=-1))(points) for obstacle in obstacles])
+    seen -= seen_radius[None]
+    first = samples[jnp.argmin(seen, axis=1)]
+
+    def nearer(_: Any, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        t, low, high, _ = state
+        there = _seen(elements, obstacles, radius, t)
+        low, high = jnp.where(there.slope < 0, t, low), jnp.where(there.slope > 0, t, high)
+        further = t - there.slope / jnp.where(there.growth > 0, there.growth, 1.0)
+        is_between = (there.growth > 0) & (low <= further) & (further <= high)
+        return jnp.where(is_between, further, (low + high) / 2), low, high, there.gaps
+
+    begin = first, jnp.maximum(first - spacing, 0.0), jnp.minimum(first + spacing, 1.0), seen[:, 0]
+    t, _, _, reached = jax.lax.fori_loop(0, STEPS, nearer, begin)
+    # Nearest at an end, to which halving comes near only.
+    t = jnp.where(seen[:, 0] <= reached, 0.0, t)
+    return jnp.where(seen[:, -1] <= jnp.minimum(reached, seen[:, 0]), 1.0, t)
+
+
+@_nearest.def_jvp
+def _(given: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Array, Array]:
+    """The slope of the gap by the place stays 0."""
+    t = _nearest(*given)
+    there, change = eqx.filter_jvp(lambda *given: _seen(*given, t), given, changes)
+    return t, jnp.where(there.stays, 0.0, -change.slope / jnp.where(there.stays, 1.0, there.growth))
+
+
+def _seen_radius(radius: Value, s: Float[Array, "n+1"], t: Float[Array, "q n"]) -> Float[Array, "q n"]:
+    """As which the rod counts at the parts t of the elements."""
+    begin, end = (jnp.broadcast_to(side[None], t.shape) for side in (s[:-1], s[1:]))
+    at_nodes = AT_NODES * jnp.maximum(1.0, (COARSE * jnp.diff(s)) ** 4)
+    thinner = THINNER + at_nodes[None] * (2 * t - 1) ** 2
+    return (1 - thinner) * value_at(radius, begin + t * (end - begin), begin, end)

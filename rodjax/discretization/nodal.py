@@ -1,6 +1,6 @@
 """Rods whose nodes have positions of their own beside obstacles, and beside themselves.
 
-No node is nearer to an obstacle than the rod is thick: gap g >= 0, and no middle of an element (`inner_contacts`) to
+No node is nearer to an obstacle than the rod is thick: gap g >= 0, and no place of an element (`inner_contacts`) to
 an obstacle without friction. The pressure p >= 0 is the multiplier of the gap, -sum p g in L (`contact_gaps`,
 `node_contacts`); with friction the tangential force q, |q| <= mu p, that of the slip (`node_friction`). Self-contact
 adds gaps between elements (`self_contact`).
@@ -126,7 +126,7 @@ class NodalForm(PositionForm):
         # Files until format 12 have those at nodes only.
         known = jnp.concatenate([known, nothing[len(known) :] + jnp.nan])
         pressures = jnp.where(jnp.isnan(known), pushing, known)
-        _, inner_gaps, _ = within_elements(self, point)
+        _, _, inner_gaps = within_elements(self, point)
         gaps = jnp.concatenate([gaps, inner_gaps])
         if self.scene.self_contact:
             far = contacts_with_itself(self, point, pressures[-1])
@@ -175,7 +175,7 @@ class NodalForm(PositionForm):
         """The contact energy of `objective` at a trial of a step from `point`."""
         gaps, _ = gaps_and_normals(self, there.nodal.positions)
         if smooth_obstacles(self.scene):
-            gaps = jnp.concatenate([gaps, within_elements(self, there)[1]])
+            gaps = jnp.concatenate([gaps, within_elements(self, there)[2]])
         contact_compliance, model = model_compliance(self), contact_model(self, point, gaps, None)
         return model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
 

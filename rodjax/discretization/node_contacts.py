@@ -25,6 +25,7 @@ from rodjax.discretization.contact_gaps import (
     pressure_rows,
     rough_obstacles,
     smooth_obstacles,
+    touched_within,
     within_elements,
 )
 from rodjax.discretization.friction import pulled, tangential, within
@@ -117,16 +118,19 @@ def exerted_by_itself(form: PositionForm, point: Any) -> Exerted:
 def _inner(
     form: PositionForm, point: Any, pressures: Float[Array, "q n"]
 ) -> tuple[Float[Array, "q n+1"], InnerRows, Float[Array, "2b+6 2b+6 n"]]:
-    """Gaps in the middles of the elements, their gradients, and the second derivatives of -sum p g."""
-    middles, gaps, normals = within_elements(form, point)
-    rates = jnp.einsum("qnc,cekn->qken", normals, middles.rates)
-    b = rates.shape[1] - 3
-    rows = InnerRows(rates[:, :b], rates[:, b:], first=len(form.scene.obstacles))
-    curved = curvature_terms(form.scene, middles.points, pressures, smooth_obstacles(form.scene))
-    by_moves = middles.rates.reshape(3, 2 * (b + 3), -1)
-    blocks = jnp.einsum("cin,ncd,djn->ijn", by_moves, curved, by_moves)
-    blocks -= middles.second(jnp.einsum("qn,qnc->cn", pressures, normals))
-    return gaps, rows, blocks
+    """Gaps within the elements, their gradients, and the second derivatives of -sum p g."""
+    elements, places, gaps = within_elements(form, point)
+    assert places is not None
+    rates, (b, n) = places.rates(elements), elements.axes.shape[2:]
+    by_rotation, by_position = (jnp.swapaxes(part, 1, 2) for part in jnp.split(rates, [b], axis=2))
+    rows = InnerRows(by_rotation, by_position, first=len(form.scene.obstacles))
+    # Where the rod touches nothing of this kind, curvatures are not computed.
+    blocks = jax.lax.cond(
+        jnp.any(pressures != 0),
+        lambda: places.second(elements, touched_within(form.scene), pressures),
+        lambda: jnp.zeros((2, b + 3, 2, b + 3, n), gaps.dtype),
+    )
+    return gaps, rows, blocks.reshape(2 * (b + 3), 2 * (b + 3), n)
 
 
 def relaxation(form: PositionForm, gaps: Float[Array, "k n+1"]) -> Float[Array, "k"]:
@@ -182,7 +186,7 @@ def exerted_by_obstacles(
     form: PositionForm, point: Any
 ) -> tuple[Float[Array, "k n+1 3"], Float[Array, "k n+1 3"], Int[Array, "k n+1"]]:
     """Normal and friction forces of each obstacle on each node, and whether the contact is open, sticks or slips. A
-    force within an element counts as half at each of its nodes.
+    force within an element counts at both of its nodes, by the lever.
     """
     nodal = point.nodal
     _, normals = distances_and_normals(form.scene, nodal.positions)
@@ -190,11 +194,13 @@ def exerted_by_obstacles(
     pushes = nodal.pressures[:k, :, None] * normals
     pressures = nodal.pressures[:k]
     if smooth_obstacles(form.scene):
-        _, _, normals_within = within_elements(form, point)
-        in_middles = nodal.pressures[k:, :-1, None]
+        elements, places, _ = within_elements(form, point)
+        assert places is not None
+        shares = jax.vmap(lambda t: elements.weights(t)[0])(places.t) * nodal.pressures[k:, None, :-1][: len(places.t)]
         smooth = np.array(smooth_obstacles(form.scene))
-        pushes = pushes.at[smooth].add(_halved(in_middles * normals_within))
-        pressures = pressures.at[smooth].add(_halved(in_middles)[..., 0])
+        pressures = pressures.at[smooth].add(jax.vmap(at_both)(shares[:, None])[:, 0])
+        on_nodes = jax.vmap(at_both)(places.normals[:, :, None] * shares[:, None])
+        pushes = pushes.at[smooth].add(jnp.swapaxes(on_nodes, 1, 2))
     states = jnp.where(pressures > 0, SLIPS, OPEN)
     if nodal.friction is None:
         return pushes, jnp.zeros_like(pushes), states
@@ -213,7 +219,7 @@ def contacts_on_elements(form: PositionForm, point: Any) -> OnElements | None:
     """
     found = []
     if smooth_obstacles(form.scene):
-        found.append(_middles_on_elements(form, point))
+        found.append(_within_on_elements(form, point))
     exerted = []
     if form.scene.self_contact:
         exerted.append(on_elements(curve(form, point), far_unit(form) * point.nodal.pressures[-1]))
@@ -224,13 +230,14 @@ def contacts_on_elements(form: PositionForm, point: Any) -> OnElements | None:
     return jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *found) if found else None
 
 
-def _middles_on_elements(form: PositionForm, point: Any) -> OnElements:
-    middles, _, normals = within_elements(form, point)
-    forces = jnp.einsum("qn,qnc->cn", point.nodal.pressures[inner_rows(form.scene), :-1], normals)
-    halves = -jnp.stack([forces, forces], axis=1) / 2
-    by_tangent = jnp.einsum("cn,cdn->dn", forces, middles.by_difference)
-    by_tangent = jnp.stack([-by_tangent, by_tangent], axis=1)
-    return OnElements(halves, by_tangent, jnp.zeros_like(halves))
+def _within_on_elements(form: PositionForm, point: Any) -> OnElements:
+    elements, places, _ = within_elements(form, point)
+    assert places is not None
+    forces = point.nodal.pressures[inner_rows(form.scene), None, :-1] * places.normals
+    of_positions = jax.vmap(lambda t: elements.weights(t)[0])(places.t)
+    by_position = -jnp.einsum("qcn,qen->cen", forces, of_positions)
+    by_tangent = -jnp.sum(jax.vmap(elements.by_tangents)(places.t, forces), axis=0)
+    return OnElements(by_position, by_tangent, jnp.zeros_like(by_position))
 
 
 def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:
@@ -242,9 +249,3 @@ def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:
 def larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
     """The maximum, with the derivative of one of the two where they are equal."""
     return jnp.where(a > b, a, b)
-
-
-def _halved(of_elements: Float[Array, "q n c"]) -> Float[Array, "q n+1 c"]:
-    """Values of elements at the nodes, half at each."""
-    halves = of_elements / 2
-    return jnp.pad(halves, ((0, 0), (0, 1), (0, 0))) + jnp.pad(halves, ((0, 0), (1, 0), (0, 0)))

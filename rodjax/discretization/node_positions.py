@@ -125,16 +125,16 @@ class PositionForm(Form):
     @property
     def radius(self) -> Float[Array, "n+1"]:
         """The radius at the nodes; where it jumps, the larger of both sides."""
-        return largest_beside(self._radius, self.field.s)
+        return largest_beside(self.radius_along, self.field.s)
 
     def radius_in_elements(self, parts: Float[Array, "k"]) -> Float[Array, "n k"]:
         """The radius in each element at relative positions 0 to 1."""
         s = self.field.s
         begin, end = (jnp.broadcast_to(side[:, None], (len(s) - 1, len(parts))) for side in (s[:-1], s[1:]))
-        return value_at(self._radius, begin + parts[None] * (end - begin), begin, end)
+        return value_at(self.radius_along, begin + parts[None] * (end - begin), begin, end)
 
     @property
-    def _radius(self) -> Value:
+    def radius_along(self) -> Value:
         radius = self.scene.rod.radius
         assert radius is not None, "a scene with obstacles has a radius"
         return radius
@@ -148,7 +148,7 @@ class PositionForm(Form):
         x = x.at[1:-1].add(BESIDE * x[1])
         points = cubic(s, nodes, self.node_slopes(point), x)
         cell = jnp.clip(jnp.searchsorted(s, x, side="right") - 1, 0, len(s) - 2)
-        radius = value_at(self._radius, x, s[cell], s[cell + 1])
+        radius = value_at(self.radius_along, x, s[cell], s[cell + 1])
         beside = jnp.where(self.is_held[cell + 1][:, None], nodes[cell + 1], jnp.nan)
         return points, radius, jnp.where(self.is_held[cell][:, None], nodes[cell], beside)
 

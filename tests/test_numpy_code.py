@@ -1,5 +1,7 @@
 """Programs as NumPy code: each operation beside JAX's own, and when such code runs in the place of an executable."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -186,6 +188,12 @@ def test_loops_end_in_time():
     endless = AnswerCode.of(jax.jit(lambda x: lax.while_loop(lambda x: x[0, 0] < jnp.inf, lambda x: x + 1, x)).trace(X))
     with pytest.raises(numpy_operations.TookTooLongError):
         endless([X], 0.01)
+
+
+def test_only_time_of_its_own_counts():
+    with numpy_operations.limited(0.01):
+        time.sleep(0.02)  # as where the machine has other work
+        assert numpy_operations.loop(lambda k: (k < 3,), lambda k: (k + 1,), (0,)) == (3,)
 
 
 @pytest.fixture

@@ -2,8 +2,10 @@
 
 import time
 
+import diffrax
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 from jax import lax
@@ -28,6 +30,13 @@ def windows(mode):
     dims = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(0,), start_index_map=(0, 1))
     starts = np.array([[0, 1], [3, 4], [5, 0], [1, -2]])
     return lambda x: lax.gather(x, starts, dims, slice_sizes=(1, 3), mode=mode)
+
+
+def decayed(rate):
+    """y at 1 of y' = -rate y; loops and branches of Equinox."""
+    term, controller = diffrax.ODETerm(lambda t, y, args: -rate * y), diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    how = {"dt0": 0.1, "y0": jnp.ones(()), "stepsize_controller": controller, "adjoint": diffrax.ForwardMode()}
+    return diffrax.diffeqsolve(term, diffrax.Tsit5(), t0=0.0, t1=1.0, throw=False, max_steps=200, **how).ys
 
 
 OPERATIONS = {
@@ -120,6 +129,8 @@ OPERATIONS = {
         jnp.linalg.cholesky(STACK),
         jnp.linalg.cholesky(-POSITIVE),
         jnp.linalg.eigvalsh(STACK),
+        jnp.linalg.svd(x, full_matrices=False)[1],
+        jnp.linalg.pinv(jnp.stack([x, x / 0]), rtol=1e-10),
         negative_count(STACK - jnp.mean(STACK)),
         jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(POSITIVE), True), x),
         *[
@@ -148,6 +159,10 @@ OPERATIONS = {
         jax.jit(lambda x: jax.jvp(jax.nn.relu, (x,), (x,)))(x),
     ],
     "kept apart": lambda x: lax.optimization_barrier((x, 2 * x)),
+    "other packages": lambda x: [
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(POSITIVE)), x[:, 0], throw=False).value,
+        jax.vmap(decayed)(x[0]),
+    ],
 }
 
 

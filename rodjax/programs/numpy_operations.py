@@ -377,6 +377,20 @@ def eigh(x: np.ndarray, lower: bool) -> Values:
     return _each_matrix(one, x)
 
 
+def svd(x: np.ndarray) -> Values:
+    """Singular values, then left and right vectors, as many as there are values."""
+
+    def one(matrix: np.ndarray) -> Values:
+        count = min(matrix.shape)
+        if not np.isfinite(matrix).all():
+            shapes = (count,), (matrix.shape[0], count), (count, matrix.shape[1])
+            return tuple(np.full(shape, np.nan, matrix.dtype) for shape in shapes)
+        left, values, right = np.linalg.svd(matrix, full_matrices=False)
+        return values, left, right
+
+    return _each_matrix(one, x)
+
+
 def tridiagonal(x: np.ndarray) -> Values:
     """Tridiagonal matrices similar to these: their eigenvalues, with zeros beside them. The reflections that lead there
     are not made: not a number.

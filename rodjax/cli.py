@@ -630,15 +630,15 @@ def _draw(path: Path, equilibrium: Result, write: Callable[[Result, Path], None]
 
 
 def _plot_harness(result: rodjax.HarnessEquilibrium, path: Path) -> None:
-    from rodjax.plot import plot_harness
+    from rodjax.plot import figure_of, plot_harness
 
-    _save_figure(plot_harness(result), path)
+    _save_figure(figure_of(plot_harness(result)), path)
 
 
 def _plot(equilibrium: Equilibrium, path: Path) -> None:
-    from rodjax.plot import plot_rod
+    from rodjax.plot import figure_of, plot_rod
 
-    _save_figure(plot_rod(equilibrium), path)
+    _save_figure(figure_of(plot_rod(equilibrium)), path)
 
 
 def _write_dxf(equilibrium: Equilibrium, path: Path) -> None:

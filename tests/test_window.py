@@ -78,7 +78,7 @@ def test_a_scene_of_its_own_controls_is_the_same():
     assert jax_leaves(same) == pytest.approx(jax_leaves(scene), abs=1e-15)  # the tangent of a clip by way of a frame
 
 
-def jax_leaves(scene: rj.Scene) -> np.ndarray:
+def jax_leaves(scene: rj.Scene | rj.Harness) -> np.ndarray:
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
 
 
@@ -347,8 +347,40 @@ def test_a_harness_is_taken_in_the_hand(tmp_path):
     (tmp_path / "path.vtkhdf").write_bytes(content)
     replayed = session_of(rj.load(tmp_path / "path.vtkhdf"), None)
     assert len(replayed.recorded) == len(session.recorded)
-    with pytest.raises(ValueError, match="a harness cannot be written as a scene file yet"):
-        scene_file(session)
+    content, remark = scene_file(session)
+    assert remark == ""
+    (tmp_path / "harness.toml").write_bytes(content)
+    harness = read_scene(tmp_path / "harness.toml")
+    assert isinstance(harness, rj.Harness)
+    assert jax.tree.structure(harness) == jax.tree.structure(session.result.harness)
+    np.testing.assert_array_equal(jax_leaves(harness), jax_leaves(session.result.harness))
+
+
+@pytest.mark.slow
+def test_a_saved_harness_has_the_turns_of_its_rods(tmp_path):
+    """Two cables one above the other, which may touch: the end of one is wound up by one turn and a half."""
+    cable = rj.Rod.circular(1.0, 5e-3, 1e7, poisson_ratio=0.5, density=1200.0)
+    rods = {
+        name: rj.Scene(cable, rj.Clamp((0, 0, z), LEVEL), rj.Clamp((0.95, 0, z), LEVEL), (0, 0, -9.81))
+        for name, z in {"above": 0.3, "below": 0.0}.items()
+    }
+    session = Session(rj.Harness(rods, contact=True), segments=6)
+    for k in range(1, 7):
+        report = session.move({"above/end": ((0.95, 0.0, 0.3), turned(LEVEL, k * math.pi / 2))})
+        assert report.moved, report.message
+    content, remark = scene_file(session)
+    assert remark == ""
+    (tmp_path / "harness.toml").write_bytes(content)
+    harness = read_scene(tmp_path / "harness.toml")
+    assert isinstance(harness, rj.Harness)
+    assert harness.contact_names == [("above", "below")]
+    again = rj.solve(harness, segments=6)
+    for name in harness:
+        twist = float(session.result[name].total_twist)
+        assert float(again[name].total_twist) == pytest.approx(twist, abs=1e-6)
+    # The end has turned by 3 pi; what the curve writhes is not twist.
+    assert float(again["above"].total_twist) == pytest.approx(3 * math.pi, abs=1.5)
+    assert float(again["below"].total_twist) == pytest.approx(0.0, abs=1e-6)
 
 
 # --- undo, record, save ----------------------------------------------------------------------------------------------

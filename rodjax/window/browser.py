@@ -334,6 +334,7 @@ class Window:
     def _download(self, client: Any, name: str, make: Callable[[Session], tuple[bytes, str]]) -> None:
         """To the browser that asked for it: this process writes no file."""
         try:
+            self.panel.say(f"{name} is made")
             content, note = make(self.session)
         except (ImportError, ValueError) as error:
             self.panel.say(f"not saved: {error}", is_bad=True)

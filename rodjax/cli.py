@@ -139,6 +139,7 @@ def _add_view(commands: Any) -> None:
         help="address to listen on: by default this machine only; whoever reaches it can move the rod",
     )
     view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
+    view.add_argument("--dark", action="store_true", help="a dark page")
     view.set_defaults(run=_view)
 
 
@@ -375,7 +376,7 @@ def _view(arguments: argparse.Namespace) -> int:
             print(f"rodjax: {arguments.scene}: {' '.join(str(error).split())}", file=sys.stderr)
             return 3
     try:
-        show(session, arguments.port, arguments.host, not arguments.no_browser)
+        show(session, arguments.port, arguments.host, not arguments.no_browser, dark=arguments.dark)
     except ImportError as error:
         raise CommandError(str(error)) from None
     return 0

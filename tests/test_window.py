@@ -20,7 +20,7 @@ from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_o
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import rows
-from rodjax.window.opening import session_of, view
+from rodjax.window.opening import DRAWN, session_of, view
 from rodjax.window.session import SNAP_WAY, Session
 
 SEGMENTS = 10
@@ -383,6 +383,64 @@ def test_a_saved_harness_has_the_turns_of_its_rods(tmp_path):
     assert float(again["below"].total_twist) == pytest.approx(0.0, abs=1e-6)
 
 
+# --- routes and tolerances -------------------------------------------------------------------------------------------
+
+
+def test_rods_drawn_within_tolerances_are_steps():
+    """A taut wire: each is pulled by EA (d/L - 1), with its own d and L."""
+    rod = rj.Rod(1.0, 1.0, 1.0, 1e4, radius=0.01)
+    wire = rj.solve(rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((1.01, 0, 0), LEVEL)), segments=8)
+    given = [rj.Tolerance("end.position.0", 1e-3), rj.Tolerance("rod.length", 1e-3)]
+    ball = rj.Sphere((0.5, 0.0, 0.1), 0.05)
+    limits = rj.Limits(clearance=0.03, end_force=200.0)
+    envelope = rj.tolerances(wire, given, limits=limits, obstacles=[ball], names=["the ball"], samples=0)
+    session = session_of(envelope, None)
+    assert session.segments == 8
+    assert len(session.recorded) == DRAWN
+    np.testing.assert_array_equal(session.result.nodes, wire.nodes)  # in the beginning it is as it should be
+    scenes = [moment.result.scene for moment in session.recorded]
+    stretches = np.array([float(scene.end.position[0] / scene.rod.length) for scene in scenes])
+    np.testing.assert_array_equal([float(scene.rod.length) for scene in scenes], envelope.drawn(DRAWN).rod.length)
+    forces = [moment.result.end_force[0] for moment in session.recorded]
+    np.testing.assert_allclose(forces, 1e4 * (stretches - 1), rtol=1e-7)
+    assert np.std(forces) > 10
+    # Where the ball is 0.1 from the middle, with its radius and that of the wire taken off.
+    assert session.figures[0].clearances[0] == pytest.approx(0.1 - 0.05 - 0.01, abs=1e-3)
+    (row,) = [row for row in rows(session, session.move({}), limits) if row.label.startswith("clearance")]
+    assert (row.label, row.is_bad) == ("clearance, the ball", False)
+    session.show(session.recorded[3])
+    assert session.move({"end": ((1.0, 0.0, 0.0), None)}).moved
+
+
+@pytest.mark.slow
+def test_the_designs_of_a_search_are_steps():
+    """The last is the route, and the others are at rest where they were told to be."""
+    rod = rj.Rod(0.3, 0.02, 0.015, 2e4, 0.15, 0.005)
+    scene = rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((0.2, 0, 0.2), rj.frame((0, 0, 1))))
+    route = rj.route(
+        scene,
+        [
+            rj.Between("end.position.0", 0.05, 0.25),
+            rj.Between("end.position.2", 0.05, 0.25),
+            rj.Between("rod.length", 0.1, 0.45),
+        ],
+        limits=rj.Limits(bend_radius=9.0, clearance=0.01),
+        obstacles=[rj.Sphere((0.0, 1.0, 0.0), 0.05)],
+        names=["the ball"],
+        starts=2,
+        segments=12,
+    )
+    session = session_of(route, None)
+    assert 2 < len(session.recorded) <= len(route.designs.rod.length)
+    ends = [moment.result.nodes[-1] for moment in session.recorded]
+    np.testing.assert_allclose(ends, [moment.result.scene.end.position for moment in session.recorded], atol=1e-12)
+    lengths = [float(moment.result.scene.rod.length) for moment in session.recorded]
+    assert set(lengths) <= set(np.asarray(route.designs.rod.length).tolist())
+    assert lengths[-1] == float(route.scene.rod.length)
+    np.testing.assert_array_equal(session.result.nodes, route.equilibrium.nodes)
+    assert list(session.beside) == ["the ball"]
+
+
 # --- undo, record, save ----------------------------------------------------------------------------------------------
 
 
@@ -527,6 +585,17 @@ def test_numbers_stand_against_their_limits(session):
     assert found["softest motion"].text == f"{stiffness:.3g} N"
 
 
+def test_a_rod_without_twist_is_told_so_without_roundings(session):
+    found = {row.label: row.text for row in rows(session, session.move({}))}
+    assert abs(float(session.result.total_twist)) < 1e-9
+    assert found["total twist"] == "0.0°, 0.00 turns"
+    assert found["twist rate"] == "0 rad/m"
+    session.move({"end": ((0.8, 0.0, 0.0), turned(LEVEL, 0.5))})
+    found = {row.label: row.text for row in rows(session, session.move({}))}
+    twist = float(session.result.total_twist)
+    assert found["total twist"] == f"{math.degrees(twist):.1f}°, {twist / (2 * math.pi):.2f} turns"
+
+
 # --- the browser's side ----------------------------------------------------------------------------------------------
 
 
@@ -554,12 +623,27 @@ def test_of_moves_that_nobody_took_the_newest_counts():
 
 
 def test_arguments_that_make_no_sense_are_refused():
-    with pytest.raises(TypeError, match="shown must be a Scene or Harness or Equilibrium or HarnessEquilibrium, got 3"):
+    with pytest.raises(
+        TypeError,
+        match="shown must be a Scene or Harness or Equilibrium or HarnessEquilibrium or Route or Envelope, got 3",
+    ):
         view(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="segments must be a whole number from 2"):
         Session(hanging(), segments=1)
     with pytest.raises(ValueError, match="scene must have an equilibrium to begin with, got none: not converged"):
         Session(hanging(obstacles=[WALL]), segments=SEGMENTS)
+
+
+@pytest.mark.parametrize(("in_notebook", "expected"), [(False, (True, True)), (True, (False, False))])
+def test_a_notebook_shows_the_window_below_the_cell(in_notebook, expected, monkeypatch):
+    """It neither waits there nor opens another tab, unless it is told to."""
+    asked = []
+    monkeypatch.setattr("rodjax.window.opening.session_of", lambda shown, segments: None)
+    monkeypatch.setattr("rodjax.window.opening.in_notebook", lambda: in_notebook)
+    monkeypatch.setattr("rodjax.window.opening.show", lambda *arguments, **more: asked.append(arguments))
+    view(hanging())
+    view(hanging(), open_browser=True, block=False)
+    assert [arguments[3:5] for arguments in asked] == [expected, (True, False)]
 
 
 @pytest.fixture

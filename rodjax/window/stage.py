@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -56,6 +57,7 @@ class Stage:
         self.handles = {name: self._handle(name, moved) for name in session.handles}
         self.arrows: dict[str, Any] = {}
         self._draw_obstacles()
+        self._draw_beside()
         points = np.concatenate([reading.centerline for reading in session.readings])
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(float(np.linalg.norm(high - low)), 0.2 * self.length)
@@ -180,13 +182,24 @@ class Stage:
         ):
             name = f"obstacles[{k}]"
             pivot = center_of(obstacles[k]) if name in self.session.handles else np.zeros(3)
-            vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)
-            first = 4 * np.arange(len(faces))[:, None]
-            triangles = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3).astype(np.uint32)
-            self.obstacles[name] = self.server.scene.add_mesh_simple(
-                f"/obstacles/{k}", vertices, triangles, color=OBSTACLE_COLOR, opacity=0.65, flat_shading=True,
-                side="double", position=tuple(pivot), cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+            self.obstacles[name] = self._obstacle(f"/obstacles/{k}", faces, pivot)
+
+    def _draw_beside(self) -> None:
+        """Obstacles that do not touch the rods, and stay where they are; those of the scene are drawn already."""
+        of_scene = getattr(self.session.scene, "obstacles", ())
+        beside = [one for one in self.session.beside.values() if not any(eqx.tree_equal(one, o) for o in of_scene)]
+        around = np.concatenate([reading.centerline for reading in self.session.readings])
+        for k, faces in enumerate(surfaces(beside, around) if beside else []):
+            self._obstacle(f"/beside/{k}", faces, np.zeros(3))
+
+    def _obstacle(self, name: str, faces: Float[np.ndarray, "f 4 3"], pivot: Float[np.ndarray, "3"]) -> Any:
+        vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)
+        first = 4 * np.arange(len(faces))[:, None]
+        triangles = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3).astype(np.uint32)
+        return self.server.scene.add_mesh_simple(
+            name, vertices, triangles, color=OBSTACLE_COLOR, opacity=0.65, flat_shading=True, side="double",
+            position=tuple(pivot), cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
 
     def _handle(self, name: str, moved: Moved) -> Any:
         handle, pose = self.session.handles[name], self.session.now.controls.poses[name]

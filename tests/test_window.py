@@ -16,7 +16,7 @@ from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
 from rodjax.window import tube
 from rodjax.window.bounds import Asked, asked_of, why_not
-from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, sliders_of
+from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, shared_obstacles, sliders_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import rows
@@ -354,6 +354,47 @@ def test_a_harness_is_taken_in_the_hand(tmp_path):
     assert isinstance(harness, rj.Harness)
     assert jax.tree.structure(harness) == jax.tree.structure(session.result.harness)
     np.testing.assert_array_equal(jax_leaves(harness), jax_leaves(session.result.harness))
+
+
+def beside_a_floor() -> rj.Harness:
+    cable, floor = rj.problems.cable(), rj.Plane((0, 0, -0.25), (0, 0, 1))
+    ball, box = rj.Sphere((0.4, 0.0, 0.4), 0.1), rj.Box((1.2, 0.0, 0.4), (0.1, 0.1, 0.1))
+    rods = {
+        "left": rj.Scene(
+            cable, rj.Clamp((0, 0, 0), LEVEL), rj.Joint("y", LEVEL), (0, 0, -9.81), obstacles=[floor, ball]
+        ),
+        "right": rj.Scene(
+            cable, rj.Joint("y", LEVEL), rj.Clamp((1.6, 0, 0), LEVEL), (0, 0, -9.81), obstacles=[box, floor]
+        ),
+    }
+    return rj.Harness(rods, {"y": rj.Body(support=rj.Pin((0.8, 0.0, 0.0)))})
+
+
+def test_what_rods_of_a_harness_have_in_common_is_one_obstacle():
+    assert shared_obstacles(beside_a_floor()) == {
+        "left/obstacles[0]": ["left/obstacles[0]", "right/obstacles[1]"],
+        "left/obstacles[1]": ["left/obstacles[1]"],
+        "right/obstacles[0]": ["right/obstacles[0]"],
+    }
+    twice = hanging(obstacles=[rj.Sphere((0, 0, -1), 0.1), rj.Sphere((0, 0, -1), 0.1)])
+    assert list(shared_obstacles(twice)) == ["obstacles[0]", "obstacles[1]"]  # both can be told apart by a hand
+
+
+@pytest.mark.slow
+def test_a_floor_under_a_harness_lifts_all_its_rods():
+    session = Session(beside_a_floor(), segments=6)
+    assert [name for name in session.handles if "obstacles" in name] == list(session.obstacles)
+    low = [float(np.min(session.result[name].nodes[:, 2])) for name in session.result]
+    radius = float(session.result["left"].scene.rod.radius)
+    place = session.now.controls.poses["left/obstacles[0]"].position
+    report = session.move({"left/obstacles[0]": (place + np.array([0, 0, 0.1]), None)})
+    assert report.moved, report.message
+    for name, before in zip(session.result, low, strict=True):
+        found = session.result[name]
+        assert before < -0.2
+        assert float(np.min(found.nodes[:, 2])) == pytest.approx(-0.15 + radius, abs=1e-3)
+        assert float(np.sum(found.contact_forces[:, 2])) > 0
+    session.undo()
 
 
 @pytest.mark.slow

@@ -108,7 +108,9 @@ def plot_route(
     bar.ax.tick_params(labelsize=9)
     if legend:
         figure.legend(handles=legend, loc="outside lower center", ncols=min(len(legend), 4), frameon=False, fontsize=9)
-    figure.suptitle("\n".join(textwrap.wrap(title.replace(" %", "\u00a0%"), WIDTH)), fontsize=10)
+    for space, kept in ((" %", "\u00a0%"), (" = ", "\u00a0=\u00a0")):
+        title = title.replace(space, kept)
+    figure.suptitle("\n".join(textwrap.wrap(title, WIDTH)), fontsize=10)
     return figure
 
 

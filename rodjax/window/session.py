@@ -31,7 +31,16 @@ from rodjax.solving.result import (
 from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.window.bounds import Asked, asked_of, why_not
-from rodjax.window.controls import Controls, controls_of, handles_of, rods_of, scene_of, sliders_of, with_frames
+from rodjax.window.controls import (
+    Controls,
+    controls_of,
+    handles_of,
+    rods_of,
+    scene_of,
+    shared_obstacles,
+    sliders_of,
+    with_frames,
+)
 from rodjax.window.following import Followed, followed
 from rodjax.window.reading import Figures, Reading, Shown, figures_of, readings_of
 
@@ -121,7 +130,11 @@ class Session:
         self._undone: list[Moment] = []
 
     def _begin_with(self, scene: Any) -> None:
-        self.scene, self.handles, self.sliders = scene, handles_of(scene), sliders_of(scene)
+        self.scene, self.sliders = scene, sliders_of(scene)
+        # What several rods of a harness lie beside is taken in the hand once.
+        self.obstacles = shared_obstacles(scene)
+        others = {name for names in self.obstacles.values() for name in names[1:]}
+        self.handles = {name: handle for name, handle in handles_of(scene).items() if name not in others}
         asked = asked_of(scene)
         self.limits = Asked(
             np.maximum(1 + self.strain_limit, np.asarray(asked.reaches)), tuple(map(np.asarray, asked.depths))
@@ -165,6 +178,7 @@ class Session:
         numbers; the rods follow as far as they can. What makes no sense is told in the report, and nothing moves.
         """
         begin = time.perf_counter()
+        changes = {each: value for name, value in changes.items() for each in self.obstacles.get(name, [name])}
         try:
             target = self.now.controls.changed(changes)
         except (TypeError, ValueError) as error:
@@ -334,7 +348,9 @@ def scene_in(shown: Shown) -> Scene | Harness:
 
 def movable(scene: Any) -> Any:
     """With a frame for each box, which may be turned."""
-    if isinstance(scene, Harness) or not scene.obstacles:
+    if isinstance(scene, Harness):
+        return eqx.tree_at(lambda harness: harness.scenes, scene, tuple(map(movable, scene.scenes)))
+    if not scene.obstacles:
         return scene
     return eqx.tree_at(lambda scene: scene.obstacles, scene, tuple(map(with_frames, scene.obstacles)))
 

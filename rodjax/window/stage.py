@@ -9,9 +9,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.drawing import largest_radius
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.surfaces import surfaces
 from rodjax.window import tube
-from rodjax.window.controls import Pose, center_of, rods_of
+from rodjax.window.controls import Pose, center_of, obstacle_of, rods_of
 from rodjax.window.reading import Pieces, Reading
 from rodjax.window.session import Session
 
@@ -176,17 +177,19 @@ class Stage:
     # --- obstacles and handles ---
 
     def _draw_obstacles(self) -> None:
-        obstacles = getattr(self.session.scene, "obstacles", ())
-        for k, faces in enumerate(
-            surfaces(obstacles, np.asarray(self.session.reading.centerline)) if obstacles else []
-        ):
-            name = f"obstacles[{k}]"
-            pivot = center_of(obstacles[k]) if name in self.session.handles else np.zeros(3)
-            self.obstacles[name] = self._obstacle(f"/obstacles/{k}", faces, pivot)
+        obstacles = self._obstacles_of_scene()
+        around = np.concatenate([reading.centerline for reading in self.session.readings])
+        drawn = surfaces(list(obstacles.values()), around) if obstacles else []
+        for (name, obstacle), faces in zip(obstacles.items(), drawn, strict=True):
+            pivot = center_of(obstacle) if name in self.session.handles else np.zeros(3)
+            self.obstacles[name] = self._obstacle(f"/obstacles/{name}", faces, pivot)
+
+    def _obstacles_of_scene(self) -> dict[str, Obstacle]:
+        return {name: obstacle_of(self.session.scene, name) for name in self.session.obstacles}
 
     def _draw_beside(self) -> None:
         """Obstacles that do not touch the rods, and stay where they are; those of the scene are drawn already."""
-        of_scene = getattr(self.session.scene, "obstacles", ())
+        of_scene = self._obstacles_of_scene().values()
         beside = [one for one in self.session.beside.values() if not any(eqx.tree_equal(one, o) for o in of_scene)]
         around = np.concatenate([reading.centerline for reading in self.session.readings])
         for k, faces in enumerate(surfaces(beside, around) if beside else []):
@@ -221,7 +224,7 @@ class Stage:
             if name in self.obstacles and pose is not self.placed.get(name):
                 _place(self.obstacles[name], pose)
                 self.placed[name] = pose
-            if handles:
+            if handles and name in self.handles:
                 _place(self.handles[name], pose)
 
     def show_handles(self, visible: bool) -> None:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib import rcParams
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize, to_rgba
 from matplotlib.patheffects import withStroke
@@ -40,13 +41,19 @@ LEAST_DEPTH = 0.3
 LABEL_SIZE = (0.6, 0.2)
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
+# Of the names of axes, clear of the numbers and of the color bar on the right [points].
+LABEL_PADS = {"x": 18, "y": 14, "z": 8}
 # Of clips and of obstacles, one after another, and how much of what is behind an obstacle it hides.
 CLIP_COLOR = "#3a3a3a"
 PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
 OPACITY = 0.35
-HALO = withStroke(linewidth=2, foreground="white")
 # The view [degrees].
 ELEVATION, AZIMUTH = 22, -62
+
+
+def halo() -> list[withStroke]:
+    """Around words, of the color of the page, light or dark, so that they can be read on lines."""
+    return [withStroke(linewidth=2, foreground=rcParams["figure.facecolor"])]
 
 
 def tube(
@@ -208,7 +215,7 @@ def draw_arrows(
         written.append(middle)
         x, y, z = at
         ha, va = "left" if side > 0 else "right", "bottom" if rise > 0 else "top"
-        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
+        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=halo())
         tips.append((x, y, z))
     return np.reshape(tips, (-1, 3))
 
@@ -225,7 +232,7 @@ def set_view(
     axes: Axes3D,
     points: Float[np.ndarray, "p 3"],
     labels: bool = True,
-    zoom: float = 0.85,
+    zoom: float = 0.95,
     azimuth: float = AZIMUTH,
 ) -> float:
     """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
@@ -238,7 +245,7 @@ def set_view(
         axis.set_major_locator(MultipleLocator(grid))
         if labels:
             axis.set_label_text(f"{axis.axis_name} [m]")
-            axis.labelpad = 12  # clear of the tick labels
+            axis.labelpad = LABEL_PADS[axis.axis_name]
         else:
             axis.set_major_formatter(NullFormatter())
     axes.set_box_aspect(tuple(spans), zoom=zoom)  # pyright: ignore[reportArgumentType]

@@ -1,5 +1,6 @@
 """Pictures of equilibria by matplotlib, without pyplot: each function draws in given axes, or in those of a new figure,
-and returns them. `axes.figure.savefig("rod.png")` saves the picture.
+and returns them. Page and words have the colors of matplotlib's style, also within
+`matplotlib.style.context("dark_background")`. `axes.figure.savefig("rod.png")` saves the picture.
 """
 
 import base64
@@ -18,12 +19,12 @@ from mpl_toolkits.mplot3d import Axes3D
 from rodjax.checks import instance, positive, sequence
 from rodjax.drawing import (
     COLOR_MAP,
-    HALO,
     LABELS,
     Field,
     color_limits,
     draw_end_loads,
     draw_tube,
+    halo,
     largest_radius,
     set_view,
     surroundings,
@@ -115,7 +116,7 @@ def plot_harness(
         points.append(draw_tube(axes, rod, radius, color_by, norm, surroundings(rod, radius, tuple(new))))
         middle = np.asarray(rod.nodes)[len(rod.s) // 2]
         x, y, z = map(float, middle)
-        axes.text(x, y, z, name, fontsize=8, path_effects=[HALO], zorder=10)
+        axes.text(x, y, z, name, fontsize=8, path_effects=halo(), zorder=10)
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     _add_color_bar([axes], norm, color_by, pad=0.08)
@@ -139,7 +140,7 @@ def plot_along(equilibrium: Equilibrium, *, axes: Iterable[Axes] | None = None) 
         panel.plot(s, values, marker="." if len(s) < 60 else None)
         panel.set(ylabel=label, ylim=(low - margin, high + margin), xlim=(s[0], s[-1]))
         panel.ticklabel_format(axis="y", useOffset=False)
-        panel.grid(color="0.9")
+        panel.grid(color="0.5", alpha=0.2)
     panels[-1].set_xlabel("arclength s [m]")
     figure_of(panels[0]).align_ylabels(panels)
     return panels

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -242,6 +244,18 @@ def test_axes_that_no_picture_can_be_drawn_in_are_refused(stages, twisted):
         plot.plot_along(twisted, axes=plane)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"axes\[0\] must be an? Axes3D"):
         plot.plot_figure_1(stages, stages=[0], axes=[plane])  # pyright: ignore[reportArgumentType]
+
+
+def test_a_picture_is_dark_where_the_style_of_matplotlib_is(twisted):
+    """Page, words, and what is behind these."""
+    with style.context("dark_background"):
+        for axes in (plot.plot_rod(twisted, loads=True), plot.plot_along(twisted)[0]):
+            image = pixels(plot.figure_of(axes))
+            assert np.all(image[0] == 0)
+            assert image.max() > 0.9  # of words
+        (effect,) = plot.plot_rod(twisted, loads=True).texts[0].get_path_effects()
+    assert isinstance(effect, withStroke)
+    assert effect._gc["foreground"] == "black"  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_plot_along_shows_the_fields(twisted):

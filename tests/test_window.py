@@ -1,10 +1,14 @@
 """The window's session, without a browser."""
 
+import contextlib
+import inspect
+import io
 import math
 import socket
 import sys
 import threading
 import tomllib
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,6 +20,7 @@ from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
 from rodjax.window import tube
 from rodjax.window.bounds import Asked, asked_of, why_not
+from rodjax.window.browser import started
 from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, shared_obstacles, sliders_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
@@ -708,6 +713,43 @@ def test_the_command_says_what_is_wrong_in_one_line(options, said, scene_toml, c
     assert out == ""
     assert err.startswith(f"rodjax: {said}")
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('support = "clamp"', 'support = "clam"', "start.support must be "),
+        ("[rod]", "[rod", "is not valid TOML: "),
+        ("[rod]", "[rob]", "rob is not allowed here"),
+    ],
+)
+def test_a_malformed_scene_is_refused_in_one_line(old, new, said, scene_toml, capsys):
+    content = Path(scene_toml).read_text()
+    assert old in content
+    Path(scene_toml).write_text(content.replace(old, new))
+    assert main(["view", scene_toml, "--no-browser", "--port", "0"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"rodjax: {scene_toml}: ")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have one address of their own only")
+def test_only_this_machine_can_connect():
+    """The server listens on 127.0.0.1 and on no other address, of which 127.0.0.2 stands for those of the network."""
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    with contextlib.closing(socket.socket()) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = started(port, inspect.signature(view).parameters["host"].default)
+    try:
+        socket.create_connection(("127.0.0.1", port), 10.0).close()
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.2", port), 10.0)
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):

@@ -16,11 +16,11 @@ from rodjax.checks import line
 from rodjax.drawing import (
     ARROW_LENGTH,
     CLIP_COLOR,
-    HALO,
     OPACITY,
     PALETTE,
     draw_arrows,
     draw_faces,
+    halo,
     seen_axes,
     set_view,
     tube_faces,
@@ -121,4 +121,4 @@ def _name(axes: Axes3D, cable_view: CableView, aside: Float[np.ndarray, "3"], ha
         labels.append((line(cable_view.name), cable_view.centerline[len(cable_view.centerline) // 2]))
     for name, position in labels:
         x, y, z = position + ASIDE * aside
-        axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])
+        axes.text(x, y, z, name, fontsize=8, ha="left", va="top", path_effects=halo())

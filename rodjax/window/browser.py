@@ -217,6 +217,8 @@ class Window:
         self.report = self.session.move(moves)
         self.stage.place(handles=False)
         self._draw()
+        # viser would send what has come together 60 times a second at most: shapes wait, and some are left out.
+        self.server.flush()
         self.on_drawn(self.report)
         now = time.monotonic()
         if self._mailbox.is_empty and now - self._stability_at > STABILITY:

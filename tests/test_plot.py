@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -201,6 +203,38 @@ def test_loads_are_drawn_with_their_size(twisted):
     ):
         expected += [f"{np.linalg.norm(load):.3g} {unit}" for load in loads]
     assert texts[:-1] == expected
+
+
+def hanging_loop():
+    """Whose ends are close together, and so are the arrows at them."""
+    down, up = frame((0.0, 0.0, -1.0), (1.0, 0.0, 0.0)), frame((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    scene = Scene(problems.cable(), Clamp((0, 0, 0), down), Clamp((0.3, 0, 0), up), gravity=(0.0, 0.0, -9.81))
+    return solve(scene, segments=SEGMENTS)
+
+
+@pytest.mark.parametrize("kind", ["a loop", "twisted"])
+def test_words_in_a_picture_are_whole_and_none_is_on_another(kind, twisted, monkeypatch):
+    draw, places = Text.draw, {}
+
+    def noted(text, renderer, *arguments):
+        places[text] = text.get_window_extent(renderer)  # those in space are where they are seen while they are drawn
+        draw(text, renderer, *arguments)
+
+    monkeypatch.setattr(Text, "draw", noted)
+    axes = plot.plot_rod(hanging_loop() if kind == "a loop" else twisted, loads=True)
+    figure = plot.figure_of(axes)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = [*axes.texts, axes.xaxis.label, axes.yaxis.label, axes.zaxis.label]
+    boxes = [places[text] for text in drawn if text.get_text()]
+    assert len(boxes) == 4 + 3 + 1
+    width, height = canvas.get_width_height()
+    for k, box in enumerate(boxes):
+        assert box.x0 >= 0
+        assert box.y0 >= 0
+        assert box.x1 <= width
+        assert box.y1 <= height
+        assert not any(box.overlaps(other) for other in boxes[:k])
 
 
 def test_a_free_end_without_load_has_no_arrow(cable):

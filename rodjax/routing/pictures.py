@@ -18,6 +18,7 @@ from rodjax.drawing import (
     CLIP_COLOR,
     OPACITY,
     PALETTE,
+    Labels,
     draw_arrows,
     draw_faces,
     halo,
@@ -87,7 +88,7 @@ def plot_route(
         0.0,
         ARROW_LENGTH * size,
         FORCE_COLOR,
-        azimuth=view,
+        Labels(axes, np.concatenate([cable_view.centerline for cable_view in cable_views]), ARROW_LENGTH * size, view),
     )
     right, up, _ = seen_axes(view)
     for cable_view in cable_views:

@@ -38,7 +38,7 @@ CHROMIUM = "chromium", "chromium-browser", "google-chrome", "chrome"
 FLAGS = ["--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 FLAGS += ["--no-sandbox"]
 # Small, as the processor that draws it is the one that solves.
-SIZE = {"width": 480, "height": 320}
+SIZE = 480, 320
 COUNT_PICTURES = "window.drawn = 0; const count = () => { window.drawn++; requestAnimationFrame(count); }; count();"
 
 
@@ -164,7 +164,7 @@ def shapes_in_browser(name: str, moves: int, seed: int, period: float = PERIOD) 
     with sync_api.sync_playwright() as playwright:
         try:
             browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
-            page = browser.new_page(viewport=SIZE)
+            page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
             page.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
             page.goto(window.url)
             while not window.is_ready or not window.server.get_clients():

@@ -22,7 +22,7 @@ import numpy as np
 from measuring import conditions, save_rows, set_up
 
 import rodjax as rj
-from rodjax.plot import plot_harness
+from rodjax.plot import figure_of, plot_harness
 from rodjax.programs import kept
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -148,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
         )
     for name, body in result.joints.items():
         print(f"{name:7} {np.linalg.norm(body.contact_force):.3f} N of obstacles")
-    plot_harness(result).savefig(arguments.out / "harness.png", dpi=150)
+    figure_of(plot_harness(result)).savefig(arguments.out / "harness.png", dpi=150)
     rj.report(result, limits=LIMITS, title="A harness on a tray").save(arguments.out)
     save_rows(rows, arguments.out / "harness.csv")
     return result, rows

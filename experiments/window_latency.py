@@ -5,9 +5,14 @@ of 32 elements each, 90 times a second, in a window that nobody looks at: throug
 it sends to a browser. What is measured is the time from a move received to its shape sent, and the processor time that
 the process takes for each move, by which other programs on the machine do not count. It needs viser: pip install
 'rodjax[view]'.
+
+With --browser the same hand moves in a window that Chromium shows, headless: how many shapes a second the window makes,
+how many reach the browser, and how many pictures that draws, here by the processor. It needs playwright and Chromium
+besides.
 """
 
 import argparse
+import shutil
 import threading
 import time
 from collections.abc import Sequence
@@ -28,6 +33,13 @@ PERIOD = 1 / 90  # [s]
 WARM_UP = 20  # first moves, which do not count
 # [ms] and the share of moves that shall be sooner.
 TARGETS = {"two clips": (5.0, 99.9), "two obstacles": (15.0, 99.0), "harness of five": (25.0, 99.0)}
+CHROMIUM = "chromium", "chromium-browser", "google-chrome", "chrome"
+# WebGL by the processor, and no sandbox, which needs rights that a container lacks.
+FLAGS = ["--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+FLAGS += ["--no-sandbox"]
+# Small, as the processor that draws it is the one that solves.
+SIZE = 480, 320
+COUNT_PICTURES = "window.drawn = 0; const count = () => { window.drawn++; requestAnimationFrame(count); }; count();"
 
 
 class Row(NamedTuple):
@@ -127,6 +139,76 @@ def latencies(
     return np.array(times[WARM_UP:]), np.array(processor[WARM_UP:]), reports[WARM_UP:]
 
 
+class Shapes(NamedTuple):
+    """Of so many moves in so many seconds: shapes made, those of them that reached the browser, and pictures drawn."""
+
+    scene: str
+    moves: int
+    seconds: float
+    made: int
+    received: int
+    drawn: int
+
+
+def chromium() -> str | None:
+    return next(filter(None, map(shutil.which, CHROMIUM)), None)
+
+
+def shapes_in_browser(name: str, moves: int, seed: int, period: float = PERIOD) -> Shapes:
+    """Of a hand in a scene, as Chromium sees it."""
+    from playwright import sync_api
+
+    dragged = scenes()[name]
+    window = Window(Session(dragged.scene, segments=SEGMENTS), port=0)
+    received, made = [], []
+    with sync_api.sync_playwright() as playwright:
+        try:
+            browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
+            page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+            page.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
+            page.goto(window.url)
+            while not window.is_ready or not window.server.get_clients():
+                page.wait_for_timeout(100)
+            page.wait_for_timeout(2000)  # until all that was there is drawn
+            page.evaluate(COUNT_PICTURES)
+            window.on_drawn = made.append
+            positions, frames = hand(dragged.begin, np.zeros(3), moves, seed)
+
+            def drag() -> None:
+                due = time.perf_counter()
+                for position, frame in zip(positions, frames, strict=True):
+                    due += period
+                    time.sleep(max(0.0, due - time.perf_counter()))
+                    window.drag(dragged.handle, Pose(position, frame))
+
+            thread, before, begin = threading.Thread(target=drag), len(received), time.perf_counter()
+            thread.start()
+            while thread.is_alive():
+                page.wait_for_timeout(20)
+            seconds, drawn = time.perf_counter() - begin, page.evaluate("window.drawn")
+            page.wait_for_timeout(500)  # what is on its way
+            shapes = sum(map(carries_shape, received[before:]))
+            browser.close()
+        finally:
+            window.close()
+    return Shapes(name, moves, seconds, len(made), shapes, drawn)
+
+
+def carries_shape(frame: str | bytes) -> bool:
+    """Whether a message of viser moves a rod: behind two sizes of 8 bytes is what it says, compressed."""
+    import zstandard
+
+    if isinstance(frame, str) or len(frame) < 16:
+        return False
+    size = int.from_bytes(frame[8:16], "little")
+    return b"batched_positions" in zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
+
+
+def told(shapes: Shapes) -> str:
+    rates = [count / shapes.seconds for count in (shapes.moves, shapes.made, shapes.received, shapes.drawn)]
+    return f"{shapes.scene:16}" + "".join(f"{rate:12.1f}" for rate in rates)
+
+
 def row(name: str, times: np.ndarray, processor: np.ndarray, reports: Sequence[Report]) -> Row:
     median, percent_99, percent_99_9 = np.percentile(times, [50, 99, 99.9])
     target, target_percent = TARGETS[name]
@@ -170,8 +252,15 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
     parser.add_argument("--moves", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder for window_latency.csv")
+    parser.add_argument("--browser", action="store_true", help="shapes a second in Chromium instead")
     arguments = parser.parse_args(argv)
     set_up()
+    if arguments.browser:
+        print(f"{arguments.moves} moves, {SEGMENTS} elements, seed {arguments.seed}; {conditions()}")
+        print(f"{'a second:':16}{'moves':>12}{'made':>12}{'received':>12}{'drawn':>12}")
+        for name in arguments.scene:
+            print(told(shapes_in_browser(name, arguments.moves, arguments.seed)), flush=True)
+        return []
     print(f"{arguments.moves} moves, {SEGMENTS} elements, seed {arguments.seed}; {conditions()}")
     print(HEADER)
     rows = []

@@ -139,6 +139,7 @@ def _add_view(commands: Any) -> None:
         help="address to listen on: by default this machine only; whoever reaches it can move the rod",
     )
     view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
+    view.add_argument("--dark", action="store_true", help="a dark page")
     view.set_defaults(run=_view)
 
 
@@ -375,7 +376,7 @@ def _view(arguments: argparse.Namespace) -> int:
             print(f"rodjax: {arguments.scene}: {' '.join(str(error).split())}", file=sys.stderr)
             return 3
     try:
-        show(session, arguments.port, arguments.host, not arguments.no_browser)
+        show(session, arguments.port, arguments.host, not arguments.no_browser, dark=arguments.dark)
     except ImportError as error:
         raise CommandError(str(error)) from None
     return 0
@@ -630,15 +631,15 @@ def _draw(path: Path, equilibrium: Result, write: Callable[[Result, Path], None]
 
 
 def _plot_harness(result: rodjax.HarnessEquilibrium, path: Path) -> None:
-    from rodjax.plot import plot_harness
+    from rodjax.plot import figure_of, plot_harness
 
-    _save_figure(plot_harness(result), path)
+    _save_figure(figure_of(plot_harness(result)), path)
 
 
 def _plot(equilibrium: Equilibrium, path: Path) -> None:
-    from rodjax.plot import plot_rod
+    from rodjax.plot import figure_of, plot_rod
 
-    _save_figure(plot_rod(equilibrium), path)
+    _save_figure(figure_of(plot_rod(equilibrium)), path)
 
 
 def _write_dxf(equilibrium: Equilibrium, path: Path) -> None:

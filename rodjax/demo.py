@@ -13,7 +13,7 @@ import numpy as np
 from rodjax import problems
 from rodjax.io.files import save
 from rodjax.paths.path import solve_path
-from rodjax.plot import plot_figure_1
+from rodjax.plot import figure_of, plot_figure_1
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, describe
 
 REPORT_MILLISECONDS = 6.0  # a step, with 10 segments, on a 2.2 GHz AMD of 2008
@@ -45,7 +45,8 @@ def run(out: Path, segments: int) -> int:
         path, first = solve(progress=False)
         again = statistics.median(solve(progress=False)[1] for _ in range(REPEATS))
     files = [out / f"figure_1{suffix}" for suffix in (".png", ".vtkhdf", ".csv")]
-    plot_figure_1([jax.tree.map(lambda leaf, k=k: leaf[k], path) for k in STAGES]).savefig(files[0], dpi=150)
+    panels = plot_figure_1([jax.tree.map(lambda leaf, k=k: leaf[k], path) for k in STAGES])
+    figure_of(panels[0]).savefig(files[0], dpi=150)
     save(path, files[1])
     _write_csv(path, files[2])
 

@@ -1,12 +1,13 @@
 """Parts of pictures of rods: tubes as shaded faces, clips and obstacles around them, arrows, views and scales."""
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib import rcParams
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize, to_rgba
 from matplotlib.patheffects import withStroke
@@ -36,17 +37,25 @@ STRIPS = ((0, (0.0, 0.0, 0.0)), (FACES_AROUND // 2, (1.0, 1.0, 1.0)))
 LEAST_RADIUS = 0.018
 ARROW_LENGTH = 0.22
 LEAST_DEPTH = 0.3
-# Width and height of what is written at an arrow, by the length of the longest one.
-LABEL_SIZE = (0.6, 0.2)
+# Width of a letter and height of what is written at an arrow [points].
+LABEL_SIZE = (6.4, 14.0)
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
+# Of the names of axes, clear of the numbers and of the color bar on the right [points].
+LABEL_PADS = {"x": 18, "y": 14, "z": 8}
 # Of clips and of obstacles, one after another, and how much of what is behind an obstacle it hides.
 CLIP_COLOR = "#3a3a3a"
 PALETTE = ("#8d99a6", "#b5976a", "#7d9b76", "#a083a8", "#6f93b8", "#b57f7f", "#9c9c5e", "#5f9c95")
 OPACITY = 0.35
-HALO = withStroke(linewidth=2, foreground="white")
+# Of flat scenes, and how much less it is of those as high as they are wide.
+ZOOM, LESS = 0.95, 0.15
 # The view [degrees].
 ELEVATION, AZIMUTH = 22, -62
+
+
+def halo() -> list[withStroke]:
+    """Around words, of the color of the page, light or dark, so that they can be read on lines."""
+    return [withStroke(linewidth=2, foreground=rcParams["figure.facecolor"])]
 
 
 def tube(
@@ -166,12 +175,52 @@ def draw_end_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, 
     # At s = 0 what the support applies is the reverse of the section force.
     forces = np.stack([-equilibrium.start_force, equilibrium.end_force])
     moments = np.stack([-equilibrium.start_moment, equilibrium.end_moment])
-    feet = nodes[[0, -1]]
+    feet, labels = nodes[[0, -1]], Labels(axes, nodes, length, AZIMUTH)
     tips = [
-        draw_arrows(axes, feet, forces, "N", LEAST_LOAD * float(units.force), length, "tab:red"),
-        draw_arrows(axes, feet, moments, "N m", LEAST_LOAD * float(units.energy), length, "tab:purple", (1.0, 0.8)),
+        draw_arrows(axes, feet, forces, "N", LEAST_LOAD * float(units.force), length, "tab:red", labels),
+        draw_arrows(
+            axes, feet, moments, "N m", LEAST_LOAD * float(units.energy), length, "tab:purple", labels, (1.0, 0.8)
+        ),
     ]
     return np.concatenate(tips)
+
+
+class Labels:
+    """Words in a picture of `points` with arrows as long as `beyond` [m] at them; none is written on another."""
+
+    def __init__(self, axes: Axes3D, points: Float[np.ndarray, "p 3"], beyond: float, azimuth: float):
+        self.axes, (self.right, self.up, _) = axes, seen_axes(azimuth)
+        extent = np.ptp(points @ np.stack([self.right, self.up], axis=1), axis=0) + 2 * beyond
+        figure, place = axes.get_figure(root=True), axes.get_position()
+        assert figure is not None
+        page = 72 * np.array(figure.get_size_inches()) * [place.width, place.height]
+        self._point = float(np.max(extent / page))  # [m]
+        self._written: list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]] = []
+
+    def write(
+        self, text: str, color: str, choices: Sequence[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]
+    ) -> Float[np.ndarray, "3"]:
+        """At the first of the places that is free, on the side of it that a direction tells; else above or below the
+        first. Returns the place.
+        """
+        size = self._point * np.array([LABEL_SIZE[0] * len(text), LABEL_SIZE[1]])
+        first, along = choices[0]
+        steps = [sign * k * size[1] * self.up for k in range(1, 9) for sign in (1, -1)]
+        places = [*choices, *((first + step, along) for step in steps)]
+        at, towards = next((one for one in places if self._is_free(*self._box(one[0], one[1], size))), choices[0])
+        self._written.append(self._box(at, towards, size))
+        x, y, z = at
+        ha, va = "right" if towards @ self.right < 0 else "left", "top" if towards @ self.up < 0 else "bottom"
+        self.axes.text(x, y, z, text, color=color, ha=ha, va=va, path_effects=halo())
+        return at
+
+    def _box(self, at: Any, towards: Any, size: Any) -> tuple[Any, Any]:
+        """The middle of what is written there, and its size."""
+        side = np.where([towards @ self.right < 0, towards @ self.up < 0], -1.0, 1.0)
+        return np.array([at @ self.right, at @ self.up]) + side * size / 2, size
+
+    def _is_free(self, middle: Any, size: Any) -> bool:
+        return not any(np.all(np.abs(middle - other) < (size + its) / 2) for other, its in self._written)
 
 
 def draw_arrows(
@@ -182,15 +231,14 @@ def draw_arrows(
     least: float,
     length: float,
     color: str,
+    labels: Labels,
     heads: Sequence[float] = (1.0,),
-    azimuth: float = AZIMUTH,
 ) -> Float[np.ndarray, "p 3"]:
     """Arrows for loads not smaller than `least`, with their magnitudes, the largest `length` [m] long; returns their
     tips.
     """
     sizes = np.linalg.norm(loads, axis=1)
-    right, up, _ = seen_axes(azimuth)
-    tips, written = [], []
+    tips = []
     for foot, load, size in zip(feet, loads, sizes, strict=True):
         if size < least:
             continue
@@ -200,16 +248,8 @@ def draw_arrows(
             ratio = 0.2 * length / (head * reach)
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
         # Beyond the tip, or where something is written there already before the foot.
-        for at, sign in ((foot + (reach + 0.05 * length) * along, 1), (foot - 0.1 * length * along, -1)):
-            side, rise = np.sign(sign * along @ right) or 1.0, np.sign(sign * along @ up) or 1.0
-            middle = np.array([at @ right, at @ up]) + np.array([side, rise]) * np.array(LABEL_SIZE) * length / 2
-            if not any(np.all(np.abs(middle - other) < np.array(LABEL_SIZE) * length) for other in written):
-                break
-        written.append(middle)
-        x, y, z = at
-        ha, va = "left" if side > 0 else "right", "bottom" if rise > 0 else "top"
-        axes.text(x, y, z, f"{size:.3g} {unit}", color=color, ha=ha, va=va, path_effects=[HALO])
-        tips.append((x, y, z))
+        choices = [(foot + (reach + 0.05 * length) * along, along), (foot - 0.1 * length * along, -along)]
+        tips.append(labels.write(f"{size:.3g} {unit}", color, choices))
     return np.reshape(tips, (-1, 3))
 
 
@@ -225,10 +265,12 @@ def set_view(
     axes: Axes3D,
     points: Float[np.ndarray, "p 3"],
     labels: bool = True,
-    zoom: float = 0.85,
+    zoom: float | None = None,
     azimuth: float = AZIMUTH,
 ) -> float:
-    """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]."""
+    """Limits around the points, one scale and one grid on all axes; returns the spacing of the grid [m]. `zoom`: `None`
+    for as large as the names of the axes allow.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     spans = 1.04 * np.maximum(high - low, LEAST_DEPTH * np.max(high - low))
     ticks = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(0.0, np.max(spans))
@@ -238,9 +280,11 @@ def set_view(
         axis.set_major_locator(MultipleLocator(grid))
         if labels:
             axis.set_label_text(f"{axis.axis_name} [m]")
-            axis.labelpad = 12  # clear of the tick labels
+            axis.labelpad = LABEL_PADS[axis.axis_name]
         else:
             axis.set_major_formatter(NullFormatter())
+    if zoom is None:
+        zoom = ZOOM - LESS * min(spans[2] / max(spans[:2]), 1.0)
     axes.set_box_aspect(tuple(spans), zoom=zoom)  # pyright: ignore[reportArgumentType]
     axes.set_proj_type("ortho")
     axes.view_init(ELEVATION, azimuth)

@@ -17,9 +17,13 @@ SPACING = 0.25
 _narrator: "Narrator | None" = None
 
 
+def in_notebook() -> bool:
+    return "ipykernel" in sys.modules
+
+
 def is_watched() -> bool:
     """Whether a person reads what goes to stderr: in a terminal or a notebook."""
-    return "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty())
+    return in_notebook() or (sys.stderr is not None and sys.stderr.isatty())
 
 
 def told(progress: bool | None) -> contextlib.AbstractContextManager[Any]:

@@ -1,10 +1,10 @@
 """A cold start is a function of the scene, not of the axes in which it is given, nor of the unknowns."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
@@ -48,7 +48,7 @@ def test_a_cold_start_turns_with_the_scene():
     np.testing.assert_allclose(others.total_twist, found.total_twist, atol=1e-6)
 
 
-@jax.jit
+@by_numpy
 def first_tangents(scene: Scene):
     options = Options(SEGMENTS, "hermite", rj.Newton())
     state, first = first_state(scene, None, options)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.discretization.cells import ElementCells, JointCells
@@ -31,7 +32,7 @@ def test_strains_of_elements_have_their_derivatives():
     def values(parts):
         return ElementStrains(parts, h).values
 
-    @jax.jit
+    @by_numpy
     def found_and_expected(parts):
         here = ElementStrains(parts, h)
         slopes = jax.grad(lambda parts: jnp.sum(moments * values(parts)))
@@ -83,7 +84,7 @@ def test_the_linearization_is_that_of_the_lagrangian(rod, kind):
     bases = form.bases_at(point)
     shape = bases.shape[1:]
 
-    @jax.jit
+    @by_numpy
     def found_and_expected(form, point):
         def at(unknowns):
             retracted = form.retract(point, bases, unknowns[:-3].reshape(shape), unknowns[-3:, None])

@@ -468,8 +468,8 @@ def test_what_is_far_away_changes_nothing():
 @pytest.mark.slow
 def test_batches_and_paths_touch_too():
     scenes = [lifted(force) for force in (0.3, 0.32, 0.34)]
-    each = [rj.solve(scene, segments=64) for scene in scenes]
-    batch, path = rj.solve_batch(scenes, segments=64), rj.solve_path(scenes, segments=64)
+    each = [rj.solve(scene, segments=32) for scene in scenes]
+    batch, path = rj.solve_batch(scenes, segments=32), rj.solve_path(scenes, segments=32)
     for k, one in enumerate(each):
         for many in (batch, path):
             assert many.converged[k]

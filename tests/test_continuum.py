@@ -1,6 +1,6 @@
 """The continuous rod: closed forms, every pair of supports, derivatives, and that it says when it fails.
 
-Compiling takes seconds for each pair of supports, so that most pairs are slow tests.
+Tracing takes seconds for each pair of supports, so that most pairs are slow tests.
 """
 
 import itertools

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 
 from rodjax import Clamp, Clip, Cylinder, Free, PointForce, Potential, Rod, Scene, frame
 from rodjax.discretization.contact_gaps import gaps_and_normals, within_elements
@@ -44,7 +45,7 @@ def test_coupling_is_that_of_automatic_derivatives(kind):
     state, first = first_state(scene, None, options)
     direction = jnp.asarray(random.normal(size=12))
 
-    @jax.jit
+    @by_numpy
     def found_and_expected(scene, state, first, frames, offsets, shift):
         search = Search.of(*in_units_of(scene, state), first, options)
         form, units = search.form, search.units
@@ -108,7 +109,7 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
     state, first = first_state(scene, None, options)
     direction = jnp.asarray(random.normal(size=12))
 
-    @jax.jit
+    @by_numpy
     def found_and_expected(scene, state, first, frames, offsets, shift, pressures):
         search = Search.of(*in_units_of(scene, state), first, options)
         form, units = search.form, search.units

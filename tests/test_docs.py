@@ -24,11 +24,18 @@ PAGES = [
 ]
 
 
+# A search from fewer starts here.
+FEWER = {"tutorials/route.md": ("starts=16", "starts=2")}
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_of_code_run(page, tmp_path, monkeypatch, capsys):
     """One after another in one namespace; what they assert holds."""
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.S)
+    text = (DOCS / page).read_text()
+    many, few = FEWER.get(page, ("", ""))
+    assert many in text
+    blocks = re.findall(r"```python\n(.*?)```", text.replace(many, few) if many else text, re.S)
     variables: dict = {}
     for block in blocks:
         exec(compile(block, str(DOCS / page), "exec"), variables)

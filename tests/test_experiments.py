@@ -185,6 +185,21 @@ def test_window_latency(tmp_path):
 
 
 @pytest.mark.slow
+def test_shapes_in_a_browser():
+    """Counted, not timed: what reaches the browser was made, and what was made was asked for."""
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    pytest.importorskip("playwright.sync_api", reason="a browser is driven by playwright: pip install playwright")
+    module = script("window_latency")
+    if module.chromium() is None:
+        pytest.skip("there is no Chromium: apt-get install chromium")
+    shapes = module.shapes_in_browser("two clips", 40, 0)
+    # Of shapes that come together viser sends the newest.
+    assert 1 <= shapes.received <= shapes.made <= shapes.moves == 40
+    assert shapes.drawn >= 1
+    assert not module.carries_shape("text")
+
+
+@pytest.mark.slow
 def test_interactive(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     options = ["--segments", "6", "--scene", "hanging", "--moves", "40", "--out", str(tmp_path)]

@@ -3,11 +3,11 @@
 import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
@@ -41,7 +41,7 @@ def solved(kind: str) -> rj.Equilibrium:
 def test_a_rod_that_turns_as_a_whole_stays_in_equilibrium(kind):
     """Rotations and forces turned with it are a motion that the linearised equilibrium does not resist."""
 
-    @jax.jit
+    @by_numpy
     def resisted(result):
         form, point = form_and_point(result)
         here = form.linearized(point)
@@ -63,7 +63,7 @@ def test_a_rod_that_turns_as_a_whole_stays_in_equilibrium(kind):
 def test_what_another_force_changes_is_that_of_the_lagrangian(kind):
     random = np.random.default_rng(0)
 
-    @eqx.filter_jit
+    @by_numpy
     def changes(result, numbers, change):
         form, point = form_and_point(result)
         bases = form.bases_at(point)
@@ -100,7 +100,7 @@ def test_the_slope_of_a_step_in_contact_is_that_of_its_objective(EI):
     result = rj.solve(Scene(rod, *ends, (0, 0, -1.0), obstacles=[rj.Plane((0, 0, 0), (0, 0, 1))]), segments=8)
     random = np.random.default_rng(0)
 
-    @eqx.filter_jit
+    @by_numpy
     def slopes(result, numbers, displacements, change):
         form, point = form_and_point(result)
         bases, here = form.bases_at(point), form.linearized(point)
@@ -129,7 +129,7 @@ def test_the_slope_of_a_step_in_contact_is_that_of_its_objective(EI):
 def test_the_rounding_floor_is_near_to_what_rounding_leaves(kind):
     """A search that may go on as long as it finds less ends within a thirtieth of it: a tenth was seen, and a third."""
 
-    @jax.jit
+    @by_numpy
     def floor(result):
         form, point = form_and_point(result)
         return form.rounding_floor(point)

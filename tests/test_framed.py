@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 from scipy.integrate import solve_ivp
 
 import rodjax as rj
@@ -399,7 +400,8 @@ def test_a_law_of_two_slopes():
         ).nodes[-1, 2]
 
     at = jnp.array(2.0)
-    differences = (jax.jit(tip)(at + 1e-4) - jax.jit(tip)(at - 1e-4)) / 2e-4
+    there = by_numpy(tip)
+    differences = (there(at + 1e-4) - there(at - 1e-4)) / 2e-4
     assert float(jax.grad(tip)(at)) == pytest.approx(float(differences), rel=1e-6)
 
 

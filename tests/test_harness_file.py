@@ -11,17 +11,30 @@ from scenes import BRANCHES, ROD
 import rodjax
 from rodjax import (
     Body,
+    Box,
+    Capsule,
     Clamp,
     Clip,
+    Cylinder,
+    DistributedForce,
+    Free,
     Harness,
     Hinge,
     Joint,
+    Pin,
+    Pipe,
     Plane,
+    PointForce,
     Rod,
     Scene,
     SceneFileError,
     Slider,
+    Smooth,
+    Sphere,
     Spring,
+    Steps,
+    Swivel,
+    Union,
     cli,
 )
 from rodjax.io.harness_file import read_harness_file
@@ -84,6 +97,75 @@ def test_a_harness_is_written_and_read_to_the_last_bit(tmp_path):
         assert jax.tree.structure(file.harness) == jax.tree.structure(harness)
         for one, other in zip(jax.tree.leaves(file.harness), jax.tree.leaves(harness), strict=True):
             assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+
+
+LEVEL = rodjax.frame((1, 0, 0))
+PLAIN = Rod.circular(0.5, 0.005, 1e7, poisson_ratio=0.5, density=1200.0)
+STRIP = Rod(
+    0.4, (2e-3, 5e-3), 1e-3, 500.0, GA=(80.0, 90.0), mass_per_length=0.1, radius=0.004, rest_curvature=(1 / 3, 0)
+)
+VARYING = Rod(
+    0.3, Steps([0.1], [1e-3, 1 / 3]), 1e-3, 500.0, 0.1, Smooth([0, 0.3], [4e-3, 6e-3]), rest_twist=0.2, rest_strain=0.01
+)
+
+
+def _in_the_middle(**body) -> Harness:
+    """Rods of both kinds that end at places and in directions of their own in a body with these loads."""
+    loads = {
+        "point_forces": [PointForce(0.2, (0, 0, -1 / 3))],
+        "distributed": [DistributedForce((0, 0.1, 0), part=(0.1, 0.3))],
+    }
+    cables = {
+        "plain": Scene(PLAIN, Clamp((0, 0, 0), LEVEL), Joint("y", LEVEL, (-0.01, 0, 1 / 3)), (0, 0, -9.81), **loads),
+        "strip": Scene(STRIP, Joint("y", rodjax.frame((1, 1, 0)), (0.01, 0, 0)), Pin((1, 0.2, 0)), (0, 0, -9.81)),
+        "varying": Scene(VARYING, Joint("y", LEVEL), Free((0, 0, 1 / 3)), (0, 0, -9.81)),
+    }
+    return Harness(cables, {"y": Body(**body)})
+
+
+def _side_by_side(contact) -> Harness:
+    """Three rods between supports, the first with turns."""
+    clips = [Clip(0.2, (0.2, 0, 0), tangent=(1, 0, 1)), Clip(0.3, (0.3, 0, 0), frame=LEVEL)]
+    obstacles = [
+        Sphere((0, 0, -1), 0.1),
+        Box((0, 0, -2), (0.1, 0.2, 1 / 3), LEVEL),
+        Union(Capsule((0, 0, -3), (0, 1, -3), 0.1), Cylinder((0, 0, -4), (0, 1, -4), 0.1)),
+        Pipe([(0, 0, -5), (1, 0, -5), (1, 1, -5)], 0.1),
+    ]
+    cables = {
+        "turned": Scene(PLAIN, Clamp((0, 0, 0), LEVEL), Clamp((0.4, 0, 0), LEVEL), turns=2),
+        "clipped": Scene(PLAIN, Swivel((0, 0.1, 0), (1, 0, 1 / 3)), Joint("far", LEVEL), clips=clips),
+        "above": Scene(STRIP, Pin((0, 0.2, 0)), Clamp((0.4, 0.2, 0), LEVEL), obstacles=obstacles),
+    }
+    return Harness(cables, {"far": Body((0, 0, 0.1))}, contact)
+
+
+HARNESSES = {
+    "a mass": lambda: _in_the_middle(mass=1 / 3),
+    "a force and a moment": lambda: _in_the_middle(force=(1 / 3, 0, 0), moment=(0, 1e-3, 1 / 3)),
+    "all, on a hinge": lambda: _in_the_middle(
+        force=(1 / 3, 0, 0), moment=(0, 1e-3, 0), mass=0.1, support=Hinge((0.5, 0, 0), LEVEL, (0, 1, 1))
+    ),
+    "on a clamp": lambda: _in_the_middle(support=Clamp((0.5, 0, 0), LEVEL)),
+    "on a pin with springs": lambda: _in_the_middle(support=Spring(Pin((0.5, 0, 0)), 1 / 3)),
+    "on a slider": lambda: _in_the_middle(support=Slider((0.5, 0, 0), [(1, 1, 0)], LEVEL)),
+    "no contact": lambda: _side_by_side(False),
+    "contact of all": lambda: _side_by_side(True),
+    "contact of some": lambda: _side_by_side([("turned", "above"), ("clipped", "turned")]),
+}
+
+
+@pytest.mark.parametrize("kind", HARNESSES)
+def test_every_kind_of_harness_is_written_and_read_to_the_last_bit(kind, tmp_path):
+    harness = HARNESSES[kind]()
+    rodjax.write_scene(harness, tmp_path / "harness.toml")
+    read = rodjax.read_scene(tmp_path / "harness.toml")
+    assert jax.tree.structure(read) == jax.tree.structure(harness)  # with names, and pairs in contact
+    for (where, one), other in zip(jax.tree.leaves_with_path(harness), jax.tree.leaves(read), strict=True):
+        assert np.asarray(other).tobytes() == np.asarray(one).tobytes(), jax.tree_util.keystr(where)
+    assert isinstance(read, Harness)
+    rodjax.write_scene(read, tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_bytes() == (tmp_path / "harness.toml").read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.analysis.sensitivity import moved
@@ -90,7 +91,7 @@ def test_a_straight_rod():
         margins = straight(0.8, pull, rj.Limits(bend_radius=6))
         return (margins.value, margins.margin), (margins.value, margins.margin)
 
-    rates, values = jax.jit(jax.jacfwd(found, has_aux=True))(jnp.array(0.0))
+    rates, values = by_numpy(jax.jacfwd(found, has_aux=True))(jnp.array(0.0))
     assert np.isinf(values).all()
     np.testing.assert_array_equal(rates, 0)
 
@@ -101,13 +102,14 @@ def test_slacks_are_continuous_as_an_obstacle_moves_along():
     result = rj.solve(scene, segments=16, solver=TIGHT)
     limits = rj.Limits(clearance=0.01)
 
-    @jax.jit
+    @by_numpy
+    @jax.vmap
     def values(x):
         sphere = rj.Sphere(jnp.stack([x, 0.0 * x, 0.0 * x + 0.06]), 0.02)
         return measured(result, limits, (sphere,), everywhere=True)[0].value
 
     for begin in (-0.01, 0.09, 0.79):
-        found = np.asarray(jax.vmap(values)(begin + 1e-4 * np.arange(201)))
+        found = np.asarray(values(begin + 1e-4 * jnp.arange(201.0)))
         # Nothing jumps where the nearest place of a piece leaves it by an end.
         assert np.max(np.abs(np.diff(found, axis=0))) < 1e-4 + 1e-9
         # Nor does the least have kinks where it goes on to the next piece: second differences are those of a distance

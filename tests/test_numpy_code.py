@@ -1,7 +1,11 @@
 """Programs as NumPy code: each operation beside JAX's own, and when such code runs in the place of an executable."""
 
+import time
+
+import diffrax
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 from jax import lax
@@ -26,6 +30,13 @@ def windows(mode):
     dims = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(0,), start_index_map=(0, 1))
     starts = np.array([[0, 1], [3, 4], [5, 0], [1, -2]])
     return lambda x: lax.gather(x, starts, dims, slice_sizes=(1, 3), mode=mode)
+
+
+def decayed(rate):
+    """y at 1 of y' = -rate y; loops and branches of Equinox."""
+    term, controller = diffrax.ODETerm(lambda t, y, args: -rate * y), diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    how = {"dt0": 0.1, "y0": jnp.ones(()), "stepsize_controller": controller, "adjoint": diffrax.ForwardMode()}
+    return diffrax.diffeqsolve(term, diffrax.Tsit5(), t0=0.0, t1=1.0, throw=False, max_steps=200, **how).ys
 
 
 OPERATIONS = {
@@ -118,6 +129,8 @@ OPERATIONS = {
         jnp.linalg.cholesky(STACK),
         jnp.linalg.cholesky(-POSITIVE),
         jnp.linalg.eigvalsh(STACK),
+        jnp.linalg.svd(x, full_matrices=False)[1],
+        jnp.linalg.pinv(jnp.stack([x, x / 0]), rtol=1e-10),
         negative_count(STACK - jnp.mean(STACK)),
         jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(POSITIVE), True), x),
         *[
@@ -146,6 +159,10 @@ OPERATIONS = {
         jax.jit(lambda x: jax.jvp(jax.nn.relu, (x,), (x,)))(x),
     ],
     "kept apart": lambda x: lax.optimization_barrier((x, 2 * x)),
+    "other packages": lambda x: [
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(POSITIVE)), x[:, 0], throw=False).value,
+        jax.vmap(decayed)(x[0]),
+    ],
 }
 
 
@@ -186,6 +203,12 @@ def test_loops_end_in_time():
     endless = AnswerCode.of(jax.jit(lambda x: lax.while_loop(lambda x: x[0, 0] < jnp.inf, lambda x: x + 1, x)).trace(X))
     with pytest.raises(numpy_operations.TookTooLongError):
         endless([X], 0.01)
+
+
+def test_only_time_of_its_own_counts():
+    with numpy_operations.limited(0.01):
+        time.sleep(0.02)  # as where the machine has other work
+        assert numpy_operations.loop(lambda k: (k < 3,), lambda k: (k + 1,), (0,)) == (3,)
 
 
 @pytest.fixture

@@ -6,8 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -121,7 +125,7 @@ def test_the_strip_keeps_turns_within_a_segment():
 
 
 def test_the_strips_are_painted_on_the_tube(twisted):
-    figure = plot.plot_rod(twisted)
+    figure = plot.figure_of(plot.plot_rod(twisted))
     pixels(figure)
     (surface,) = [a for a in figure.axes[0].collections if isinstance(a, Poly3DCollection)]
     colors = np.asarray(surface.get_facecolor())
@@ -139,7 +143,7 @@ def test_the_strips_are_painted_on_the_tube(twisted):
     [("curvature", "curvature [1/m]"), ("twist", "twist rate [rad/m]"), ("tension", "tension [N]")],
 )
 def test_the_color_bar_has_units_and_the_range_of_the_field(twisted, color_by, label):
-    figure = plot.plot_rod(twisted, color_by=color_by)
+    figure = plot.figure_of(plot.plot_rod(twisted, color_by=color_by))
     _, bar = figure.axes
     assert bar.get_ylabel() == label
     low, high = bar.get_ylim()
@@ -150,7 +154,7 @@ def test_the_color_bar_has_units_and_the_range_of_the_field(twisted, color_by, l
 
 
 def test_all_axes_have_one_scale(twisted):
-    axes = cast(Axes3D, plot.plot_rod(twisted).axes[0])
+    axes = plot.plot_rod(twisted)
     spans = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
     ratio = np.asarray(axes._box_aspect) / spans  # pyright: ignore[reportAttributeAccessIssue]
     np.testing.assert_allclose(ratio, ratio[0])
@@ -159,8 +163,8 @@ def test_all_axes_have_one_scale(twisted):
 
 
 def test_a_thin_rod_is_drawn_thicker_and_the_picture_says_so(twisted):
-    def notes(figure):
-        return [text.get_text() for text in figure.axes[0].texts]
+    def notes(axes):
+        return [text.get_text() for text in axes.texts]
 
     assert notes(plot.plot_rod(twisted, radius=0.005)) == [""]
     assert notes(plot.plot_rod(twisted, radius=0.015)) == ["drawn 3 times as thick as it is"]
@@ -179,7 +183,7 @@ def test_a_rod_that_varies_is_drawn_as_thick_as_it_is(twisted):
         s, centerline, points = drawing.tube(changed, 0.04)
         distance = np.linalg.norm(points - centerline[:, None], axis=-1)
         np.testing.assert_allclose(distance, distance[:, :1] * np.ones_like(distance), rtol=1e-12)
-        (note,) = [text.get_text() for text in plot.plot_rod(changed, radius=0.04).axes[0].texts]
+        (note,) = [text.get_text() for text in plot.plot_rod(changed, radius=0.04).texts]
         assert note == "drawn 2 times as thick as it is"
         return s / length, distance[:, 0]
 
@@ -191,7 +195,7 @@ def test_a_rod_that_varies_is_drawn_as_thick_as_it_is(twisted):
 
 
 def test_loads_are_drawn_with_their_size(twisted):
-    texts = [text.get_text() for text in plot.plot_rod(twisted, loads=True).axes[0].texts]
+    texts = [text.get_text() for text in plot.plot_rod(twisted, loads=True).texts]
     expected = []
     for loads, unit in (
         ((twisted.start_force, twisted.end_force), "N"),
@@ -201,42 +205,105 @@ def test_loads_are_drawn_with_their_size(twisted):
     assert texts[:-1] == expected
 
 
+def hanging_loop():
+    """Whose ends are close together, and so are the arrows at them."""
+    down, up = frame((0.0, 0.0, -1.0), (1.0, 0.0, 0.0)), frame((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    scene = Scene(problems.cable(), Clamp((0, 0, 0), down), Clamp((0.3, 0, 0), up), gravity=(0.0, 0.0, -9.81))
+    return solve(scene, segments=SEGMENTS)
+
+
+@pytest.mark.parametrize("kind", ["a loop", "twisted"])
+def test_words_in_a_picture_are_whole_and_none_is_on_another(kind, twisted, monkeypatch):
+    draw, places = Text.draw, {}
+
+    def noted(text, renderer, *arguments):
+        places[text] = text.get_window_extent(renderer)  # those in space are where they are seen while they are drawn
+        draw(text, renderer, *arguments)
+
+    monkeypatch.setattr(Text, "draw", noted)
+    axes = plot.plot_rod(hanging_loop() if kind == "a loop" else twisted, loads=True)
+    figure = plot.figure_of(axes)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = [*axes.texts, axes.xaxis.label, axes.yaxis.label, axes.zaxis.label]
+    boxes = [places[text] for text in drawn if text.get_text()]
+    assert len(boxes) == 4 + 3 + 1
+    width, height = canvas.get_width_height()
+    for k, box in enumerate(boxes):
+        assert box.x0 >= 0
+        assert box.y0 >= 0
+        assert box.x1 <= width
+        assert box.y1 <= height
+        assert not any(box.overlaps(other) for other in boxes[:k])
+
+
 def test_a_free_end_without_load_has_no_arrow(cable):
     force = PointForce(0.5, (0.0, 0.0, -0.01))
     scene = Scene(cable, Clamp((0.0, 0.0, 0.0), frame((1.0, 0.0, 0.0))), Free(), point_forces=[force])
     equilibrium = solve(scene, segments=SEGMENTS, discretization="finite_difference")
-    texts = [text.get_text() for text in plot.plot_rod(equilibrium, loads=True).axes[0].texts]
+    texts = [text.get_text() for text in plot.plot_rod(equilibrium, loads=True).texts]
     assert texts[0] == "0.01 N"
     assert [text.split()[-1] for text in texts[:-1]] == ["N", "m"]
 
 
 def test_pictures_are_not_blank(twisted):
-    for figure in (plot.plot_rod(twisted, loads=True), plot.plot_along(twisted)):
-        image = pixels(figure)
+    for axes in (plot.plot_rod(twisted, loads=True), plot.plot_along(twisted)[0]):
+        image = pixels(plot.figure_of(axes))
         assert np.mean(np.any(image < 0.9, axis=-1)) > 0.01
         assert np.all(image[0] == 1)  # nothing cut off at the top
 
 
-def test_a_rod_can_be_drawn_in_axes_of_another_figure(twisted):
+def test_pictures_are_drawn_in_axes_of_another_figure(stages, twisted):
+    """Which are returned; nothing but the color bar of each is added to the figure, and nothing drawn elsewhere."""
     figure = Figure()
-    axes = figure.add_subplot(1, 2, 1, projection="3d")
-    assert plot.plot_rod(twisted, axes=axes) is figure
+    spaces = [cast(Axes3D, figure.add_subplot(2, 3, k, projection="3d")) for k in (1, 2, 3)]
+    planes = [figure.add_subplot(2, 3, k) for k in (4, 5, 6)]
+    assert plot.plot_rod(twisted, axes=spaces[0]) is spaces[0]
+    assert plot.plot_along(twisted, axes=planes) == tuple(planes)
+    assert plot.plot_along(twisted, axes=np.array(planes)) == tuple(planes)  # as `subplots` returns them
+    assert plot.plot_figure_1(stages, stages=(1, 5), axes=spaces[1:]) == tuple(spaces[1:])
+    assert len(figure.axes) == 6 + 2
+    assert [len(axes.collections) for axes in spaces] == [1, 1, 1]
+    assert [len(axes.lines) for axes in planes] == [2, 2, 2]
+    assert plot.figure_of(planes[0]) is figure
+
+
+def test_axes_that_no_picture_can_be_drawn_in_are_refused(stages, twisted):
+    plane = Figure().add_subplot()
     with pytest.raises(TypeError, match=r"axes must be an? Axes3D"):
-        plot.plot_rod(twisted, axes=figure.add_subplot(1, 2, 2))  # pyright: ignore[reportArgumentType]
+        plot.plot_rod(twisted, axes=plane)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="axes must hold 3 axes, one for each panel, got 1"):
+        plot.plot_along(twisted, axes=[plane])
+    with pytest.raises(TypeError, match="axes must be a list of axes, got <Axes:"):
+        plot.plot_along(twisted, axes=plane)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"axes\[0\] must be an? Axes3D"):
+        plot.plot_figure_1(stages, stages=[0], axes=[plane])  # pyright: ignore[reportArgumentType]
+
+
+def test_a_picture_is_dark_where_the_style_of_matplotlib_is(twisted):
+    """Page, words, and what is behind these."""
+    with style.context("dark_background"):
+        for axes in (plot.plot_rod(twisted, loads=True), plot.plot_along(twisted)[0]):
+            image = pixels(plot.figure_of(axes))
+            assert np.all(image[0] == 0)
+            assert image.max() > 0.9  # of words
+        (effect,) = plot.plot_rod(twisted, loads=True).texts[0].get_path_effects()
+    assert isinstance(effect, withStroke)
+    assert effect._gc["foreground"] == "black"  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_plot_along_shows_the_fields(twisted):
-    figure = plot.plot_along(twisted)
-    assert [axes.get_ylabel() for axes in figure.axes] == list(drawing.LABELS.values())
-    assert figure.axes[-1].get_xlabel() == "arclength s [m]"
-    for axes, name in zip(figure.axes, drawing.LABELS, strict=True):
+    panels = plot.plot_along(twisted)
+    assert [axes.get_ylabel() for axes in panels] == list(drawing.LABELS.values())
+    assert panels[-1].get_xlabel() == "arclength s [m]"
+    for axes, name in zip(panels, drawing.LABELS, strict=True):
         np.testing.assert_array_equal(axes.lines[0].get_xdata(), twisted.s)
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), getattr(twisted, name))
 
 
 def test_figure_1_shows_six_stages_alike(stages):
-    figure = plot.plot_figure_1(stages)
-    panels = [cast(Axes3D, axes) for axes in figure.axes[:6]]
+    panels = plot.plot_figure_1(stages)
+    figure = plot.figure_of(panels[0])
     titles = [axes.get_title() for axes in panels]
     assert titles[0] == "(a) circle segment\ntotal twist 0°"
     assert titles[1].startswith("(b) upside-down Omega, no twist\n")
@@ -245,7 +312,7 @@ def test_figure_1_shows_six_stages_alike(stages):
     assert figure.axes[6].get_ylabel() == "curvature [1/m]"
     assert pixels(figure).std() > 0.05
     chosen = plot.plot_figure_1(stages, stages=(1, 5))
-    assert [axes.get_title()[:3] for axes in chosen.axes[:2]] == ["(b)", "(f)"]
+    assert [axes.get_title()[:3] for axes in chosen] == ["(b)", "(f)"]
 
 
 def test_errors_say_what_is_allowed(stages, twisted):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from numpy_programs import by_numpy
 from scipy.integrate import solve_ivp
 
 import rodjax as rj
@@ -132,7 +133,7 @@ def test_the_system_is_the_derivative_of_what_is_out_of_balance(EI):
     displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
     change = jnp.asarray(generator.normal(size=point.end_force.shape))
 
-    @jax.jit
+    @by_numpy
     def both(point, rotation):
         here = form.linearized(point)
         rotation = jnp.where(jnp.sum(here.bases**2, axis=0) > 0, rotation, 0.0)

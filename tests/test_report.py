@@ -282,6 +282,27 @@ def test_the_text_and_the_picture_are_written(saved, report):
     assert np.mean(np.any(image < 0.9, axis=-1)) > 0.05
 
 
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_what_the_page_says_can_be_read_on_a_light_and_a_dark_one(saved, theme):
+    """Contrast of at least 4.5, as WCAG 2.2 asks of text, of words and lines on all that they may stand on."""
+    page = (saved / "report.html").read_text()
+    found = re.findall(r":root \{(.*?)\}", page, re.S)[theme == "dark"]
+    colors = dict(re.findall(r"--(\w+): #([0-9a-f]{6})", found))
+
+    def luminance(name: str) -> float:
+        shares = np.array([int(colors[name][k : k + 2], 16) / 255 for k in (0, 2, 4)])
+        linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    assert (luminance("page") < luminance("ink")) == (theme == "dark")
+    pairs = [(word, on) for word in ("ink", "soft", "bad") for on in ("page", "hover")]
+    pairs += [(word, on) for word in ("ink", "soft", "load", "x", "y", "z") for on in ("sky", "ground")]
+    pairs += [("ink", on) for on in ("plain", "kept", "broken")]
+    for word, on in pairs:
+        low, high = sorted((luminance(word), luminance(on)))
+        assert (high + 0.05) / (low + 0.05) > 4.5, (word, on)
+
+
 def test_the_page_loads_nothing_and_hides_no_tags_in_names(saved, report):
     page = (saved / "report.html").read_text()
     assert len(page) < 1e6

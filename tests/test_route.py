@@ -73,6 +73,19 @@ def test_the_shortest_turn_is_an_arc(shortest):
     assert "4 of 4 starts" in str(shortest)
 
 
+def test_the_designs_of_the_search_are_kept(shortest):
+    """From a start to the route."""
+    designs = shortest.designs
+    assert eqx.tree_equal(jax.tree.map(lambda leaf: leaf[-1], designs), shortest.scene)
+    lengths = np.asarray(designs.rod.length)
+    assert 4 < len(lengths) <= 1 + int(np.max(shortest.starts.iterations))
+    # Converging: the last steps are smaller than the first.
+    steps = np.abs(np.diff(lengths))
+    assert np.max(steps[-2:]) < 0.01 * np.max(steps)
+    path = rj.solve_path(designs, segments=16, solver=TIGHT)
+    np.testing.assert_allclose(path.nodes[-1], shortest.equilibrium.nodes, atol=1e-9)
+
+
 def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
@@ -161,17 +174,6 @@ def test_an_obstacle_in_the_way_is_passed(shortest):
 
 
 @pytest.mark.slow
-def test_the_same_arguments_give_the_same_bits():
-    """As executables: which of the first answers are NumPy code, equal to rounding, is a matter of time."""
-    with rj.numpy_first(False):
-        first, again = routed(), routed()
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert first.starts.message == again.starts.message
-    assert first.multipliers == again.multipliers
-
-
-@pytest.mark.slow
 def test_what_cannot_be_kept_is_said(shortest):
     """A bend radius of 0.4 m in a space of 0.25 m."""
     route = routed(bend_radius=40.0)
@@ -226,6 +228,26 @@ def test_a_taut_trial_takes_no_solve():
     from_taut = spares_asked(0.6, lambda design: 0.25 - design[0] ** 2)
     assert np.min(from_taut) >= -0.22
     assert np.min(from_taut[1:]) < -1e-3
+
+
+def test_a_search_tells_where_it_stood():
+    """Down a parabola with the minimum at 0.7: from where it began, each place lower than the one before."""
+
+    def evaluated(design):
+        return Numbers((design[0] - 0.7) ** 2, np.zeros(0), np.array([[2 * (design[0] - 0.7)]]), True)
+
+    begin = np.array([0.1])
+    search = Search(
+        begin,
+        evaluated(begin),
+        Settings(1.0, np.zeros(0), 1e-12, 20),
+        lambda asked: evaluated(asked.design),
+        lambda design: np.inf,
+    )
+    stood = np.array(search.run().designs)[:, 0]
+    assert stood[0] == 0.1
+    assert stood[-1] == pytest.approx(0.7, abs=1e-6)
+    assert np.all(np.diff((stood - 0.7) ** 2) < 0)
 
 
 def test_variables():
@@ -303,14 +325,15 @@ def test_arguments_are_checked():
 
 
 @pytest.mark.slow
-def test_groups_of_starts_are_searched_by_anybody(shortest, monkeypatch):
-    """In groups of two, whoever searches from them, the same to the last bit; the arc as in one group.
+def test_the_same_arguments_give_the_same_bits_whoever_searches(shortest, monkeypatch):
+    """In groups of two, again and by others, the same to the last bit; the arc as in one group. As executables: which
+    of the first answers are NumPy code, equal to rounding, is a matter of time.
 
     The last test, as what is compiled here has other last bits than the NumPy code of the others.
     """
     monkeypatch.setattr("rodjax.routing.route.GROUP", 2)
     with ThreadPoolExecutor(2) as engine:
-        kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
+        kinds: list[dict] = [{"threads": 1}, {"threads": 1}, {"threads": 2}, {"executor": engine}]
         with rj.numpy_first(False):  # cold solves of all starts, too
             first, *others = (routed(**kind) for kind in kinds)
     assert first.feasible
@@ -320,3 +343,5 @@ def test_groups_of_starts_are_searched_by_anybody(shortest, monkeypatch):
         assert jax.tree.structure(other) == jax.tree.structure(first)
         for ours, theirs in zip(jax.tree.leaves(other), jax.tree.leaves(first), strict=True):
             np.testing.assert_array_equal(ours, theirs)
+        assert other.starts.message == first.starts.message
+        assert other.multipliers == first.multipliers

@@ -57,6 +57,24 @@ def test_a_taut_wire():
     assert "not of first order: bend radius" in str(envelope)
 
 
+def test_rods_are_drawn_within_tolerances():
+    """Of 4000: means and covariances of what scatters, each within four of its standard errors."""
+    envelope = rj.tolerances(wire(), OF_WIRE, samples=0)
+    drawn = envelope.drawn(4000, seed=1)
+    assert isinstance(drawn.end, Clamp)
+    ends = np.asarray(drawn.end.position) - [1.01, 0, 0]
+    sigma = np.sqrt(np.diag(COVARIANCE))
+    assert np.all(np.abs(ends.mean(0)) < 4 * sigma / np.sqrt(4000))
+    found = np.cov(ends.T)
+    errors = np.sqrt((COVARIANCE**2 + np.outer(sigma, sigma) ** 2) / 4000)
+    assert np.all(np.abs(found - COVARIANCE) < 4 * errors)
+    assert np.std(drawn.rod.length) == pytest.approx(1e-4, rel=4 / np.sqrt(8000))
+    assert eqx.tree_equal(envelope.drawn(5, seed=2), envelope.drawn(5, seed=2))
+    assert not eqx.tree_equal(envelope.drawn(5, seed=2), envelope.drawn(5))
+    with pytest.raises(ValueError, match="count must be a whole number from 1"):
+        envelope.drawn(0)
+
+
 @pytest.mark.slow
 def test_the_softest_motion_of_a_rod_that_slides():
     """Its deviation beside the difference of two solves."""

@@ -1,10 +1,14 @@
 """The window's session, without a browser."""
 
+import contextlib
+import inspect
+import io
 import math
 import socket
 import sys
 import threading
 import tomllib
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,11 +20,12 @@ from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
 from rodjax.window import tube
 from rodjax.window.bounds import Asked, asked_of, why_not
-from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, sliders_of
+from rodjax.window.browser import started
+from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, shared_obstacles, sliders_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import rows
-from rodjax.window.opening import session_of, view
+from rodjax.window.opening import DRAWN, session_of, view
 from rodjax.window.session import SNAP_WAY, Session
 
 SEGMENTS = 10
@@ -78,7 +83,7 @@ def test_a_scene_of_its_own_controls_is_the_same():
     assert jax_leaves(same) == pytest.approx(jax_leaves(scene), abs=1e-15)  # the tangent of a clip by way of a frame
 
 
-def jax_leaves(scene: rj.Scene) -> np.ndarray:
+def jax_leaves(scene: rj.Scene | rj.Harness) -> np.ndarray:
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
 
 
@@ -347,8 +352,139 @@ def test_a_harness_is_taken_in_the_hand(tmp_path):
     (tmp_path / "path.vtkhdf").write_bytes(content)
     replayed = session_of(rj.load(tmp_path / "path.vtkhdf"), None)
     assert len(replayed.recorded) == len(session.recorded)
-    with pytest.raises(ValueError, match="a harness cannot be written as a scene file yet"):
-        scene_file(session)
+    content, remark = scene_file(session)
+    assert remark == ""
+    (tmp_path / "harness.toml").write_bytes(content)
+    harness = read_scene(tmp_path / "harness.toml")
+    assert isinstance(harness, rj.Harness)
+    assert jax.tree.structure(harness) == jax.tree.structure(session.result.harness)
+    np.testing.assert_array_equal(jax_leaves(harness), jax_leaves(session.result.harness))
+
+
+def beside_a_floor() -> rj.Harness:
+    cable, floor = rj.problems.cable(), rj.Plane((0, 0, -0.25), (0, 0, 1))
+    ball, box = rj.Sphere((0.4, 0.0, 0.4), 0.1), rj.Box((1.2, 0.0, 0.4), (0.1, 0.1, 0.1))
+    rods = {
+        "left": rj.Scene(
+            cable, rj.Clamp((0, 0, 0), LEVEL), rj.Joint("y", LEVEL), (0, 0, -9.81), obstacles=[floor, ball]
+        ),
+        "right": rj.Scene(
+            cable, rj.Joint("y", LEVEL), rj.Clamp((1.6, 0, 0), LEVEL), (0, 0, -9.81), obstacles=[box, floor]
+        ),
+    }
+    return rj.Harness(rods, {"y": rj.Body(support=rj.Pin((0.8, 0.0, 0.0)))})
+
+
+def test_what_rods_of_a_harness_have_in_common_is_one_obstacle():
+    assert shared_obstacles(beside_a_floor()) == {
+        "left/obstacles[0]": ["left/obstacles[0]", "right/obstacles[1]"],
+        "left/obstacles[1]": ["left/obstacles[1]"],
+        "right/obstacles[0]": ["right/obstacles[0]"],
+    }
+    twice = hanging(obstacles=[rj.Sphere((0, 0, -1), 0.1), rj.Sphere((0, 0, -1), 0.1)])
+    assert list(shared_obstacles(twice)) == ["obstacles[0]", "obstacles[1]"]  # both can be told apart by a hand
+
+
+@pytest.mark.slow
+def test_a_floor_under_a_harness_lifts_all_its_rods():
+    session = Session(beside_a_floor(), segments=6)
+    assert [name for name in session.handles if "obstacles" in name] == list(session.obstacles)
+    low = [float(np.min(session.result[name].nodes[:, 2])) for name in session.result]
+    radius = float(session.result["left"].scene.rod.radius)
+    place = session.now.controls.poses["left/obstacles[0]"].position
+    report = session.move({"left/obstacles[0]": (place + np.array([0, 0, 0.1]), None)})
+    assert report.moved, report.message
+    for name, before in zip(session.result, low, strict=True):
+        found = session.result[name]
+        assert before < -0.2
+        assert float(np.min(found.nodes[:, 2])) == pytest.approx(-0.15 + radius, abs=1e-3)
+        assert float(np.sum(found.contact_forces[:, 2])) > 0
+    session.undo()
+
+
+@pytest.mark.slow
+def test_a_saved_harness_has_the_turns_of_its_rods(tmp_path):
+    """Two cables one above the other, which may touch: the end of one is wound up by one turn and a half."""
+    cable = rj.Rod.circular(1.0, 5e-3, 1e7, poisson_ratio=0.5, density=1200.0)
+    rods = {
+        name: rj.Scene(cable, rj.Clamp((0, 0, z), LEVEL), rj.Clamp((0.95, 0, z), LEVEL), (0, 0, -9.81))
+        for name, z in {"above": 0.3, "below": 0.0}.items()
+    }
+    session = Session(rj.Harness(rods, contact=True), segments=6)
+    for k in range(1, 7):
+        report = session.move({"above/end": ((0.95, 0.0, 0.3), turned(LEVEL, k * math.pi / 2))})
+        assert report.moved, report.message
+    content, remark = scene_file(session)
+    assert remark == ""
+    (tmp_path / "harness.toml").write_bytes(content)
+    harness = read_scene(tmp_path / "harness.toml")
+    assert isinstance(harness, rj.Harness)
+    assert harness.contact_names == [("above", "below")]
+    again = rj.solve(harness, segments=6)
+    for name in harness:
+        twist = float(session.result[name].total_twist)
+        assert float(again[name].total_twist) == pytest.approx(twist, abs=1e-6)
+    # The end has turned by 3 pi; what the curve writhes is not twist.
+    assert float(again["above"].total_twist) == pytest.approx(3 * math.pi, abs=1.5)
+    assert float(again["below"].total_twist) == pytest.approx(0.0, abs=1e-6)
+
+
+# --- routes and tolerances -------------------------------------------------------------------------------------------
+
+
+def test_rods_drawn_within_tolerances_are_steps():
+    """A taut wire: each is pulled by EA (d/L - 1), with its own d and L."""
+    rod = rj.Rod(1.0, 1.0, 1.0, 1e4, radius=0.01)
+    wire = rj.solve(rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((1.01, 0, 0), LEVEL)), segments=8)
+    given = [rj.Tolerance("end.position.0", 1e-3), rj.Tolerance("rod.length", 1e-3)]
+    ball = rj.Sphere((0.5, 0.0, 0.1), 0.05)
+    limits = rj.Limits(clearance=0.03, end_force=200.0)
+    envelope = rj.tolerances(wire, given, limits=limits, obstacles=[ball], names=["the ball"], samples=0)
+    session = session_of(envelope, None)
+    assert session.segments == 8
+    assert len(session.recorded) == DRAWN
+    np.testing.assert_array_equal(session.result.nodes, wire.nodes)  # in the beginning it is as it should be
+    scenes = [moment.result.scene for moment in session.recorded]
+    stretches = np.array([float(scene.end.position[0] / scene.rod.length) for scene in scenes])
+    np.testing.assert_array_equal([float(scene.rod.length) for scene in scenes], envelope.drawn(DRAWN).rod.length)
+    forces = [moment.result.end_force[0] for moment in session.recorded]
+    np.testing.assert_allclose(forces, 1e4 * (stretches - 1), rtol=1e-7)
+    assert np.std(forces) > 10
+    # Where the ball is 0.1 from the middle, with its radius and that of the wire taken off.
+    assert session.figures[0].clearances[0] == pytest.approx(0.1 - 0.05 - 0.01, abs=1e-3)
+    (row,) = [row for row in rows(session, session.move({}), limits) if row.label.startswith("clearance")]
+    assert (row.label, row.is_bad) == ("clearance, the ball", False)
+    session.show(session.recorded[3])
+    assert session.move({"end": ((1.0, 0.0, 0.0), None)}).moved
+
+
+@pytest.mark.slow
+def test_the_designs_of_a_search_are_steps():
+    """The last is the route, and the others are at rest where they were told to be."""
+    rod = rj.Rod(0.3, 0.02, 0.015, 2e4, 0.15, 0.005)
+    scene = rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((0.2, 0, 0.2), rj.frame((0, 0, 1))))
+    route = rj.route(
+        scene,
+        [
+            rj.Between("end.position.0", 0.05, 0.25),
+            rj.Between("end.position.2", 0.05, 0.25),
+            rj.Between("rod.length", 0.1, 0.45),
+        ],
+        limits=rj.Limits(bend_radius=9.0, clearance=0.01),
+        obstacles=[rj.Sphere((0.0, 1.0, 0.0), 0.05)],
+        names=["the ball"],
+        starts=2,
+        segments=12,
+    )
+    session = session_of(route, None)
+    assert 2 < len(session.recorded) <= len(route.designs.rod.length)
+    ends = [moment.result.nodes[-1] for moment in session.recorded]
+    np.testing.assert_allclose(ends, [moment.result.scene.end.position for moment in session.recorded], atol=1e-12)
+    lengths = [float(moment.result.scene.rod.length) for moment in session.recorded]
+    assert set(lengths) <= set(np.asarray(route.designs.rod.length).tolist())
+    assert lengths[-1] == float(route.scene.rod.length)
+    np.testing.assert_array_equal(session.result.nodes, route.equilibrium.nodes)
+    assert list(session.beside) == ["the ball"]
 
 
 # --- undo, record, save ----------------------------------------------------------------------------------------------
@@ -495,6 +631,17 @@ def test_numbers_stand_against_their_limits(session):
     assert found["softest motion"].text == f"{stiffness:.3g} N"
 
 
+def test_a_rod_without_twist_is_told_so_without_roundings(session):
+    found = {row.label: row.text for row in rows(session, session.move({}))}
+    assert abs(float(session.result.total_twist)) < 1e-9
+    assert found["total twist"] == "0.0°, 0.00 turns"
+    assert found["twist rate"] == "0 rad/m"
+    session.move({"end": ((0.8, 0.0, 0.0), turned(LEVEL, 0.5))})
+    found = {row.label: row.text for row in rows(session, session.move({}))}
+    twist = float(session.result.total_twist)
+    assert found["total twist"] == f"{math.degrees(twist):.1f}°, {twist / (2 * math.pi):.2f} turns"
+
+
 # --- the browser's side ----------------------------------------------------------------------------------------------
 
 
@@ -522,12 +669,27 @@ def test_of_moves_that_nobody_took_the_newest_counts():
 
 
 def test_arguments_that_make_no_sense_are_refused():
-    with pytest.raises(TypeError, match="shown must be a Scene or Harness or Equilibrium or HarnessEquilibrium, got 3"):
+    with pytest.raises(
+        TypeError,
+        match="shown must be a Scene or Harness or Equilibrium or HarnessEquilibrium or Route or Envelope, got 3",
+    ):
         view(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="segments must be a whole number from 2"):
         Session(hanging(), segments=1)
     with pytest.raises(ValueError, match="scene must have an equilibrium to begin with, got none: not converged"):
         Session(hanging(obstacles=[WALL]), segments=SEGMENTS)
+
+
+@pytest.mark.parametrize(("in_notebook", "expected"), [(False, (True, True)), (True, (False, False))])
+def test_a_notebook_shows_the_window_below_the_cell(in_notebook, expected, monkeypatch):
+    """It neither waits there nor opens another tab, unless it is told to."""
+    asked = []
+    monkeypatch.setattr("rodjax.window.opening.session_of", lambda shown, segments: None)
+    monkeypatch.setattr("rodjax.window.opening.in_notebook", lambda: in_notebook)
+    monkeypatch.setattr("rodjax.window.opening.show", lambda *arguments, **more: asked.append(arguments))
+    view(hanging())
+    view(hanging(), open_browser=True, block=False)
+    assert [arguments[3:5] for arguments in asked] == [expected, (True, False)]
 
 
 @pytest.fixture
@@ -551,6 +713,43 @@ def test_the_command_says_what_is_wrong_in_one_line(options, said, scene_toml, c
     assert out == ""
     assert err.startswith(f"rodjax: {said}")
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('support = "clamp"', 'support = "clam"', "start.support must be "),
+        ("[rod]", "[rod", "is not valid TOML: "),
+        ("[rod]", "[rob]", "rob is not allowed here"),
+    ],
+)
+def test_a_malformed_scene_is_refused_in_one_line(old, new, said, scene_toml, capsys):
+    content = Path(scene_toml).read_text()
+    assert old in content
+    Path(scene_toml).write_text(content.replace(old, new))
+    assert main(["view", scene_toml, "--no-browser", "--port", "0"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"rodjax: {scene_toml}: ")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have one address of their own only")
+def test_only_this_machine_can_connect():
+    """The server listens on 127.0.0.1 and on no other address, of which 127.0.0.2 stands for those of the network."""
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    with contextlib.closing(socket.socket()) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = started(port, inspect.signature(view).parameters["host"].default)
+    try:
+        socket.create_connection(("127.0.0.1", port), 10.0).close()
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.2", port), 10.0)
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):

@@ -1,6 +1,7 @@
 """The window in a real browser, headless: what it shows, a handle dragged by the mouse, and that it ends cleanly."""
 
 import io
+import json
 import os
 import shutil
 import signal
@@ -11,10 +12,13 @@ import time
 import tomllib
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import get_cachedir
 from matplotlib.image import imread
+from PIL import Image, ImageSequence
 
 import rodjax as rj
 from rodjax.window.controls import Pose
@@ -73,6 +77,29 @@ def drawn_share(page, camera: Camera, points) -> float:
     columns, rows = np.round(camera.pixels(points)).astype(int).T
     near = [is_dark[r - 2 : r + 3, c - 2 : c + 3].any() for r, c in zip(rows, columns, strict=True)]
     return float(np.mean(near))
+
+
+def saved_film(page, window, folder) -> np.ndarray:
+    """Three moves are recorded, and the pictures that the browser draws of them downloaded."""
+    pose = window.session.now.controls.poses["end"]
+    window.command(lambda: window.record(True))
+    for k in range(3):
+        window.drag("end", Pose(pose.position + np.array([0.0, 0.0, 0.06 * (k + 1)]), pose.frame))
+        until(lambda k=k: len(window.session.recorded) == k + 2, "a move to be recorded")
+    window.command(lambda: window.record(False))
+    page.get_by_role("button", name="Record").or_(page.get_by_text("Record", exact=True)).first.click()
+    with page.expect_download(timeout=1e3 * SECONDS) as download:
+        page.get_by_role("button", name="Save film").click()
+        page.get_by_role("link", name="film").or_(page.get_by_text("Download film", exact=False)).first.click(
+            timeout=1e3 * SECONDS
+        )
+    path = folder / download.value.suggested_filename
+    download.value.save_as(path)
+    if path.suffix == ".gif":
+        images = ImageSequence.Iterator(Image.open(path))
+        return np.stack([np.asarray(image.convert("RGB")) for image in images])
+    imageio = pytest.importorskip("imageio.v3")
+    return imageio.imread(path.read_bytes(), extension=path.suffix, plugin="pyav")
 
 
 def test_a_rod_is_dragged_in_the_browser(tmp_path):
@@ -137,6 +164,17 @@ def test_a_rod_is_dragged_in_the_browser(tmp_path):
         saved = tomllib.loads((tmp_path / "scene.toml").read_text())
         assert saved["end"]["position"] == f"[{', '.join(map(repr, map(float, reached)))}] m"
 
+        page.get_by_role("checkbox", name="Dark page").check()
+        until(lambda: imread(io.BytesIO(page.screenshot()))[5, 5, :3].max() < 0.3, "the dark page")
+        page.get_by_role("checkbox", name="Dark page").uncheck()
+        until(lambda: imread(io.BytesIO(page.screenshot()))[5, 5, :3].min() > 0.9, "the light page")
+        film = saved_film(page, window, tmp_path)
+        assert film.shape == (4, 640, 960, 3)
+        dark = [np.mean(picture.min(axis=-1) < 200) for picture in film]
+        assert min(dark) > 0.002  # the rod is in each of them
+        changed = [np.mean(np.abs(film[k + 1].astype(int) - film[k]).max(axis=-1) > 60) for k in range(3)]
+        assert min(changed) > 0.001  # and elsewhere in the next
+
         page.get_by_role("button", name="Undo").click()
         until(lambda: session.now.controls.poses["end"].position[0] == 0.8, "the move to be undone")
         browser.close()
@@ -149,11 +187,30 @@ def test_a_rod_is_dragged_in_the_browser(tmp_path):
     until(lambda: set(threading.enumerate()) <= before, "all threads to end")
 
 
+# Tells what the command opens, in the end; where the tests run in the background of a shell, Ctrl-C would be ignored.
+WATCHED = """
+import json, os, signal, sys
+import rodjax.cli
+signal.signal(signal.SIGINT, signal.default_int_handler)
+opened = []
+def watch(event, arguments):
+    if event == "open" and isinstance(arguments[0], (str, bytes, os.PathLike)):
+        is_written = (arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC) != 0
+        opened.append((os.path.abspath(os.fsdecode(arguments[0])), is_written))
+sys.addaudithook(watch)
+code = rodjax.cli.main()
+print(json.dumps(opened))
+sys.exit(code)
+"""
+# Where programs and what the system tells of itself are; matplotlib keeps a list of fonts.
+PROGRAMS = (sys.prefix, sys.base_prefix, str(Path(rj.__file__).parent), "/usr", "/etc", "/proc", "/sys", "/dev")
+FONTS = get_cachedir()
+
+
 def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
+    """And reads no file but the scene and programs, and writes none."""
     rj.write_scene(scene(), tmp_path / "scene.toml", segments=10)
-    # Where the tests run in the background of a shell, Ctrl-C would be ignored.
-    main = "import signal, sys, rodjax.cli; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    main += "sys.exit(rodjax.cli.main())"
+    main = WATCHED
     command = [sys.executable, "-W", "error", "-c", main, "view", "scene.toml", "--port", "0", "--no-browser"]
     process = subprocess.Popen(
         command,
@@ -170,7 +227,11 @@ def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
     assert listening(port, "127.0.0.1")
     process.send_signal(signal.SIGINT)
     out, errors = process.communicate(timeout=SECONDS)
-    assert (process.returncode, out, errors) == (0, "", "")
+    assert (process.returncode, errors) == (0, "")
+    opened = json.loads(out)
+    assert [str(tmp_path / "scene.toml"), False] in opened
+    assert {path for path, _ in opened if not path.startswith((*PROGRAMS, FONTS))} == {str(tmp_path / "scene.toml")}
+    assert {path for path, is_written in opened if is_written and not path.startswith(FONTS)} <= {os.devnull}
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
     assert not listening(port, "127.0.0.1")
 

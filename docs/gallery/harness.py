@@ -34,5 +34,5 @@ assert result.converged
 assert abs(y[1]) < 1e-6  # both sides are alike
 np.testing.assert_allclose(result["left"].start_force[2], result["right"].start_force[2], rtol=1e-5)
 
-figure = plot_harness(result)
-figure.savefig("harness.png", dpi=90)
+axes = plot_harness(result)
+axes.figure.savefig("harness.png", dpi=90)

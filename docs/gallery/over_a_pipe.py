@@ -23,5 +23,5 @@ assert result.converged
 assert pushed[2] > 0.1 * weight
 assert abs(pushed[2] + held[2] - weight) < 1e-6 * weight  # what bears the cable is its weight
 
-figure = plot_rod(result)
-figure.savefig("over_a_pipe.png", dpi=90)
+axes = plot_rod(result)
+axes.figure.savefig("over_a_pipe.png", dpi=90)

@@ -56,6 +56,8 @@ from rodjax.mechanics.energy import (
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, needs_frames, nondimensional, slid, slides, sliding_arclengths
 from rodjax.model.supports import Clamp, Directed, Pin
+from rodjax.programs.answers import one_answer
+from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, warn_of_outcome
 from rodjax.solving.solve import solve
@@ -74,6 +76,7 @@ MIN_INTERVALS, MAX_INTERVALS = 4, 128
 DEFAULT_INTERVALS = 16
 
 
+@one_answer
 def solve_continuum(
     scene: Scene,
     guess: Equilibrium | None = None,
@@ -253,7 +256,7 @@ def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEn
     )
 
 
-@functools.partial(jax.jit, static_argnames=("rtol", "intervals", "segments"))
+@functools.partial(compiled, static_argnames=("rtol", "intervals", "segments"))
 def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     scaled, units = nondimensional(scene)
     if slides(scene):
@@ -326,7 +329,7 @@ def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float
     return force, error_growth(s, jnp.sqrt(jnp.sum(force**2, axis=1)), (guess.curvature * units.length) ** 2)
 
 
-@jax.jit
+@compiled
 def _growth(scene: Scene, guess: Equilibrium) -> Float[Array, ""]:
     scaled, units = nondimensional(scene)
     return _growth_along(scaled, guess, units)[1][-1]

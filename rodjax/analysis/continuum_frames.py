@@ -50,6 +50,7 @@ from rodjax.model.rest import RestStrain, SpaceCurve, SplinedCurve
 from rodjax.model.rod import Law
 from rodjax.model.scene import Scene, nondimensional
 from rodjax.model.supports import Clamp
+from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium, form_and_point
 from rodjax.units import Units
 
@@ -324,7 +325,7 @@ def _over_intervals(scene: Scene, rtol: float, start: Start, sections: Section) 
 # --- the solve -------------------------------------------------------------------------------------------------------
 
 
-@functools.partial(jax.jit, static_argnames=("rtol", "intervals", "segments"))
+@functools.partial(compiled, static_argnames=("rtol", "intervals", "segments"))
 def solve_frames(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     """As `solve_continuum`, from a guess with frames."""
     scaled, units = nondimensional(scene)
@@ -377,7 +378,7 @@ def _along(guess: Equilibrium, units: Units) -> _Along:
     )
 
 
-@jax.jit
+@compiled
 def growth_of_frames(scene: Scene, guess: Equilibrium) -> Float[Array, ""]:
     """The exponent of the growth of errors from one end of the rod to the other."""
     return _along(guess, nondimensional(scene)[1]).growth[-1]

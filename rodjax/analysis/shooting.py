@@ -327,6 +327,8 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     status = jnp.where(residual < TOLERANCE, Status.CONVERGED, Status.MAX_ITERATIONS)
     status = jnp.where(jnp.isfinite(residual), status, Status.NOT_FINITE)
     status = with_strain(status, reached.axial_strain, DEFAULT_STRAIN_LIMIT)
+    # Of types that do not yield to others, as NumPy code needs them.
+    status, iterations = (jnp.asarray(number, int) for number in (status, iterations))
     # Potentials are zero at the global origin, not at that of the units.
     from_origin = sections.position + (units.origin / units.length)[None]
     energy = reached.elastic_energy + reached.load_energy + _energy_at(scaled, start, from_origin)
@@ -334,7 +336,6 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     end_force = (last.force if held_at_both_ends(scene) else jnp.zeros_like(last.force))[:, None]
     if scene.clips:
         end_force = _end_forces_of_spans(scaled, start, sections)
-    none = jnp.zeros((), int)
     return Equilibrium(
         s=reached.s * scene.rod.length,
         nodes=units.origin[None] + units.length * nodes.position,
@@ -353,9 +354,9 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         converged=is_converged(status),
         stable=jnp.zeros((), bool),
         status=status,
-        iterations=jnp.asarray(iterations),
-        evaluations=jnp.asarray(iterations) + 1,
-        substeps=none + 1,
+        iterations=iterations,
+        evaluations=iterations + 1,
+        substeps=jnp.ones((), int),
         residual=residual,
         scene=scene,
         state=SolverState(reached.shape, end_force, units, stations.arclengths, reached.clip_moments),

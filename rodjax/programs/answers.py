@@ -62,13 +62,13 @@ class Program:
         code = self._code(args, options) if self.executable is None else None
         if code is not None:
             ANSWERS.remember(self)
-            begin = time.perf_counter()
+            begin = time.thread_time()
             try:
                 return code(leaves, self.seconds_left)
             except TookTooLongError:
                 pass
             finally:
-                self.seconds_left -= time.perf_counter() - begin
+                self.seconds_left -= time.thread_time() - begin
         executable = self.executable
         if executable is None:
             ANSWERS.compile_others(self)

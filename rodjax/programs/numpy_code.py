@@ -18,7 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from rodjax.programs import numpy_operations
-from rodjax.programs.numpy_rules import ELEMENTWISE, INNER, OTHERS
+from rodjax.programs.numpy_rules import ELEMENTWISE, INNER, OTHERS, of_another_package
 
 Values = tuple[Any, ...]
 # So many numbers of a result of constants are made when the program is written, and not each time it runs.
@@ -183,11 +183,11 @@ class _Body:
             return
         if primitive == "broadcast_in_dim":
             return self.broadcast(equation)
-        rule = OTHERS.get(primitive) or INNER.get(primitive)
-        if rule is None:
-            raise NotInNumpyError(primitive)
+        rule = OTHERS.get(primitive) or INNER.get(primitive) or of_another_package
         given = [self.full(v) for v in equation.invars]
         expression = rule(self, equation, *given)
+        if expression is None:
+            raise NotInNumpyError(primitive)
         if primitive in OTHERS and all(map(_is_constant, given)) and self.fold(equation, expression):
             return
         targets = ", ".join(self.new(v) for v in results)

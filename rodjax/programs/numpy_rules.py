@@ -281,6 +281,28 @@ def _high_level(body: Any, equation: Any, *given: str) -> str:
     return f"{body.writer.function(program)}({', '.join(given)})"
 
 
+def _thin_svd(body: Any, equation: Any, x: str) -> str | None:
+    """The one with vectors, and of these no more than singular values."""
+    params = equation.params
+    is_thin = params["compute_uv"] and not params["full_matrices"] and params.get("subset_by_index") is None
+    return f"op.svd({x})" if is_thin else None
+
+
+def of_another_package(body: Any, equation: Any, *given: str) -> str | None:
+    """An operation of Equinox or Lineax, by those of JAX that it consists of; `None` for any other."""
+    primitive = equation.primitive
+    implementation = primitive.__dict__.get("impl")
+    if getattr(implementation, "__module__", "").split(".")[0] not in ("equinox", "lineax"):
+        return None
+
+    def expanded(*leaves: Any) -> Any:
+        return implementation(*leaves, **equation.params)
+
+    program = jax.make_jaxpr(expanded)(*(v.aval for v in equation.invars))
+    called = f"{body.writer.function(program)}({', '.join(given)})"
+    return called if primitive.multiple_results else f"{called}[0]"
+
+
 def _while(body: Any, equation: Any, *given: str) -> str:
     params = equation.params
     of_condition, of_body = params["cond_nconsts"], params["body_nconsts"]
@@ -431,6 +453,7 @@ OTHERS: dict[str, Rule] = {
     "lu_pivots_to_permutation": _operation("permutation", "permutation_size"),
     "triangular_solve": _triangular_solve,
     "eigh": lambda body, equation, x: f"op.eigh({x}, {equation.params['lower']})",
+    "svd": _thin_svd,
     "tridiagonal": lambda body, equation, x: f"op.tridiagonal({x})",
     "platform_index": _platform_index,
     "optimization_barrier": _same,

@@ -16,11 +16,12 @@ from rodjax.checks import line
 from rodjax.drawing import (
     ARROW_LENGTH,
     CLIP_COLOR,
-    HALO,
     OPACITY,
     PALETTE,
+    Labels,
     draw_arrows,
     draw_faces,
+    halo,
     seen_axes,
     set_view,
     tube_faces,
@@ -87,7 +88,7 @@ def plot_route(
         0.0,
         ARROW_LENGTH * size,
         FORCE_COLOR,
-        azimuth=view,
+        Labels(axes, np.concatenate([cable_view.centerline for cable_view in cable_views]), ARROW_LENGTH * size, view),
     )
     right, up, _ = seen_axes(view)
     for cable_view in cable_views:
@@ -108,7 +109,9 @@ def plot_route(
     bar.ax.tick_params(labelsize=9)
     if legend:
         figure.legend(handles=legend, loc="outside lower center", ncols=min(len(legend), 4), frameon=False, fontsize=9)
-    figure.suptitle("\n".join(textwrap.wrap(title.replace(" %", "\u00a0%"), WIDTH)), fontsize=10)
+    for space, kept in ((" %", "\u00a0%"), (" = ", "\u00a0=\u00a0")):
+        title = title.replace(space, kept)
+    figure.suptitle("\n".join(textwrap.wrap(title, WIDTH)), fontsize=10)
     return figure
 
 
@@ -119,4 +122,4 @@ def _name(axes: Axes3D, cable_view: CableView, aside: Float[np.ndarray, "3"], ha
         labels.append((line(cable_view.name), cable_view.centerline[len(cable_view.centerline) // 2]))
     for name, position in labels:
         x, y, z = position + ASIDE * aside
-        axes.text(x, y, z, name, fontsize=8, color="0.2", ha="left", va="top", path_effects=[HALO])
+        axes.text(x, y, z, name, fontsize=8, ha="left", va="top", path_effects=halo())

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from rodjax.checks import instance, positive, whole_number
+from rodjax.checks import instance, leaf, positive, whole_number
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, check_without_friction
 from rodjax.paths.batch import solve_stack
@@ -102,6 +102,8 @@ class Route(eqx.Module):
     - `gradients`: by the names of the margins, and "objective": the derivatives by `numbers`, (n,); of the margins at
       the worst place, on the mesh of the search
     - `starts`: how each start ended
+    - `designs`: the scenes at which the search that led here stood, one after another along a leading axis; the last is
+        `scene`. `rodjax.view(route)` shows them, `rodjax.solve_path(route.designs, segments=48)` solves them
     - `solves`: of the equilibrium, in all; each but the first of a start came with all derivatives: `with_gradients`;
       `failed`: those without an equilibrium; `redrawn`: starts that had none
     """
@@ -126,6 +128,7 @@ class Route(eqx.Module):
     values: dict[str, np.ndarray]
     gradients: dict[str, Float[np.ndarray, "n"]]
     starts: Starts
+    designs: Scene
     solves: int = eqx.field(static=True)
     with_gradients: int = eqx.field(static=True)
     failed: int = eqx.field(static=True)
@@ -356,7 +359,19 @@ class _Fleet:
         self.solves[which] += found.solves[: len(which)]
         self.failed += found.failed
         for k, outcome in zip(which, found.outcomes, strict=True):
-            self.outcomes[k] = Outcome(self.outcomes[k].iterations + outcome.iterations, outcome.message)
+            before = self.outcomes[k]
+            designs = before.designs + outcome.designs
+            self.outcomes[k] = Outcome(before.iterations + outcome.iterations, outcome.message, designs)
+
+    def stood(self, k: int) -> Scene:
+        """Where a search stood, one after another, and what is its best last: as stacked scenes."""
+        best = self.best.design[k]
+        designs = [design for design in self.outcomes[k].designs if not np.array_equal(design, best)]
+        designs = np.stack([*designs, best])
+        # So many at a time as there are starts, for which there is a program already.
+        size, total = len(self._starts), len(designs)
+        parts = [scenes_of(self.problem, jnp.asarray(designs[rows_of(j, size, total)])) for j in range(0, total, size)]
+        return jax.tree.map(lambda *leaves: leaf(np.concatenate(leaves)[:total]), *parts)
 
     def optimality(self, k: int) -> Optimality:
         """Of the best design of a search, in units of the objective."""
@@ -435,6 +450,7 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
         values={variable.key: np.asarray(number_of(at.result.scene, variable)) for variable in variables},
         gradients=rows,
         starts=_starts(fleet, feasible, offsets, scales, found.names),
+        designs=fleet.stood(best),
         solves=int(np.sum(fleet.solves)),
         with_gradients=int(np.sum(fleet.solves)) - len(feasible) - fleet.redrawn,
         failed=fleet.failed,

@@ -82,6 +82,10 @@ class Scattering(eqx.Module):
         values = [nominal([key], scene) + change for key, change in zip(self.keys, changes, strict=True)]
         return with_values(scene, [[key] for key in self.keys], ["linear"] * len(self.keys), values)
 
+    def scenes(self, zs: Float[np.ndarray, "k p"]) -> Scene:
+        """Along a leading axis."""
+        return _scenes(self, zs)
+
     def quantities(self, equilibrium: Equilibrium) -> Quantities:
         values = jnp.zeros(0, equilibrium.s.dtype)
         if self.limits is not None:
@@ -124,7 +128,7 @@ def _solved_part(
 ) -> tuple[Quantities, Bool[np.ndarray, "k"]]:
     # How many did not converge is what the caller is told.
     with silenced(NotConvergedWarning):
-        rods = solve_stack(_scenes(scattering, zs), guess=scattering.equilibrium, strain_limit=None, **options)
+        rods = solve_stack(scattering.scenes(zs), guess=scattering.equilibrium, strain_limit=None, **options)
     return jax.tree.map(np.asarray, (_quantities(scattering, rods), rods.converged))
 
 

@@ -78,10 +78,11 @@ class Settings(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a search went; where it came is with the evaluations."""
+    """How a search went, and the designs at which it stood, one after another."""
 
     iterations: int
     message: str
+    designs: tuple[Float[np.ndarray, "n"], ...] = ()
 
 
 class Search:
@@ -99,6 +100,7 @@ class Search:
     ):
         self._settings, self._ask, self._spare = settings, ask, spare
         self._at, self._here = start, _tempered(first)
+        self._stood = [start]
         self._least_spare = self._allowed(start)
         self._is_accepted = True
         self._iterations = self._solves = 0
@@ -123,7 +125,7 @@ class Search:
             message = OPTIMAL
         elif message == OPTIMAL:
             message = STALLED
-        return Outcome(self._iterations, message)
+        return Outcome(self._iterations, message, tuple(self._stood))
 
     def _is_optimal(self) -> bool:
         if self._violation(self._here) > KEPT:
@@ -296,6 +298,7 @@ class Search:
     def _stand(self, design: Float[np.ndarray, "n"], found: Numbers) -> None:
         """What the search comes back to from now on."""
         self._at, self._here = np.clip(design, 0.0, 1.0), found
+        self._stood.append(self._at)
         self._least_spare = self._allowed(self._at)
         self._is_accepted = True
 

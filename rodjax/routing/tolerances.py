@@ -121,6 +121,7 @@ class Envelope:
     - `sampled`: `Scatter` of the Monte Carlo, `None` without samples; `samples`: how many of its solves converged
     - `scatter`: that of the two which holds: `sampled` where something is flagged and there are samples, else
       `first_order`; `is_certain`: whether one does
+    - `scattering`: what scatters: the `equilibrium`, the `limits` and `obstacles` of the margins
     - `flags`: sentences by what they concern, where the first order is not enough: names of the margins, "centerline",
       "start_force", "end_force", or of all "rod"
     """
@@ -135,7 +136,16 @@ class Envelope:
     stiffness_deviation: float
     sampled: Scatter | None
     samples: int
+    scattering: Scattering
     flags: dict[str, str]
+
+    def drawn(self, count: int, seed: int = 0) -> Scene:
+        """So many scenes, drawn at random within the tolerances, along a leading axis. `rodjax.view(envelope)` shows
+        such rods, `rodjax.solve_batch(envelope.drawn(100), segments=32)` solves them.
+        """
+        count = whole_number(count, "count", 1, MOST_SAMPLES)
+        rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63))
+        return self.scattering.scenes(rng.standard_normal((count, len(self.scattering.keys))))
 
     @property
     def scatter(self) -> Scatter:
@@ -293,6 +303,7 @@ def _envelope(
         stiffness_deviation=stiffness_deviation,
         sampled=sampled,
         samples=count,
+        scattering=scattering,
         flags=flags,
     )
 

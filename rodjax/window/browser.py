@@ -44,13 +44,22 @@ class Window:
     - `session`: `Session`.
     - `port`: 0 for any that is free. `host`: who may connect; the default only programs of this machine.
     - `limits`: of `rodjax.Limits`, against which numbers are shown; `None` for none.
+    - `dark`: whether the page is dark. `together`: whether all steps of the session are shown in the beginning.
 
     `on_drawn` is called with the report of each move whose shape has been sent, in the window's own thread.
 
     Raises `ImportError` without viser, `OSError` where nothing can be opened at host and port.
     """
 
-    def __init__(self, session: Session, port: int = 8080, host: str = "127.0.0.1", limits: Limits | None = None):
+    def __init__(
+        self,
+        session: Session,
+        port: int = 8080,
+        host: str = "127.0.0.1",
+        limits: Limits | None = None,
+        dark: bool = False,
+        together: bool = False,
+    ):
         self.session, self.limits = session, limits
         self.quantity, self.with_loads = "curvature", True
         self.scales: dict[str, Scale] = {}
@@ -62,8 +71,7 @@ class Window:
         self.server = started(port, host)
         shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self.server.get_port()}"
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.show_dark(dark)
         # A tunnel through a server of viser's would let anybody in.
         self.server.request_share_url = _no_tunnel
         least = [least_bend_radius(scene, limits) for scene in rods_of(session.scene).values()]
@@ -72,6 +80,9 @@ class Window:
         self.panel = self._panel()
         self.panel.show_frames(len(session.recorded), len(session.recorded) - 1)
         self._draw()
+        if together:
+            self.panel.fan.value = True
+            self.show_fan(True)
         self._thread = threading.Thread(target=self._run, name="rodjax window", daemon=True)
         self._thread.start()
 
@@ -118,6 +129,7 @@ class Window:
             fit_colors=lambda: later(self.fit_colors),
             show_loads=lambda on: later(lambda: self.show_loads(on)),
             show_handles=self.stage.show_handles,
+            show_dark=self.show_dark,
             number=self._number,
             record=lambda on: later(lambda: self.record(on)),
             play=lambda: later(self.play),
@@ -127,9 +139,8 @@ class Window:
             save_recording=lambda client: later(lambda: self._download(client, "path.vtkhdf", path_file)),
         )
         numbers = dict(self.session.now.controls.numbers)
-        return Panel(
-            self.server.gui, list(self.session.sliders.values()), numbers, colors, buttons, bool(self.session.recorded)
-        )
+        sliders, has_steps = list(self.session.sliders.values()), bool(self.session.recorded)
+        return Panel(self.server.gui, sliders, numbers, colors, buttons, has_steps, self.is_dark)
 
     def drag(self, name: str, pose: Pose, phase: str = "update") -> None:
         """A handle has been dragged to a pose, as the browser tells it: at the "start", an "update" or the "end"."""
@@ -206,6 +217,8 @@ class Window:
         self.report = self.session.move(moves)
         self.stage.place(handles=False)
         self._draw()
+        # viser would send what has come together 60 times a second at most: shapes wait, and some are left out.
+        self.server.flush()
         self.on_drawn(self.report)
         now = time.monotonic()
         if self._mailbox.is_empty and now - self._stability_at > STABILITY:
@@ -288,6 +301,11 @@ class Window:
         self.with_loads = on
         self._draw()
 
+    def show_dark(self, on: bool) -> None:
+        self.is_dark = on
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=on)
+
     def record(self, on: bool) -> None:
         self.session.record(on)
         if not on:
@@ -334,6 +352,7 @@ class Window:
     def _download(self, client: Any, name: str, make: Callable[[Session], tuple[bytes, str]]) -> None:
         """To the browser that asked for it: this process writes no file."""
         try:
+            self.panel.say(f"{name} is made")
             content, note = make(self.session)
         except (ImportError, ValueError) as error:
             self.panel.say(f"not saved: {error}", is_bad=True)

@@ -144,6 +144,25 @@ def handles_of(scene: Scene | Harness) -> dict[str, Handle]:
     return handles
 
 
+def shared_obstacles(scene: Scene | Harness) -> dict[str, list[str]]:
+    """The names of each obstacle, of which a harness has one for each rod beside it: by the first, all."""
+    found: list[tuple[Obstacle, list[str]]] = []
+    for prefix, rod in rods_of(scene).items():
+        for k, obstacle in enumerate(rod.obstacles):
+            name = f"{prefix}obstacles[{k}]"
+            same = next((names for one, names in found if prefix and bool(eqx.tree_equal(one, obstacle))), None)
+            if same is None:
+                found.append((obstacle, [name]))
+            else:
+                same.append(name)
+    return {names[0]: names for _, names in found}
+
+
+def obstacle_of(scene: Scene | Harness, name: str) -> Obstacle:
+    prefix, _, own = name.rpartition("/")
+    return rods_of(scene)[f"{prefix}/" if prefix else ""].obstacles[_index(own)]
+
+
 def _supports(scene: Scene | Harness) -> dict[str, Support]:
     """Of the joints of a harness, those that there are."""
     if isinstance(scene, Scene):

@@ -13,6 +13,9 @@ from rodjax.solving.status import Status
 from rodjax.window.bounds import held_places
 from rodjax.window.session import Report, Session
 
+# Below so many radians along the whole rod a twist is rounding.
+ROUNDING = 1e-9
+
 
 class Row(NamedTuple):
     """One number in words; `is_bad`: it breaks its limit, or warns."""
@@ -57,11 +60,12 @@ def _rod_rows(session: Session, result: Equilibrium, limits: Limits | None) -> l
     found = [_bend_row("smallest bend radius", float(session.figures[0].bend_radius), scene, limits)]
     found += _clearance_rows(session, limits)
     found += _load_rows(session, scene, limits)
-    twist = float(result.total_twist)
+    twist, rate = float(result.total_twist), float(np.max(np.abs(reading.values["twist"])))
+    degrees, turns = round(np.degrees(twist), 1) + 0.0, round(twist / (2 * np.pi), 2) + 0.0  # no -0.0
     return [
         *found,
-        Row("total twist", f"{np.degrees(twist):.1f}°, {twist / (2 * np.pi):.2f} turns"),
-        _most("twist rate", float(np.max(np.abs(reading.values["twist"]))), "rad/m", limits, "twist"),
+        Row("total twist", f"{degrees:.1f}°, {turns:.2f} turns"),
+        _most("twist rate", rate if rate * float(scene.rod.length) > ROUNDING else 0.0, "rad/m", limits, "twist"),
         _strain_row("axial strain", np.asarray(result.axial_strain), session, limits),
     ]
 
@@ -104,12 +108,18 @@ def _bend_row(label: str, radius: float, scene: Scene, limits: Limits | None) ->
 def _clearance_rows(session: Session, limits: Limits | None) -> list[Row]:
     least = None if limits is None or limits.clearance is None else np.asarray(limits.clearance)
     figures, found = session.figures[0], []
-    for k, clearance in enumerate(figures.clearances):
-        push = float(np.linalg.norm(figures.obstacle_forces[k]))
-        text = metres(float(clearance)) + (" between nodes" if clearance < 0 else "")
-        text += f", pushed by {push:.3g} N" if push else ""
-        limit = None if least is None else float(least if least.ndim == 0 else least[k])
-        found.append(Row(f"clearance, obstacle {k}", text, limit is not None and float(clearance) < limit))
+    touching = len(figures.obstacle_forces)
+    names = [*(f"obstacle {k}" for k in range(touching)), *session.beside]
+    # Limits are those of the obstacles beside the rod, where there are such.
+    first = touching if session.beside else 0
+    for k, (name, clearance) in enumerate(zip(names, figures.clearances, strict=True)):
+        text = metres(float(clearance))
+        if k < touching:
+            push = float(np.linalg.norm(figures.obstacle_forces[k]))
+            text += " between nodes" if clearance < 0 else ""
+            text += f", pushed by {push:.3g} N" if push else ""
+        limit = None if least is None or k < first else float(least if least.ndim == 0 else least[k - first])
+        found.append(Row(f"clearance, {name}", text, limit is not None and float(clearance) < limit))
     return found
 
 

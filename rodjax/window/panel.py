@@ -22,6 +22,7 @@ class Buttons(NamedTuple):
     fit_colors: Callable[[], None]
     show_loads: Callable[[bool], None]
     show_handles: Callable[[bool], None]
+    show_dark: Callable[[bool], None]
     number: Callable[[str, float], None]
     record: Callable[[bool], None]
     play: Callable[[], None]
@@ -42,6 +43,7 @@ class Panel:
         colors: dict[str, str],
         do: Buttons,
         has_steps: bool = False,
+        is_dark: bool = False,
     ):
         self.gui = gui
         self.message = gui.add_html("")
@@ -51,8 +53,10 @@ class Panel:
         self.legend = gui.add_html("")
         self._when(self.color, lambda value: do.color_by(self.labels[value]))
         self._button("Fit the colours", lambda client: do.fit_colors())
-        self._when(gui.add_checkbox("Forces and moments", True), do.show_loads)
+        loads = gui.add_checkbox("Forces and moments", True, hint="Forces: orange; moments: blue, with two heads")
+        self._when(loads, do.show_loads)
         self._when(gui.add_checkbox("Handles", True), do.show_handles)
+        self._when(gui.add_checkbox("Dark page", is_dark), do.show_dark)
         with gui.add_folder("Change"):
             self.sliders = {slider.name: self._slider(slider, values[slider.name], do.number) for slider in sliders}
         self._button("Undo", lambda client: do.undo())

@@ -14,6 +14,7 @@ from rodjax.analysis.samples import framed_at
 from rodjax.checks import Numbers
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.rotations import from_frame
+from rodjax.model.obstacles import Obstacle
 from rodjax.programs.compilation import compiled
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
@@ -60,12 +61,13 @@ class Reading(NamedTuple):
 
 class Figures(NamedTuple):
     """What takes a look at all of the rod: `bend_radius`, the smallest one of the centerline [m], infinite where it is
-    straight; `clearances` from the obstacles [m], and the forces [N] with which these push.
+    straight; `clearances` from the obstacles of the scene, then from those beside it [m], and the forces [N] with which
+    those of the scene push.
     """
 
     bend_radius: Float[Numbers, ""]
     clearances: Float[Numbers, "obstacles"]
-    obstacle_forces: Float[Numbers, "obstacles 3"]
+    obstacle_forces: Float[Numbers, "touching 3"]
 
 
 def _reading(equilibrium: Equilibrium) -> Reading:
@@ -152,21 +154,22 @@ _readings = compiled(readings_in_program)
 
 
 @compiled
-def _figures(shown: Shown) -> Groups:
-    return over_groups(_figures_of_rod, shown)
+def _figures(shown: Shown, beside: tuple[Obstacle, ...]) -> Groups:
+    return over_groups(lambda equilibrium: _figures_of_rod(equilibrium, beside), shown)
 
 
-def _figures_of_rod(equilibrium: Equilibrium) -> Figures:
+def _figures_of_rod(equilibrium: Equilibrium, beside: tuple[Obstacle, ...]) -> Figures:
     # On both sides of nodes, too: at clips curvature jumps.
     largest = jnp.max(curvature_along(equilibrium)[1])
     scene, clearances = equilibrium.scene, jnp.zeros(0, equilibrium.s.dtype)
-    if scene.obstacles:
+    obstacles = scene.obstacles + beside
+    if obstacles:
         s = arclengths_between(equilibrium, np.arange(PLACES) / PLACES)
         centerline, radius = equilibrium.position_at(s), radius_at(scene.rod, s)
-        clearances = jnp.stack([jnp.min(jax.vmap(one.at)(centerline) - radius) for one in scene.obstacles])
+        clearances = jnp.stack([jnp.min(jax.vmap(one.at)(centerline) - radius) for one in obstacles])
     return Figures(1 / largest, clearances, jnp.sum(equilibrium.obstacle_forces, axis=1))
 
 
-def figures_of(shown: Shown) -> tuple[Figures, ...]:
-    """Of each rod."""
-    return of_rods(_figures(shown), shown)
+def figures_of(shown: Shown, beside: tuple[Obstacle, ...] = ()) -> tuple[Figures, ...]:
+    """Of each rod; `beside`: obstacles that do not touch it."""
+    return of_rods(_figures(shown, beside), shown)

@@ -1,18 +1,20 @@
 """Rods in the hand, without a browser: a scene, moves that change it, and what is shown of it."""
 
 import functools
+import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from rodjax.checks import instance, whole_number
+from rodjax.checks import instance, leaf, whole_number
 from rodjax.model.harness import Harness
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Directed
 from rodjax.paths.modes import lowest_mode
@@ -29,7 +31,16 @@ from rodjax.solving.result import (
 from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.window.bounds import Asked, asked_of, why_not
-from rodjax.window.controls import Controls, controls_of, handles_of, rods_of, scene_of, sliders_of, with_frames
+from rodjax.window.controls import (
+    Controls,
+    controls_of,
+    handles_of,
+    rods_of,
+    scene_of,
+    shared_obstacles,
+    sliders_of,
+    with_frames,
+)
 from rodjax.window.following import Followed, followed
 from rodjax.window.reading import Figures, Reading, Shown, figures_of, readings_of
 
@@ -87,6 +98,7 @@ class Session:
     - `guess`: an earlier equilibrium, whose turns are carried, or `None`.
     - `strain_limit`: a move that would strain a rod by more than this is refused, as far as places that are held
       show; what is above at the start may stay so.
+    - `beside`: obstacles that are shown, with the clearances from them, and do not touch the rods, by their names.
 
     Raises `ValueError` where the scene has no equilibrium to begin with.
     """
@@ -98,8 +110,10 @@ class Session:
         segments: int = SEGMENTS,
         guess: Shown | None = None,
         strain_limit: float = DEFAULT_STRAIN_LIMIT,
+        beside: Mapping[str, Obstacle] | None = None,
     ):
         instance(scene, "scene", (Scene, Harness))
+        self.beside = {} if beside is None else dict(beside)
         self.segments = whole_number(segments, "segments", 2, MAX_SEGMENTS)
         self.strain_limit = strain_limit
         # The turns that a scene states are made once, and carried from then on.
@@ -116,7 +130,11 @@ class Session:
         self._undone: list[Moment] = []
 
     def _begin_with(self, scene: Any) -> None:
-        self.scene, self.handles, self.sliders = scene, handles_of(scene), sliders_of(scene)
+        self.scene, self.sliders = scene, sliders_of(scene)
+        # What several rods of a harness lie beside is taken in the hand once.
+        self.obstacles = shared_obstacles(scene)
+        others = {name for names in self.obstacles.values() for name in names[1:]}
+        self.handles = {name: handle for name, handle in handles_of(scene).items() if name not in others}
         asked = asked_of(scene)
         self.limits = Asked(
             np.maximum(1 + self.strain_limit, np.asarray(asked.reaches)), tuple(map(np.asarray, asked.depths))
@@ -139,7 +157,7 @@ class Session:
     @functools.cached_property
     def figures(self) -> tuple[Figures, ...]:
         """Of each rod, when they are asked for."""
-        return figures_of(self.result)
+        return figures_of(self.result, tuple(self.beside.values()))
 
     def _reached(self, moment: Moment, readings: tuple[Reading, ...], depths: tuple[Any, ...]) -> None:
         self.now, self.readings, self.softest = moment, readings, None
@@ -160,6 +178,7 @@ class Session:
         numbers; the rods follow as far as they can. What makes no sense is told in the report, and nothing moves.
         """
         begin = time.perf_counter()
+        changes = {each: value for name, value in changes.items() for each in self.obstacles.get(name, [name])}
         try:
             target = self.now.controls.changed(changes)
         except (TypeError, ValueError) as error:
@@ -291,19 +310,35 @@ class Session:
             self.recorded = [self.now]
         self.is_recording = on
 
-    def add_recorded(self, path: Any) -> None:
-        """Takes a path, or a batch, of equilibria of the structure of this scene for what was recorded."""
+    def add_recorded(self, steps: Iterable[Any]) -> None:
+        """Takes equilibria of the structure of this scene for what was recorded."""
         self.recorded = []
-        for k in range(min(path.status.shape[0], MOST_RECORDED)):
-            one = jax.tree.map(lambda leaf, k=k: leaf[k], path)
+        for one in itertools.islice(steps, MOST_RECORDED):
             scene = without_turns(movable(scene_in(one)))
             self.recorded.append(Moment(scene, controls_of(scene), one))
+
+    def solved_in_turn(self, scenes: Scene, guess: Any, *, is_path: bool) -> Iterator[Any]:
+        """The equilibria of stacked scenes, each from the last one of a path, else all from the guess; without those
+        that have none.
+        """
+        for scene in rows_in(scenes):
+            found = self.solved(movable(scene), guess)
+            if bool(found.converged):
+                guess = found if is_path else guess
+                yield found
 
     def recording(self) -> Any:
         """All recorded equilibria along a leading axis. Raises `ValueError` where there are none."""
         if not self.recorded:
             raise ValueError("nothing is recorded yet")
         return jax.tree.map(lambda *leaves: np.stack(leaves), *(moment.result for moment in self.recorded))
+
+
+def rows_in(stack: Any) -> Iterator[Any]:
+    """What is stacked along a leading axis, one after another."""
+    stack = jax.tree.map(np.asarray, stack)
+    for k in range(len(jax.tree.leaves(stack)[0])):
+        yield jax.tree.map(lambda x, k=k: leaf(x[k]), stack)
 
 
 def scene_in(shown: Shown) -> Scene | Harness:
@@ -313,7 +348,9 @@ def scene_in(shown: Shown) -> Scene | Harness:
 
 def movable(scene: Any) -> Any:
     """With a frame for each box, which may be turned."""
-    if isinstance(scene, Harness) or not scene.obstacles:
+    if isinstance(scene, Harness):
+        return eqx.tree_at(lambda harness: harness.scenes, scene, tuple(map(movable, scene.scenes)))
+    if not scene.obstacles:
         return scene
     return eqx.tree_at(lambda scene: scene.obstacles, scene, tuple(map(with_frames, scene.obstacles)))
 

@@ -3,14 +3,16 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.drawing import largest_radius
+from rodjax.model.obstacles import Obstacle
 from rodjax.model.surfaces import surfaces
 from rodjax.window import tube
-from rodjax.window.controls import Pose, center_of, rods_of
+from rodjax.window.controls import Pose, center_of, obstacle_of, rods_of
 from rodjax.window.reading import Pieces, Reading
 from rodjax.window.session import Session
 
@@ -56,6 +58,7 @@ class Stage:
         self.handles = {name: self._handle(name, moved) for name in session.handles}
         self.arrows: dict[str, Any] = {}
         self._draw_obstacles()
+        self._draw_beside()
         points = np.concatenate([reading.centerline for reading in session.readings])
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(float(np.linalg.norm(high - low)), 0.2 * self.length)
@@ -174,19 +177,32 @@ class Stage:
     # --- obstacles and handles ---
 
     def _draw_obstacles(self) -> None:
-        obstacles = getattr(self.session.scene, "obstacles", ())
-        for k, faces in enumerate(
-            surfaces(obstacles, np.asarray(self.session.reading.centerline)) if obstacles else []
-        ):
-            name = f"obstacles[{k}]"
-            pivot = center_of(obstacles[k]) if name in self.session.handles else np.zeros(3)
-            vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)
-            first = 4 * np.arange(len(faces))[:, None]
-            triangles = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3).astype(np.uint32)
-            self.obstacles[name] = self.server.scene.add_mesh_simple(
-                f"/obstacles/{k}", vertices, triangles, color=OBSTACLE_COLOR, opacity=0.65, flat_shading=True,
-                side="double", position=tuple(pivot), cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+        obstacles = self._obstacles_of_scene()
+        around = np.concatenate([reading.centerline for reading in self.session.readings])
+        drawn = surfaces(list(obstacles.values()), around) if obstacles else []
+        for (name, obstacle), faces in zip(obstacles.items(), drawn, strict=True):
+            pivot = center_of(obstacle) if name in self.session.handles else np.zeros(3)
+            self.obstacles[name] = self._obstacle(f"/obstacles/{name}", faces, pivot)
+
+    def _obstacles_of_scene(self) -> dict[str, Obstacle]:
+        return {name: obstacle_of(self.session.scene, name) for name in self.session.obstacles}
+
+    def _draw_beside(self) -> None:
+        """Obstacles that do not touch the rods, and stay where they are; those of the scene are drawn already."""
+        of_scene = self._obstacles_of_scene().values()
+        beside = [one for one in self.session.beside.values() if not any(eqx.tree_equal(one, o) for o in of_scene)]
+        around = np.concatenate([reading.centerline for reading in self.session.readings])
+        for k, faces in enumerate(surfaces(beside, around) if beside else []):
+            self._obstacle(f"/beside/{k}", faces, np.zeros(3))
+
+    def _obstacle(self, name: str, faces: Float[np.ndarray, "f 4 3"], pivot: Float[np.ndarray, "3"]) -> Any:
+        vertices = (faces.reshape(-1, 3) - pivot).astype(np.float32)
+        first = 4 * np.arange(len(faces))[:, None]
+        triangles = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3).astype(np.uint32)
+        return self.server.scene.add_mesh_simple(
+            name, vertices, triangles, color=OBSTACLE_COLOR, opacity=0.65, flat_shading=True, side="double",
+            position=tuple(pivot), cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
 
     def _handle(self, name: str, moved: Moved) -> Any:
         handle, pose = self.session.handles[name], self.session.now.controls.poses[name]
@@ -208,7 +224,7 @@ class Stage:
             if name in self.obstacles and pose is not self.placed.get(name):
                 _place(self.obstacles[name], pose)
                 self.placed[name] = pose
-            if handles:
+            if handles and name in self.handles:
                 _place(self.handles[name], pose)
 
     def show_handles(self, visible: bool) -> None:

@@ -20,8 +20,8 @@ DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 def with_contacts(errors: Errors, form: PositionForm, point: Any) -> Errors:
-    """With what it adds that contacts act at nodes and middles of elements, with friction at nodes alone: where one
-    lies by itself, it may be anywhere beside these.
+    """With what it adds that contacts act at nodes and at one place of each element, with friction at nodes alone: where
+    one lies by itself, it may be anywhere beside these; and that moments have a kink where one lies within an element.
 
     And how deep the rod lies between the nodes.
     """
@@ -36,7 +36,14 @@ def with_contacts(errors: Errors, form: PositionForm, point: Any) -> Errors:
     if defects is not None:
         defects = defects + (sizes[:-1] + sizes[1:]) / 2
     nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
-    moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT / errors.scale.moment
+    moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT
+    within = form.point_forces(point)
+    if within is not None:
+        sizes = jnp.sqrt(jnp.sum(within.forces**2, axis=1))
+        beside = jnp.pad(sizes, ((0, 0), (1, 1)))
+        sizes = sizes - (beside[:, :-2] + beside[:, 2:]) / 2
+        moment = jnp.maximum(moment, jnp.max(sizes * h[None] * within.t * (1 - within.t)))
+    moment /= errors.scale.moment
     return errors._replace(nodes=nodes, defects=defects, depths=depths_of_elements(form, point), misplaced=moment)
 
 

@@ -25,6 +25,7 @@ from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
+from rodjax.discretization.potentials import PointForces
 from rodjax.discretization.results import clip_moments, resultants, with_fields_by_tangent
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
@@ -207,7 +208,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
     has_fields = form.fields_on_elements(point) is not None
-    last, passed = _integrated(form, field, forces, torque, first, has_fields)
+    last, passed = _integrated(form, field, forces, torque, first, has_fields, form.point_forces(point))
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
     # a twist.
@@ -299,21 +300,24 @@ def _integrated(
     torque: Float[Array, ""],
     first: Section,
     has_fields: bool,
+    point_forces: PointForces | None,
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta.
-    `has_fields`: the forces are parabolas, else those at the start less the weight.
+    `has_fields`: the forces are parabolas, but for those at one place, else those at the start less the weight.
     """
     scene, rod = form.scene, form.scene.rod
     start, middle, end = (forces[:, k] for k in range(3))
     weight = jnp.zeros(3, start.dtype) if scene.gravity is None else scene.gravity
     step = field.h / STEPS
 
-    def slope(section: Section, s: Float[Array, "n"]) -> Section:
-        """Derivatives by arclength, at s from the first node."""
-        n = start - weight[:, None] * s[None]
+    def slope(section: Section, k: Float[Array, ""], part: float) -> Section:
+        """Derivatives by arclength, at so much of step k."""
+        n = start - weight[:, None] * ((k + part) * step)[None]
         if has_fields:
-            x = (s / field.h)[None]
+            x = (k + part) / STEPS
             n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
+            if point_forces is not None:
+                n += point_forces.beyond_parabola(x, k / STEPS, STEPS)
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
         way = (1 + axial_strain_under(rod, dot(n, tangent)))[None] * tangent
         turn = cross(curvature_under(rod, section.moment), tangent)
@@ -323,11 +327,10 @@ def _integrated(
         return jax.tree.map(lambda value, change: value + distance[None] * change, section, slope)
 
     def advanced(section: Section, k: Float[Array, ""]) -> tuple[Section, Float[Array, "3 n"]]:
-        s = k * step
-        a = slope(section, s)
-        b = slope(ahead(section, a, step / 2), s + step / 2)
-        c = slope(ahead(section, b, step / 2), s + step / 2)
-        d = slope(ahead(section, c, step), s + step)
+        a = slope(section, k, 0.0)
+        b = slope(ahead(section, a, step / 2), k, 0.5)
+        c = slope(ahead(section, b, step / 2), k, 0.5)
+        d = slope(ahead(section, c, step), k, 1.0)
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, a, b, c, d)
         section = ahead(section, mean, step)
         return section, section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]

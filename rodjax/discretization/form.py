@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_positions, nodes_along
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
-from rodjax.discretization.potentials import OnElements
+from rodjax.discretization.potentials import OnElements, PointForces
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.model.scene import Scene
@@ -301,6 +301,10 @@ class Form(eqx.Module):
 
     def fields_on_elements(self, point: Any) -> OnElements | None:
         """`None` without fields."""
+        return None
+
+    def point_forces(self, point: Any) -> PointForces | None:
+        """Those of the fields on elements that act at one place of an element; `None` without such."""
         return None
 
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:

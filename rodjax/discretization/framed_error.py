@@ -110,8 +110,9 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
 def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: Pose) -> Pose:
     """The sections at the ends of the elements, by the rule of Runge and Kutta."""
     h = field.h
-    # Between the three points of an element, all along the rod that varies is a parabola; so are forces.
-    forces = section_forces(form, point)
+    # Between the three points of an element, all along the rod that varies is a parabola; so are forces, but for those
+    # at one place.
+    forces, point_forces = section_forces(form, point), form.point_forces(point)
     sections = form.sections
     rest = form.scene.rod.rest_shape
     couples = form.couples_along(point.quaternions)
@@ -124,10 +125,12 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
             (weight * by_point[..., k, :] for k, weight in enumerate(weights)), jnp.zeros_like(by_point[..., 0, :])
         )
 
-    def slope(pose: Pose, x: Float[Array, ""]) -> Pose:
-        q = unit(pose.quaternion)
+    def slope(pose: Pose, k: Float[Array, ""], part: float) -> Pose:
+        q, x = unit(pose.quaternion), (k + part) / STEPS
         t = tangent(q)
         force = parabola(x, forces)
+        if point_forces is not None:
+            force += point_forces.beyond_parabola(x, k / STEPS, STEPS)
         here = jax.tree.map(lambda leaf: parabola(x, leaf), section_arrays(sections))
         here = eqx.combine(here, sections)
         strains, axial = here.strains_under(rotated(inverse(q), pose.moment), dot(force, t))
@@ -147,11 +150,10 @@ def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: 
         return jax.tree.map(lambda value, change: value + (part * h / STEPS)[None] * change, pose, slope)
 
     def advanced(pose: Pose, k: Float[Array, ""]) -> tuple[Pose, None]:
-        x = k / STEPS
-        a = slope(pose, x)
-        b = slope(ahead(pose, a, 0.5), x + 0.5 / STEPS)
-        c = slope(ahead(pose, b, 0.5), x + 0.5 / STEPS)
-        d = slope(ahead(pose, c, 1.0), x + 1 / STEPS)
+        a = slope(pose, k, 0.0)
+        b = slope(ahead(pose, a, 0.5), k, 0.5)
+        c = slope(ahead(pose, b, 0.5), k, 0.5)
+        d = slope(ahead(pose, c, 1.0), k, 1.0)
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, a, b, c, d)
         return ahead(pose, mean, 1.0), None
 

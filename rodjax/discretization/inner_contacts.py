@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.geometry.vectors import cross, dot
@@ -158,12 +157,15 @@ class Places(NamedTuple):
 
     @staticmethod
     def of(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value) -> "Places":
-        numbers = [sum(leaf.size for leaf in jax.tree.leaves(obstacle)) for obstacle in obstacles]
-        in_middle = elements.beside[None] | jnp.asarray(np.array(numbers) > MOST_NUMBERS)[:, None]
-        if min(numbers) > MOST_NUMBERS:
-            nearest = jnp.full(in_middle.shape, 0.5, elements.s.dtype)
-        else:
-            nearest = jnp.where(in_middle, 0.5, _nearest(elements, obstacles, radius))
+        rows = [jnp.full_like(elements.s[1:], 0.5)] * len(obstacles)
+        is_followed = [sum(leaf.size for leaf in jax.tree.leaves(one)) <= MOST_NUMBERS for one in obstacles]
+        in_middle = elements.beside[None] | ~jnp.array(is_followed)[:, None]
+        followed = [k for k, is_one in enumerate(is_followed) if is_one]
+        if followed:
+            found = _nearest(elements, tuple(obstacles[k] for k in followed), radius)
+            for k, row in zip(followed, found, strict=True):
+                rows[k] = jnp.where(elements.beside, 0.5, row)
+        nearest = jnp.stack(rows)
         there = _seen(elements, obstacles, radius, nearest)
         return there._replace(stays=there.stays | in_middle)
 

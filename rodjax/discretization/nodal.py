@@ -40,12 +40,13 @@ from rodjax.discretization.node_contacts import (
     contact_model,
     contacts_on_elements,
     contacts_with_itself,
+    forces_within,
     relaxation,
     shares,
 )
 from rodjax.discretization.node_friction import with_friction
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.potentials import OnElements
+from rodjax.discretization.potentials import OnElements, PointForces
 from rodjax.discretization.self_contact import comes_through
 from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
@@ -145,6 +146,9 @@ class NodalForm(PositionForm):
         if contacts is None:
             return fields
         return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
+
+    def point_forces(self, point: Any) -> PointForces | None:
+        return forces_within(self, point) if smooth_obstacles(self.scene) else None
 
     def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
         fields = self.fields_on_elements(point)

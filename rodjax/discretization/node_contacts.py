@@ -31,7 +31,7 @@ from rodjax.discretization.contact_gaps import (
 from rodjax.discretization.friction import pulled, tangential, within
 from rodjax.discretization.node_friction import friction_at, friction_bounds, slip_rows, sticking, travelled
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.potentials import OnElements, at_both
+from rodjax.discretization.potentials import OnElements, PointForces, at_both
 from rodjax.discretization.self_contact import Exerted, SelfContacts, exerted, on_elements, self_contacts
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
 from rodjax.linalg.unilateral import Unilateral
@@ -238,6 +238,14 @@ def _within_on_elements(form: PositionForm, point: Any) -> OnElements:
     by_position = -jnp.einsum("qcn,qen->cen", forces, of_positions)
     by_tangent = -jnp.sum(jax.vmap(elements.by_tangents)(places.t, forces), axis=0)
     return OnElements(by_position, by_tangent, jnp.zeros_like(by_position))
+
+
+def forces_within(form: PositionForm, point: Any) -> PointForces:
+    """The forces of obstacles on the rod within its elements."""
+    elements, places, _ = within_elements(form, point)
+    assert places is not None
+    forces = point.nodal.pressures[inner_rows(form.scene), None, :-1] * places.normals
+    return PointForces(places.t, forces, jax.vmap(lambda t: elements.weights(t)[0][0])(places.t))
 
 
 def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:

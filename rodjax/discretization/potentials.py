@@ -42,6 +42,24 @@ class OnElements(NamedTuple):
     density: Float[Array, "3 2 n"]
 
 
+class PointForces(NamedTuple):
+    """Up to q forces within each of n elements, at the parts t of these, and which share of each the first node has."""
+
+    t: Float[Array, "q n"]
+    forces: Float[Array, "q 3 n"]
+    shares: Float[Array, "q n"]
+
+    def beyond_parabola(self, x: Float[Array, ""], begin: Float[Array, ""], steps: int) -> Float[Array, "3 n"]:
+        """What the forces through the elements, which jump, are at their part x beyond those of `section_forces`, which
+        are parabolas; a jump within the one of so many steps that begins there counts in all of it as in the mean.
+        """
+        passed = jnp.clip((begin - self.t) * steps + 1, 0.0, 1.0)
+        start = jnp.sum(self.shares[:, None] * self.forces, axis=0)
+        jumps = start - jnp.sum(passed[:, None] * self.forces, axis=0)
+        end = start - jnp.sum(self.forces, axis=0)
+        return jumps - (1 - x) * (1 - 2 * x) * start + x * (1 - x) * (start + end) - x * (2 * x - 1) * end
+
+
 def _density(scene: Scene, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
     return sum((potential(position, s) for potential in scene.potentials), jnp.zeros_like(s))
 

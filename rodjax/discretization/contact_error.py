@@ -20,8 +20,9 @@ DEPTH_PLACES = (0.25, 0.5, 0.75)
 
 
 def with_contacts(errors: Errors, form: PositionForm, point: Any) -> Errors:
-    """With what it adds that contacts act at nodes and at one place of each element, with friction at nodes alone: where
-    one lies by itself, it may be anywhere beside these; and that moments have a kink where one lies within an element.
+    """With what it adds that contacts act at nodes and at one place of each element, with friction at nodes alone:
+    where one lies by itself, it may be anywhere beside these; and that moments have a kink where one lies within an
+    element.
 
     And how deep the rod lies between the nodes.
     """

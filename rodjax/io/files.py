@@ -100,7 +100,7 @@ FIELDS = {
     "state/before/points": ("m", "with obstacles: where the rod last was sound, at equal steps of arclength"),
     "state/pressures": (
         "1",
-        "forces of each obstacle on nodes and middles of elements, between elements and the rod beyond; solver's units",
+        "forces of each obstacle on nodes and within elements, between elements and the rod beyond; solver's units",
     ),
     "state/friction/forces": ("1", "tangential forces of obstacles with friction on each node, in the solver's units"),
     "state/friction/reference": ("m", "nodes in the equilibrium before, from which slips are counted; NaN from rest"),

@@ -12,6 +12,7 @@ import pytest
 
 import rodjax as rj
 from rodjax.discretization.error import bulge
+from rodjax.discretization.potentials import PointForces
 from rodjax.geometry.rotations import columns
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.refinement import SECTION_FACTOR
@@ -232,3 +233,28 @@ def test_the_twist_of_a_curve_beyond_that_of_an_arc_is_the_area_between_them():
 
     assert abs(off(4)) < 0.02 * exact
     assert off(4) / off(8) == pytest.approx(16.0, rel=0.1)
+
+
+def test_forces_at_one_place_of_an_element_jump_there():
+    """What is integrated in their place: the mean over each step is that of the jump, so that the moment of a force
+    about the end of its element is exact. Two forces in each of two elements, one at a node.
+    """
+    rng = np.random.default_rng(0)
+    t, shares = jnp.array([[0.3, 0.8], [0.0, 0.55]]), jnp.asarray(rng.uniform(size=(2, 2)))
+    forces = jnp.asarray(rng.normal(size=(2, 3, 2)))
+    points = PointForces(t, forces, shares)
+    start = jnp.sum(shares[:, None] * forces, axis=0)
+    end = start - jnp.sum(forces, axis=0)
+    middle = -(start + end) / 4
+
+    def force(x: float, begin: float) -> jax.Array:
+        parabola = (1 - x) * (1 - 2 * x) * start + 4 * x * (1 - x) * middle + x * (2 * x - 1) * end
+        return parabola + points.beyond_parabola(jnp.array(x), jnp.array(begin), 4)
+
+    total = 0.0
+    for begin in np.arange(4) / 4:
+        stages = [force(begin + part / 8, begin) for part in range(3)]
+        np.testing.assert_allclose(stages[0], stages[2], rtol=0, atol=1e-14)
+        total += np.asarray(stages[0] + 4 * stages[1] + stages[2]) / 24
+    exact = np.asarray(start - jnp.sum((1 - t)[:, None] * forces, axis=0))
+    np.testing.assert_allclose(total, exact, rtol=0, atol=1e-14)

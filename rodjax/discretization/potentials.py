@@ -43,7 +43,7 @@ class OnElements(NamedTuple):
 
 
 class PointForces(NamedTuple):
-    """Up to q forces within each of n elements, at the parts t of these, and which share of each the first node has."""
+    """Forces of q obstacles within n elements, at the parts t of these, and the first node.s share of each."""
 
     t: Float[Array, "q n"]
     forces: Float[Array, "q 3 n"]

@@ -43,7 +43,7 @@ class OnElements(NamedTuple):
 
 
 class PointForces(NamedTuple):
-    """Forces of q obstacles within n elements, at the parts t of these, and the first node.s share of each."""
+    """Forces of q obstacles within n elements, at the parts t of these, and the first node's share of each."""
 
     t: Float[Array, "q n"]
     forces: Float[Array, "q 3 n"]

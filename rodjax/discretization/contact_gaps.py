@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.inner_contacts import Elements, Places
+from rodjax.discretization.inner_contacts import SAG, THINNER, Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve
@@ -118,11 +118,17 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     """
     s, obstacles = form.field.s, touched_within(form.scene)
     free = jnp.where(form.is_held, 0.0, 1.0).astype(s.dtype)
-    nodes = point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, form.is_at_support
-    elements = Elements.of(*nodes, s)
+    positions, gravity = point.nodal.positions, form.scene.gravity
+    sag: Array | float = 0.0
+    if gravity is not None:
+        radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+        sag = SAG * jnp.sqrt(jnp.sum(gravity**2)) * jnp.diff(s) ** 4 / radius
+    elements = Elements.of(positions, point.tangents[:, ::2], form.node_axes(point), free, s, sag)
     if not obstacles:
         return elements, None, jnp.zeros((0, len(s)), s.dtype)
-    places = Places.of(elements, obstacles, form.radius_along)
+    distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in obstacles])
+    is_held_within = form.is_at_support[None] & (distances < (1 - THINNER) * form.radius[None])
+    places = Places.of(elements, obstacles, form.radius_along, is_held_within)
     return elements, places, jnp.pad(places.gaps, ((0, 0), (0, 1)), constant_values=1.0)
 
 

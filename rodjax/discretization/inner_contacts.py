@@ -8,10 +8,10 @@ at the part t of the element is
 the cubic through both nodes, and on circles of sixth order. Of each element the contact point with an obstacle is the
 place where
 
-    g = distance(x) - (1 - THINNER - at_nodes (2 t - 1)^2) radius,    at_nodes = AT_NODES max(1, (COARSE h/L)^4)
+    g = distance(x) - (1 - THINNER - at_nodes (2 t - 1)^2) radius
 
-is least, so that it follows an edge or a thin pipe along the element; beside a support, which may hold the rod within
-an obstacle, it is in the middle. First derivatives of g are those at a fixed
+is least, so that it follows an edge or a thin pipe along the element; beside a support that holds the rod within the
+obstacle it is in the middle. First derivatives of g are those at a fixed
 place; the second ones count that the place moves. A force p n there is virtual work on both nodes: forces and couples.
 """
 
@@ -29,11 +29,13 @@ from rodjax.model.obstacles import Obstacle
 
 # Within elements the rod counts as thinner by these parts, in their middle and more at their nodes. Where it lies along
 # an obstacle, nodes and places between them would say the same, and who bears it would be undetermined: so nodes do;
-# and the place is in the middle then. On coarse meshes more, as a rod sags between nodes by the fourth power of their
-# distance: the place would go from one end of an element to the other with what a step changes.
+# and the place is in the middle then. On coarse meshes more, as much as the rod sags between nodes, but no more than
+# `MOST_AT_NODES`: else the place would go from one end of an element to the other with what a step changes.
 THINNER = 1e-5
 AT_NODES = 8e-5
-COARSE = 16
+MOST_AT_NODES = 0.02
+# A heavy beam held level at both ends sags by w h^4/EI times this.
+SAG = 1 / 384
 # Places of an element among which the nearest one is, and steps of the search from there.
 SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
 STEPS = 8
@@ -43,16 +45,16 @@ MOST_NUMBERS = 1000
 
 class Elements(NamedTuple):
     """What the centerline within n elements depends on: position and tangent of the first and the last node of each,
-    `axes` about which the tangents turn; `free`: 0 at nodes whose place is given, else 1; `beside`: whether a support
-    holds one of both.
+    `axes` about which the tangents turn; `free`: 0 at nodes whose place is given, else 1; `at_nodes`: by which part of
+    its radius the rod counts as thinner at the nodes.
     """
 
     positions: Float[Array, "3 2 n"]
     tangents: Float[Array, "3 2 n"]
     axes: Float[Array, "3 2 b n"]
     free: Float[Array, "2 n"]
-    beside: Bool[Array, "n"]
     s: Float[Array, "n+1"]
+    at_nodes: Float[Array, "n"]
 
     @staticmethod
     def of(
@@ -60,14 +62,16 @@ class Elements(NamedTuple):
         tangents: Float[Array, "3 n+1"],
         axes: Float[Array, "3 b n+1"],
         free: Float[Array, "n+1"],
-        is_at_support: Bool[Array, "n+1"],
         s: Float[Array, "n+1"],
+        sag: Float[Array, "n"] | float = 0.0,
     ) -> "Elements":
+        """`sag`: between nodes, as a part of the radius."""
+
         def at_ends(of_nodes: Float[Array, "*c n+1"], axis: int) -> Float[Array, "*d n"]:
             return jnp.stack([of_nodes[..., :-1], of_nodes[..., 1:]], axis=axis)
 
         nodes = at_ends(positions.T, 1), at_ends(tangents, 1), at_ends(axes, 1), at_ends(free, 0)
-        return Elements(*nodes, is_at_support[:-1] | is_at_support[1:], s)
+        return Elements(*nodes, s, jnp.clip(jnp.broadcast_to(sag, s[1:].shape), AT_NODES, MOST_AT_NODES))
 
     @property
     def difference(self) -> Float[Array, "3 n"]:
@@ -156,15 +160,18 @@ class Places(NamedTuple):
     stays: Bool[Array, "q n"]
 
     @staticmethod
-    def of(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value) -> "Places":
+    def of(
+        elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value, is_held_within: Bool[Array, "q n+1"]
+    ) -> "Places":
+        """`is_held_within`: nodes that a support holds within an obstacle."""
         rows = [jnp.full_like(elements.s[1:], 0.5)] * len(obstacles)
         is_followed = [sum(leaf.size for leaf in jax.tree.leaves(one)) <= MOST_NUMBERS for one in obstacles]
-        in_middle = elements.beside[None] | ~jnp.array(is_followed)[:, None]
+        in_middle = is_held_within[:, :-1] | is_held_within[:, 1:] | ~jnp.array(is_followed)[:, None]
         followed = [k for k, is_one in enumerate(is_followed) if is_one]
         if followed:
             found = _nearest(elements, tuple(obstacles[k] for k in followed), radius)
             for k, row in zip(followed, found, strict=True):
-                rows[k] = jnp.where(elements.beside, 0.5, row)
+                rows[k] = jnp.where(in_middle[k], 0.5, row)
         nearest = jnp.stack(rows)
         there = _seen(elements, obstacles, radius, nearest)
         return there._replace(stays=there.stays | in_middle)
@@ -208,7 +215,7 @@ def _seen(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value, t:
         return lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
 
     def seen_radius(t: Float[Array, "q n"]) -> Float[Array, "q n"]:
-        return _seen_radius(radius, elements.s, t)
+        return _seen_radius(radius, elements, t)
 
     slope = jnp.sum(normals * along, axis=1) - rate(seen_radius)(t)
     growth = jnp.sum(of_slope * along + normals * curving, axis=1) - rate(rate(seen_radius))(t)
@@ -223,7 +230,7 @@ def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value)
     """
     samples, spacing = jnp.asarray(SAMPLES, elements.s.dtype), SAMPLES[1] - SAMPLES[0]
     everywhere = jnp.broadcast_to(samples[:, None], (len(samples), len(elements.s) - 1))
-    points, seen_radius = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements.s, everywhere)
+    points, seen_radius = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements, everywhere)
     seen = jnp.stack([jax.vmap(jax.vmap(obstacle.at, in_axes=-1))(points) for obstacle in obstacles])
     seen -= seen_radius[None]
     first = samples[jnp.argmin(seen, axis=1)]
@@ -251,9 +258,9 @@ def _(given: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Array, Array]:
     return t, jnp.where(there.stays, 0.0, -change.slope / jnp.where(there.stays, 1.0, there.growth))
 
 
-def _seen_radius(radius: Value, s: Float[Array, "n+1"], t: Float[Array, "q n"]) -> Float[Array, "q n"]:
+def _seen_radius(radius: Value, elements: Elements, t: Float[Array, "q n"]) -> Float[Array, "q n"]:
     """As which the rod counts at the parts t of the elements."""
+    s = elements.s
     begin, end = (jnp.broadcast_to(side[None], t.shape) for side in (s[:-1], s[1:]))
-    at_nodes = AT_NODES * jnp.maximum(1.0, (COARSE * jnp.diff(s)) ** 4)
-    thinner = THINNER + at_nodes[None] * (2 * t - 1) ** 2
+    thinner = THINNER + elements.at_nodes[None] * (2 * t - 1) ** 2
     return (1 - thinner) * value_at(radius, begin + t * (end - begin), begin, end)

@@ -56,10 +56,10 @@ class Scene(eqx.Module):
     - `clips`: `Clip`s that hold places between the ends, in the order of their arclengths.
     - `obstacles`: `Obstacle`s that the rod, which has a radius, cannot enter: they push it back, and with friction hold
         it along a path (`rodjax.solve_path`), at the nodes of the mesh, where it touches them to rounding, and without
-        friction within each element too, where that comes nearest, to 1e-4 of the radius on elements of L/16 or less
-        (beside supports, and by a `Mesh`, in the middle of elements). Else, of a mesh that is chosen for a tolerance,
-        elements lie no deeper than that between their nodes either, as far as finer ones help: over an edge, or on a
-        mesh that is given, the rod may: `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod
+        friction within each element too, where that comes nearest, to 1e-4 of the radius where it sags by less between
+        nodes (in its middle by a `Mesh`, or beside a support within the obstacle). Else, of a mesh that is chosen for a
+        tolerance, elements lie no deeper than that between their nodes either, as far as finer ones help: over an edge,
+        or on a mesh that is given, the rod may: `rodjax.describe` says so, and `rodjax.clearance` tells where. A rod
         that came through an obstacle since its guess or the last step of its path, or whose centerline lies within one,
         is not converged. Where no obstacle touches the rod they only cost time: to see how far it is from what it stays
         away from, `rodjax.clearance` needs none in the scene. Double precision only.

@@ -174,8 +174,8 @@ def close(found, expected, size, name, rtol):
 
 
 def check_reversed(scene: Scene) -> None:
-    """Both to a residual of 1e-10 EI/L^2, or to the rounding floor of contacts; so is what they differ by, but for forces
-    of contacts, whose places along the rod are soft: these differ by up to 200 times as much.
+    """Both to a residual of 1e-10 EI/L^2, or to the rounding floor of contacts; so is what they differ by, but for
+    forces of contacts, whose places along the rod are soft: these differ by up to 200 times as much.
     """
     solver = rj.Newton(tolerance=1e-10)
     forward = rj.solve(scene, segments=SEGMENTS, solver=solver)

@@ -197,7 +197,7 @@ class Places(NamedTuple):
         total = -jnp.sum(jax.vmap(elements.second)(self.t, pressures[:, None] * self.normals), axis=0)
         total -= jnp.einsum("qcean,qcdn,qdfbn->eafbn", moving, curving, moving)
         slopes = jax.vmap(elements.rates)(self.t, self.of_slope)
-        slopes += jax.vmap(lambda *place: elements.rates(*place, 1))(self.t, self.normals)
+        slopes += jax.vmap(lambda t, normals: elements.rates(t, normals, 1))(self.t, self.normals)
         weights = jnp.where(self.stays, 0.0, pressures / jnp.where(self.stays, 1.0, self.growth))
         return total + jnp.einsum("qn,qean,qfbn->eafbn", weights, slopes, slopes)
 
@@ -254,7 +254,9 @@ def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value)
 def _(given: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Array, Array]:
     """The slope of the gap by the place stays 0."""
     t = _nearest(*given)
-    there, change = eqx.filter_jvp(lambda *given: _seen(*given, t), given, changes)
+    there, change = eqx.filter_jvp(
+        lambda elements, obstacles, radius: _seen(elements, obstacles, radius, t), given, changes
+    )
     return t, jnp.where(there.stays, 0.0, -change.slope / jnp.where(there.stays, 1.0, there.growth))
 
 

@@ -93,8 +93,8 @@ def bedding(position, s):
     return 10.0 * position[2] ** 2 + jnp.sin(3 * position[0]) * s
 
 
-# A rod that touches nothing, but is pressed in the middle of its elements by the pressures that are given.
-NEAR = {"potentials": [Potential(bedding)], "obstacles": [Cylinder((0.4, -1, -0.4), (0.4, 1, -0.4), 0.2)]}
+# A rod that touches nothing, but is pressed within its elements by the pressures that are given.
+NEAR = {"potentials": [Potential(bedding)], "obstacles": [Cylinder((0.65, -1, -0.4), (0.65, 1, -0.4), 0.2)]}
 NODAL = {
     "tangents": Scene(Rod(*PLAIN, radius=0.01), START, END, **LOADS, **NEAR),
     "shear": Scene(Rod(*STRIP, GA=50.0, rest_curvature=(1.0, 0.5), radius=0.01), START, END, **LOADS, **NEAR),

@@ -279,6 +279,23 @@ def test_contact_points_within_elements_have_exact_derivatives():
     np.testing.assert_allclose(point, [np.sin(0.0625), 0, 1 - np.cos(0.0625)], rtol=0, atol=0.125**6)
 
 
+@pytest.mark.slow
+def test_without_gravity_there_are_derivatives_by_it():
+    """Its size, of which places within elements know, has none at zero."""
+    floor = rj.Plane((0, 0, -0.05), (0, 0, 1))
+
+    def height(gravity: float | jax.Array) -> jax.Array:
+        rod, end = Rod(1.0, 1.0, 0.8, 1e4, 0.5, radius=0.01), Free(force=(0, 0, -3.0))
+        down = jnp.array([0.0, 0.0, -1.0]) * gravity
+        scene = Scene(rod, Clamp((0, 0, 0.05), LEVEL), end, down, obstacles=[floor])
+        return rj.solve(scene, segments=6, solver=rj.Newton(tolerance=1e-11)).nodes[3, 2]
+
+    step = 1e-4
+    difference = (float(height(step)) - float(height(-step))) / (2 * step)
+    assert abs(difference) > 1e-4
+    assert float(jax.grad(height)(0.0)) == pytest.approx(difference, rel=1e-5)
+
+
 def test_a_rod_too_short_for_its_side_is_told_by_how_much():
     """A cable of 0.5 m between pins 0.5 m apart, below a cylinder between them: two tangents and an arc. Chords of 1/32
     of the string ask for up to 4e-4 too little.

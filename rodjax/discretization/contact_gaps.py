@@ -15,6 +15,7 @@ from rodjax.discretization.inner_contacts import SAG, THINNER, Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve
+from rodjax.geometry.vectors import root
 from rodjax.model.obstacles import InUnits, Obstacle
 from rodjax.model.scene import Scene
 
@@ -122,7 +123,7 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     sag: Array | float = 0.0
     if gravity is not None:
         radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
-        sag = SAG * jnp.sqrt(jnp.sum(gravity**2)) * jnp.diff(s) ** 4 / radius
+        sag = SAG * root(jnp.sum(gravity**2)) * jnp.diff(s) ** 4 / radius
     elements = Elements.of(positions, point.tangents[:, ::2], form.node_axes(point), free, s, sag)
     if not obstacles:
         return elements, None, jnp.zeros((0, len(s)), s.dtype)

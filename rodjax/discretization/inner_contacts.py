@@ -11,8 +11,8 @@ place where
     g = distance(x) - (1 - THINNER - at_nodes (2 t - 1)^2) radius
 
 is least, so that it follows an edge or a thin pipe along the element; beside a support that holds the rod within the
-obstacle it is in the middle. First derivatives of g are those at a fixed
-place; the second ones count that the place moves. A force p n there is virtual work on both nodes: forces and couples.
+obstacle it is in the middle. First derivatives of g are those at a fixed place; the second ones count that the place
+moves. A force p n there is virtual work on both nodes: forces and couples.
 """
 
 from collections.abc import Callable
@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rodjax.discretization.potentials import of_pulls
 from rodjax.geometry.vectors import cross, dot
 from rodjax.model.along import Value, value_at
 from rodjax.model.obstacles import Obstacle
@@ -135,12 +136,8 @@ class Elements(NamedTuple):
         total = jnp.zeros((2, b + 3, 2, b + 3, n), forces.dtype).at[:, :b, :, :b].set(both)
         by_tangents = self.by_tangents(t, forces)
         for k in range(2):
-            # Half of both orders in which a tangent t turns: w (v.t) + v (w.t) less 2 t (w.v).
-            axes, tangent, force = self.axes[:, k], self.tangents[:, k], by_tangents[:, k]
-            pulled, leaned = (jnp.einsum("cbn,cn->bn", axes, v) for v in (force, tangent))
-            mixed = (pulled[:, None] * leaned[None] + leaned[:, None] * pulled[None]) / 2
-            turn = mixed - dot(force, tangent)[None, None] * jnp.einsum("cbn,can->ban", axes, axes)
-            total = total.at[k, :b, k, :b].add(turn)
+            pulled = of_pulls(by_tangents[:, k], self.tangents[:, k], self.axes[:, k])
+            total = total.at[k, :b, k, :b].add(-pulled.by_rotations)
         return total
 
 

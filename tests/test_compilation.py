@@ -5,11 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax.programs import compilation
+from rodjax.programs import compilation, parts
+from rodjax.programs.parts import traced_once
 
 
 def test_the_cache_is_filled(tmp_path):
@@ -67,3 +70,32 @@ print(resident() - early)
     settings = {**os.environ, "RODJAX_NUMPY_FIRST": "on", "RODJAX_CACHE": "off"}
     run = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
     assert float(run.stdout) < 1000
+
+
+def test_a_part_of_programs_is_traced_once(monkeypatch):
+    """Also for derivatives and stacks, whose numbers are those of the function itself."""
+    traced = []
+
+    @traced_once
+    def part(x, pair):
+        traced.append(isinstance(x, jax.core.Tracer))
+        return jnp.sin(x) * pair[0] + pair[1]
+
+    x, pair = jnp.linspace(0.0, 1.0, 5), (jnp.array(2.0), None)
+
+    def both(x):
+        return part(x, (pair[0], x)) + part(2 * x, (pair[0], x))
+
+    expected = 2 * (np.sin(x) + np.sin(2 * np.asarray(x))) + 2 * np.asarray(x)
+    np.testing.assert_allclose(both(x), expected, rtol=1e-15)
+    assert traced == [False, False]  # as it is
+    traced.clear()
+    np.testing.assert_allclose(jax.jit(both)(x), expected, rtol=1e-14)
+    slopes = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(both(x)))))(jnp.stack([x, x + 1]))
+    by_hand = 2 * (np.cos(np.stack([x, x + 1])) + 2 * np.cos(2 * np.stack([x, x + 1]))) + 2
+    np.testing.assert_allclose(slopes, by_hand, rtol=1e-14)
+    assert traced == [True]
+    # As many traces as there is room for.
+    monkeypatch.setattr(parts, "MOST", 0)
+    jax.jit(lambda x: both(x))(jnp.ones(3))
+    assert len(traced) == 3

@@ -23,6 +23,7 @@ from rodjax.geometry.rotations import columns, rotated
 from rodjax.geometry.vectors import cross, diagonal, dot, skew
 from rodjax.linalg.blocks import product, short_sum, transpose_product
 from rodjax.mechanics.energy import Sections
+from rodjax.programs.parts import traced_once
 
 
 class CellStates(NamedTuple):
@@ -135,6 +136,7 @@ class Turning(NamedTuple):
 Blocks = list[list[Float[Array, "3 3 n"]]]
 
 
+@traced_once
 def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     """By the rotations alone."""
     here = Coordinates.of(cells)
@@ -144,6 +146,7 @@ def first_derivatives(cells: CellStates) -> Float[Array, "3 p n"]:
     return _by_rotations(cells, here, slopes, stresses[3:], turning)
 
 
+@traced_once
 def derivatives(cells: CellStates) -> CellDerivatives:
     here = Coordinates.of(cells)
     strains = cells.field.strains(here.seen[cells.field.coordinates])

@@ -18,6 +18,7 @@ from rodjax.discretization.self_contact import Curve
 from rodjax.geometry.vectors import root
 from rodjax.model.obstacles import InUnits, Obstacle
 from rodjax.model.scene import Scene
+from rodjax.programs.parts import traced_once
 
 # Compliance of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change,
 # times some 200, is asked for again in the next step; the smaller, the more digits the elimination loses.
@@ -113,6 +114,7 @@ def gaps_and_normals(
     return jnp.where(form.is_at_support[None], 1.0, distances - form.radius[None]), normals
 
 
+@traced_once
 def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | None, Float[Array, "q n+1"]]:
     """The elements, where they come nearest to the obstacles without friction, `None` if there are none, and the gaps
     there.

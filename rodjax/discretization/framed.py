@@ -48,6 +48,7 @@ from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import Sections
 from rodjax.model.scene import Scene, has_potential, with_pins
 from rodjax.model.supports import Clamp, Directed
+from rodjax.programs.parts import traced_once
 
 # The moment out of its plane, per length, that a rod in a plane may be left with, as a part of the forces through it
 # and of EI/L^2: directions count as lying in the plane up to as much.
@@ -300,6 +301,7 @@ class FrameForm(Form):
                 across = block_product(block_product(projection[..., 2::2], across), projection[..., 0:-1:2])
         return cells, self.projected(field.scatter_add(cells.first)), (diagonal, lower, across)
 
+    @traced_once
     def linearized(self, point: FramePoint) -> Linearization:
         layout = self.layout
         assert isinstance(layout, SpanForces)

@@ -16,6 +16,7 @@ from rodjax.geometry.vectors import cross, dot, root
 from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
 from rodjax.model.supports import Directed, Free
+from rodjax.programs.parts import traced_once
 
 
 class NodeStrains(eqx.Module):
@@ -64,6 +65,7 @@ def _end_moment(end, frame: Float[Array, "3 3"], held: Float[Array, "3"], sign: 
     return jnp.zeros_like(held)
 
 
+@traced_once
 def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
     """By frames of cells, global axes: at the last one the section moment, at the first the reverse."""
     q = point.quaternions

@@ -46,6 +46,7 @@ from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Directed, Free, Held
+from rodjax.programs.parts import traced_once
 
 
 class QuadraticRotationElements(eqx.Module):
@@ -155,6 +156,7 @@ class QuadraticRotationElements(eqx.Module):
         wholes = swept_angle(new[:, :-1:2], new[:, 2::2], old[:, :-1:2], old[:, 2::2])
         return half * jnp.sum(halves) + whole * jnp.sum(wholes)
 
+    @traced_once
     def by_end_tangents(
         self, scene: Scene, tangents: Float[Array, "3 m"], forces: Float[Array, "3 2 n"], torque: Float[Array, ""]
     ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
@@ -203,6 +205,7 @@ class QuadraticRotationElements(eqx.Module):
         bases = tangent_bases(tangents)
         return carried_in_bases(d1, bases[..., ::2], partial_sums(_turns_along(tangents, bases)))
 
+    @traced_once
     def principal_twist(self, scene: Scene, tangents: Float[Array, "3 m"]) -> Float[Array, ""]:
         """The total twist between two clamps [rad], up to whole turns."""
         assert isinstance(scene.start, Clamp)

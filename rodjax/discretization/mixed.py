@@ -43,6 +43,7 @@ from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene, dead_end_moment, with_pins
 from rodjax.model.supports import Clamp, Free
+from rodjax.programs.parts import traced_once
 
 # A total twist further than this [rad] from those that the end frames allow has lost a part of a turn: others are off
 # by roundings.
@@ -222,9 +223,11 @@ class MixedForm(Form):
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
+    @traced_once
     def linearized(self, point: MixedPoint) -> Linearization:
         return self._linearized(point, self.scene)
 
+    @traced_once
     def released(self, point: MixedPoint) -> Linearization:
         return self._linearized(point, with_pins(self.scene))
 

@@ -54,6 +54,7 @@ from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.model.scene import has_contacts
 from rodjax.model.supports import Held
+from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
 TOUCHES = 1e-2
@@ -100,6 +101,7 @@ class NodalForm(PositionForm):
             nodal = dataclasses.replace(nodal, friction=dataclasses.replace(nodal.friction, forces=forces))
         return dataclasses.replace(point, nodal=nodal)
 
+    @traced_once
     def begun(
         self,
         point: Any,

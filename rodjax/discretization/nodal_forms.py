@@ -31,6 +31,7 @@ from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene, with_pins
 from rodjax.model.supports import Free, Held
+from rodjax.programs.parts import traced_once
 
 
 class NodalTangents(NodalForm, MixedForm):
@@ -63,6 +64,7 @@ class NodalTangents(NodalForm, MixedForm):
     def node_axes(self, point: MixedPoint) -> Float[Array, "3 b n+1"]:
         return cross(point.tangents[:, None, ::2], self.bases_at(point)[..., ::2])
 
+    @traced_once
     def linearized(self, point: MixedPoint) -> Linearization:
         field, tangents = self.field, point.tangents
         assert isinstance(field, QuadraticRotationElements)
@@ -246,6 +248,7 @@ class NodalFrames(NodalForm, FrameForm):
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
+    @traced_once
     def linearized(self, point: FramePoint) -> Linearization:
         cells, gradient, (diagonal, lower, across) = self.by_cells(point)
         if not self.has_potential:

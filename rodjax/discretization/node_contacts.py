@@ -35,6 +35,7 @@ from rodjax.discretization.potentials import OnElements, PointForces, at_both
 from rodjax.discretization.self_contact import Exerted, SelfContacts, exerted, on_elements, self_contacts
 from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
 from rodjax.linalg.unilateral import Unilateral
+from rodjax.programs.parts import traced_once
 
 # A gap counts as so much of a force in EI/L^2 when it is asked whether a search has ended.
 GAP_WEIGHT = 1e4
@@ -230,6 +231,7 @@ def contacts_on_elements(form: PositionForm, point: Any) -> OnElements | None:
     return jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *found) if found else None
 
 
+@traced_once
 def _within_on_elements(form: PositionForm, point: Any) -> OnElements:
     elements, places, _ = within_elements(form, point)
     assert places is not None

@@ -18,6 +18,7 @@ from rodjax.mechanics.energy import axial_strain_under, curvature_under, torque_
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Directed, Free, Support
+from rodjax.programs.parts import traced_once
 
 
 class Resultants(eqx.Module):
@@ -44,6 +45,7 @@ def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
     return _on_edges(form.scene, form.field, point.tangents, tension, forces, point.total_twist)
 
 
+@traced_once
 def _on_elements(form: MixedForm, field: QuadraticRotationElements, point: MixedPoint) -> Resultants:
     """Moments are the derivatives of the energy of the element beside by the tangent of a node: of fourth order too."""
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.geometry.vectors import cross, dot
+from rodjax.programs.parts import traced_once
 
 # Angles below this have series for functions of them.
 SMALL = 1e-2
@@ -26,11 +27,15 @@ Quaternion = tuple[Array, Array, Array, Array]
 def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function of tuples of components also as one of arrays with the components first."""
 
+    @traced_once
+    def of_arrays(*values: Any) -> Any:
+        return jnp.stack(function(*map(jnp.unstack, values)))
+
     @functools.wraps(function)
     def either(*values: Any) -> Any:
         if isinstance(values[0], tuple):
             return function(*values)
-        return jnp.stack(function(*map(jnp.unstack, values)))
+        return of_arrays(*values)
 
     return either
 

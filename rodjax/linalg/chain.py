@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks, negative_count
 from rodjax.linalg.far_rows import FarRows
+from rodjax.programs.parts import traced_once
 
 # Solutions with soft contacts, after the first one.
 HARDENINGS = 5
@@ -236,6 +237,7 @@ class ChainSystem(eqx.Module):
         """With these contacts closed."""
         return dataclasses.replace(self, contacts=dataclasses.replace(self.contacts, is_closed=is_closed))
 
+    @traced_once
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
         first, pressures, u, force = self.split(y)
@@ -358,6 +360,7 @@ class _Border(eqx.Module):
         by_rotation = jnp.concatenate([system.border, by_rotation], axis=1)
         return _Border(by_rotation, by_position, compliance, k + far.positive)
 
+    @traced_once
     def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "k r"]:
         """Transposed, times columns."""
         product = jnp.einsum("ikm,irm->kr", self.by_rotation, x)
@@ -389,6 +392,7 @@ class ChainFactors(eqx.Module):
         """Whether H is positive definite under the constraints."""
         return (self.negative == 0) & jnp.isfinite(jnp.sum(self.inverses)) & jnp.isfinite(jnp.sum(self.complement))
 
+    @traced_once
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """With rigid contacts, by iterative refinement: each correction reduces the penetration by the contact
         compliance times the stiffness of the rod, and with it what rounding has left.
@@ -499,6 +503,7 @@ class ChainFactors(eqx.Module):
         return x, z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
 
 
+@traced_once
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
     whole, contacts, system = system, system.contacts, system.condensed()

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
+from rodjax.programs.parts import traced_once
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
 # square of this, and what they differ by is about 10 times this.
@@ -237,6 +238,7 @@ class _Elimination(eqx.Module):
         return x
 
 
+@traced_once
 def _eliminate(
     diagonal: Float[Array, "b b n"],
     lower: Float[Array, "b b n-1"],

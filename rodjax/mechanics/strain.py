@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.geometry.vectors import dot, triple_product
+from rodjax.programs.parts import traced_once
 
 
 def axial_strain(dphi: Float[Array, "... 3"]) -> Float[Array, "..."]:
@@ -22,6 +23,7 @@ def squared_curvature_between(
     return 4 * squared_difference / ((4 - squared_difference) * spacing**2)
 
 
+@traced_once
 def swept_angle(
     tangent: Float[Array, "3 *k"],
     next_tangent: Float[Array, "3 *k"],

@@ -13,13 +13,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import get_opaque_trace_state
 
 from rodjax.checks import is_known
 from rodjax.programs import kept
 from rodjax.programs.answers import QUICK, Program, knows_quick
-
-_OUTSIDE = get_opaque_trace_state()
+from rodjax.programs.parts import is_outside
 
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
@@ -57,7 +55,9 @@ class _Programs:
         def anew(*args, **options):
             return self.function(*args, **options)
 
-        return jax.jit(anew, static_argnames=tuple(self.static)).trace(*args, **options)
+        # The same mesh of devices as where JAX transposes, that the two may share what they trace.
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            return jax.jit(anew, static_argnames=tuple(self.static)).trace(*args, **options)
 
     @property
     def count(self) -> int:
@@ -198,7 +198,7 @@ def _say_once() -> None:
 
 def _is_whole(*args: Any) -> bool:
     """Whether a function of these arguments is called as a program of its own."""
-    if get_opaque_trace_state() == _OUTSIDE:
+    if is_outside():
         return True
     # Beside the derivatives of something, but not in a program that is being traced.
     return is_known(args) and is_known(jax.lax.full((), 0.0))

@@ -25,6 +25,9 @@ if not IS_OPTIMIZED:
     # As `rodjax.programs.compilation.QUICK`, also for the programs in which tests use solves.
     if jax.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+# Read as NumPy is imported, by workers and processes that tests start: each has one core, on which threads
+# for small matrices wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Memory that compiling frees stays with the process: asking the system for it again and again takes 15 % of the time.
 if sys.platform == "linux":
     M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3

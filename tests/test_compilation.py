@@ -81,10 +81,10 @@ def test_a_part_of_programs_is_traced_once(monkeypatch):
         traced.append(isinstance(x, jax.core.Tracer))
         return jnp.sin(x) * pair[0] + pair[1]
 
-    x, pair = jnp.linspace(0.0, 1.0, 5), (jnp.array(2.0), None)
+    x, factor = jnp.linspace(0.0, 1.0, 5), jnp.array(2.0)
 
     def both(x):
-        return part(x, (pair[0], x)) + part(2 * x, (pair[0], x))
+        return part(x, (factor, x)) + part(2 * x, (factor, x))
 
     expected = 2 * (np.sin(x) + np.sin(2 * np.asarray(x))) + 2 * np.asarray(x)
     np.testing.assert_allclose(both(x), expected, rtol=1e-15)
@@ -99,3 +99,21 @@ def test_a_part_of_programs_is_traced_once(monkeypatch):
     monkeypatch.setattr(parts, "MOST", 0)
     jax.jit(lambda x: both(x))(jnp.ones(3))
     assert len(traced) == 3
+
+
+def test_a_solve_and_its_derivative_trace_the_linearisation_once(monkeypatch):
+    """JAX differentiates and transposes what it has traced for the search."""
+    (part,) = (part for part in parts._parts if part.function.__qualname__ == "MixedForm.linearized")
+    traced, linearized = [], part.function
+    monkeypatch.setattr(part, "inside", None)
+    monkeypatch.setattr(part, "function", lambda *args: traced.append(1) or linearized(*args))
+    x = rj.frame(tangent=(1, 0, 0))
+
+    def force(distance):
+        ends = rj.Clamp((0, 0, 0), x), rj.Clamp((distance, 0, 0), x)
+        return rj.solve(rj.Scene(rj.problems.cable(), *ends, gravity=(0, 0, -9.81)), segments=6).end_force[0]
+
+    slope = jax.grad(force)(0.8)
+    assert len(traced) == 1
+    # Beside 1e-7 of it that the search leaves in the difference.
+    assert abs(slope - (force(0.8 + 1e-4) - force(0.8 - 1e-4)) / 2e-4) < 1e-5 * abs(slope)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 import jax
 from jax.extend.core import get_opaque_trace_state
 
-# So many traces are kept: a solve with all that is read off it has some 20 of one structure and mesh.
+# So many traces are kept: a described solve has 7 (plain) to 27 (curved) of one structure and mesh.
 MOST = 500
 F = TypeVar("F", bound=Callable)
 _OUTSIDE = get_opaque_trace_state()

@@ -1001,7 +1001,7 @@ def damaged_fits(example, world):
     assert not Path("rodjax-fit").exists()
 
 
-MAY_BE_MISSING = {"scene/gravity", "scene/turns", "scene/rod/radius", "scene/point_forces"}
+MAY_BE_MISSING = {"scene/gravity", "scene/turns", "scene/rod/radius"}
 REPLACEMENTS: dict[str, Callable[[np.ndarray], Any]] = {
     "text": lambda _: "text",
     "fewer": lambda values: np.zeros((2, *values.shape)),
@@ -1042,6 +1042,21 @@ def results_with_an_alien_dataset(example, world):
     with pytest.raises(ValueError, match=r"a\.vtkhdf ") as caught:
         load("a.vtkhdf")
     assert type(caught.value) is ValueError
+
+
+def test_a_result_that_lacks_an_entry_is_refused(world):
+    """Each entry in turn: a load or an obstacle that is gone is no smaller scene."""
+    save(world.samples.single, "a.vtkhdf")
+    with opened("a.vtkhdf") as file:
+        found = []
+        file["rodjax"].visititems(lambda place, entry: found.append(place))
+    assert len(found) > 50
+    for place in set(found) - MAY_BE_MISSING:
+        save(world.samples.single, "a.vtkhdf")
+        with opened("a.vtkhdf", "r+") as file:
+            del file["rodjax"][place]
+        with pytest.raises(ValueError, match=r"a\.vtkhdf "):
+            load("a.vtkhdf")
 
 
 def contents(path: str | Path) -> dict[str, Any]:

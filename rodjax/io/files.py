@@ -215,6 +215,8 @@ DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
 # Loads of which files of older formats have none.
 LATER = ("potentials", "point_couples")
+# The attribute of a group that tells how many entries a group in it has, which files until format 17 may lack.
+NUMBER_OF = "number_of_"
 # How deep unions may lie in one another in a file.
 MOST_UNIONS = 2
 # What stands in the attribute `kind` of a group: which of several classes the values are of.
@@ -399,6 +401,7 @@ def _write_value(group: h5py.Group, name: str, value: Any, place: str) -> None:
         _write(group.create_group(name), value, f"{place}/")
     elif isinstance(value, tuple):
         entries = group.create_group(name)
+        group.attrs[NUMBER_OF + name] = len(value)
         for k, entry in enumerate(value):
             _write_value(entries, str(k), entry, f"{place}/*")
     elif value is not None:
@@ -425,7 +428,7 @@ def _read(
     for field in dataclasses.fields(kind):
         if field.metadata.get("static"):
             value = _static(group, field, path)
-        elif field.name in LATER and field.name not in group:
+        elif field.name in LATER and field.name not in group and NUMBER_OF + field.name not in group.attrs:
             value = ()
         else:
             name = STORED_AS.get(field.name, field.name)
@@ -456,6 +459,9 @@ def _read_value(
     of_tuple = next((typing.get_args(one) for one in annotations if typing.get_origin(one) is tuple), None)
     of_arrays = [one for one in annotations if hasattr(one, "dim_str")]
     entry = group.get(name)
+    number = group.attrs.get(NUMBER_OF + name)
+    if number is not None and not (isinstance(entry, h5py.Group) and len(entry) == number):
+        raise ValueError(f"{path} is damaged: {group.name}/{name} has other than its {number} entries")
     if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
         items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
         return tuple(_read_value(entry, str(k), item, path, shape, kinds) for k, item in enumerate(items))

@@ -107,6 +107,25 @@ def test_chunks_do_not_show(monkeypatch):
             np.testing.assert_array_equal(ours, theirs)
 
 
+def test_side_by_side_as_on_an_accelerator(monkeypatch):
+    """All rods of a chunk at once; those that go one after another on a processor."""
+    on = []
+
+    def is_on_processor(mesh=None):
+        on.append(jax.config.jax_default_device is not None)
+        return on[-1]
+
+    scenes = random_scenes(20)
+    monkeypatch.setattr(batch, "CHUNKS", ((16, math.inf),))
+    expected, by_cg = solve_batch(scenes, **OPTIONS), solve_batch(scenes, solver=rj.NonlinearCG(), **OPTIONS)
+    monkeypatch.setattr(batch, "is_on_processor", is_on_processor)
+    monkeypatch.setattr(batch, "ACCELERATOR_CHUNKS", ((16, math.inf),))
+    assert_same(solve_batch(scenes, threads=1, **OPTIONS), expected)
+    assert not any(on)
+    assert_same(solve_batch(scenes, threads=2, solver=rj.NonlinearCG(), **OPTIONS), by_cg)
+    assert any(on)
+
+
 def test_what_fills_up_a_chunk_is_not_solved():
     scenes = batch._stacked(random_scenes(5))
 
@@ -207,8 +226,9 @@ if processes == 1:
         raise AssertionError("scenes that the devices cannot share were taken")
     options = batch.checked_options(scenes[0], 8, None, "finite_difference", None, None, False)[0]
     counts = np.full(jax.device_count(), len(scenes) // jax.device_count())
-    program = jax.jit(batch._solve_many, static_argnames=("options", "mesh"))
-    text = program.lower(stacked, None, counts, 0.05, options=options, mesh=mesh).compile().as_text()
+    program = jax.jit(batch._solve_many, static_argnames=("options", "mesh", "lanes"))
+    lowered = program.lower(stacked, None, counts, 0.05, options=options, mesh=mesh, lanes=8)
+    text = lowered.compile().as_text()
     assert "while(" in text
     for collective in ("all-reduce", "all-gather", "all-to-all", "collective-permute"):
         assert collective + "(" not in text, collective

@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -307,6 +308,17 @@ def test_batch(capsys, monkeypatch):
     assert len({row.turns for row in easy}) == 1  # the same work, whoever does it
     assert mixed[0].turns > easy[0].turns
     assert "solve_batch" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_accelerator(capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    (row,) = script("accelerator").main(["--count", "16", "--of-core", "16", "--kinds", "differences"])
+    assert row.converged == 1.0
+    assert row.difference == 0.0  # the processor is the accelerator here
+    found = re.search(r"error (\S+)\n", capsys.readouterr().out)
+    assert found
+    assert float(found[1]) < 1e-6  # of a difference by 1e-5 of the stiffness
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ side, the lanes, make their turns of Newton's method together, and a lane whose 
 compiled loop without idle work, until there are no more scenes. Many scenes go in chunks, which threads share.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -54,12 +55,14 @@ from rodjax.solving.result import (
     warn_of_outcome,
 )
 
-# Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all.
-LANES = 8
+# Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all. On
+# an accelerator starting a loop takes 3 us, in which it could make a turn of 30 rods.
+LANES, ACCELERATOR_LANES = 8, 8192
 # Scenes in one call of a compiled program, and up to how many scenes in all: of the first that allows so many; more go
 # by the last. The fewer in a call, the more threads share them, and the longer lanes idle at its end: 128 take 11 %
 # more time a scene than 1024, 256 take 6 %. What is prepared for a scene takes some 20 kB at 50 segments.
 CHUNKS = ((16, 16), (128, 128), (256, 4096), (1024, math.inf))
+ACCELERATOR_CHUNKS = ((1024, 1024), (8192, 8192), (65536, math.inf))
 
 
 @one_answer
@@ -171,9 +174,23 @@ def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Sce
     return stack_scenes(rows)
 
 
-def chunk_size(count: int) -> int:
+def is_on_processor(mesh: Mesh | None = None) -> bool:
+    """Whether programs run on a processor: on the devices of a mesh, or on JAX's default device."""
+    if mesh is not None:
+        return mesh.devices.flat[0].platform == "cpu"
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return getattr(device, "platform", device or jax.default_backend()) == "cpu"
+
+
+def lane_count(mesh: Mesh | None = None) -> int:
+    """So many rods are computed side by side."""
+    return LANES if is_on_processor(mesh) else ACCELERATOR_LANES
+
+
+def chunk_size(count: int, mesh: Mesh | None = None) -> int:
     """Scenes in one call, of so many in all; that threads share them changes nothing."""
-    return next(size for size, most in CHUNKS if count <= most)
+    chunks = CHUNKS if is_on_processor(mesh) else ACCELERATOR_CHUNKS
+    return next(size for size, most in chunks if count <= most)
 
 
 def _in_chunks(
@@ -188,8 +205,16 @@ def _in_chunks(
     each = _is_stack(guess)
     devices = 1 if mesh is None else mesh.size
     share = -(-count // devices)
-    chunk = chunk_size(share)
+    lanes, chunk, processor = lane_count(mesh), chunk_size(share, mesh), None
     is_traced = not is_known(scenes, guess)
+    if _go_in_turn(scenes, options) and not (is_traced or mesh is not None or is_on_processor()):
+        # One rod at a time an accelerator only waits for its next small program.
+        with contextlib.suppress(RuntimeError):  # where JAX was told to have no processor
+            processor = jax.devices("cpu")[0]
+        if processor is not None:
+            with jax.default_device(processor):
+                scenes, guess = jax.tree.map(np.asarray, (scenes, guess))
+                return _in_chunks(scenes, guess, strain_limit, options, None, threads)
     if mesh is not None and (is_traced or jax.process_count() > 1):
         if count % devices:
             raise ValueError(
@@ -198,7 +223,7 @@ def _in_chunks(
             )
         chunk = share
     if is_traced:
-        return _solve_many(scenes, guess, jnp.full(devices, share), strain_limit, options, mesh)
+        return _solve_many(scenes, guess, jnp.full(devices, share), strain_limit, options, mesh, lanes)
 
     def solved(first: int) -> Equilibrium:
         last = min(first + chunk * devices, count)
@@ -210,7 +235,7 @@ def _in_chunks(
             whole = jax.sharding.NamedSharding(mesh, PartitionSpec())
             shardings = (sharding, sharding if each else whole, sharding)
             inputs = tuple(jax.device_put(x, place) for x, place in zip(inputs, shardings, strict=True))
-        return jax.block_until_ready(_solve_many(*inputs, strain_limit, options, mesh))
+        return jax.block_until_ready(_solve_many(*inputs, strain_limit, options, mesh, lanes))
 
     firsts = range(0, count, chunk * devices)
     if len(firsts) == 1:
@@ -226,7 +251,17 @@ def _in_chunks(
     if count == chunk * devices:
         return parts[0]
     found = [parts[k] for k in range(len(parts))]
+    if not is_on_processor(mesh):  # results stay there
+        return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
     return jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)[:count]), *found)
+
+
+def _go_in_turn(scenes: Scene, options: Options) -> bool:
+    """Whether scenes are solved one after another: side by side all would wait for the slowest in each of the loops
+    that a solve has within its own.
+    """
+    is_path = scenes.rod.length.ndim == 2
+    return is_path or not isinstance(options.solver, Newton) or slides(scenes) or has_node_positions(scenes)
 
 
 def _is_stack(guess: Guess | Equilibrium | None) -> bool:
@@ -237,15 +272,16 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
     """Entries `first` to `last`, and the last of them again up to `size`."""
     if last - first == size == len(x):
         return x
-    return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
+    rows = np.minimum(np.arange(first, first + size), last - 1)
+    return np.asarray(x)[rows] if is_on_processor() else jnp.asarray(x)[rows]
 
 
 def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
     """The first `count` of stacked scenes, each from its guess, without derivatives; of the others nothing of use."""
-    return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None)
+    return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None, lane_count())
 
 
-@functools.partial(compiled, static_argnames=("mesh",))
+@functools.partial(compiled, static_argnames=("mesh", "lanes"))
 def _solve_many(
     scenes: Scene,
     guess: Guess | Equilibrium | None,
@@ -253,15 +289,17 @@ def _solve_many(
     strain_limit: Float[Array, ""] | float,
     options: Options,
     mesh: Mesh | None,
+    lanes: int,
 ) -> Equilibrium:
     """The first of the scenes, as many as `counts` tells each device; of the rest something without meaning."""
+    solve = functools.partial(_solve_here, lanes=min(lanes, len(scenes.rod.length) // len(counts)))
     if mesh is None:
-        return _solve_here(scenes, guess, counts, strain_limit, options)
+        return solve(scenes, guess, counts, strain_limit, options)
     # Not `jit` with sharded inputs, which would ask all devices in each turn whether all are done.
     shared = PartitionSpec(mesh.axis_names[0])
     whole = PartitionSpec()
     specs = (shared, shared if _is_stack(guess) else whole, shared, whole, whole)
-    many = jax.shard_map(_solve_here, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
+    many = jax.shard_map(solve, mesh=mesh, in_specs=specs, out_specs=shared, check_vma=False)
     return many(scenes, guess, counts, *jax.tree.map(jnp.asarray, (strain_limit, options)))
 
 
@@ -271,6 +309,8 @@ def _solve_here(
     counts: Int[Array, "1"],
     strain_limit: Float[Array, ""] | float,
     options: Options,
+    *,
+    lanes: int,
 ) -> Equilibrium:
     if scenes.rod.length.ndim == 2:
         path = functools.partial(path_from, strain_limit=strain_limit, options=options)
@@ -285,16 +325,18 @@ def _solve_here(
     def result(scene: Scene, found: Found) -> Equilibrium:
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 
-    if not isinstance(options.solver, Newton) or slides(scenes) or has_node_positions(scenes):
+    solver = options.solver
+    if _go_in_turn(scenes, options) or not isinstance(solver, Newton):
 
         def whole(scene: Scene, guess: Guess | Equilibrium | None) -> Equilibrium:
             return result(scene, solve_from(scene, *state(scene, guess), options))
 
         return _in_turn(whole, scenes, guess, counts[0])
     starts = jax.vmap(state, (0, 0 if _is_stack(guess) else None))(scenes, guess)
-    searches = _mapped(search, scenes, starts)
-    ends = _ends(searches, counts[0], options.solver, options.find)
-    return _mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)
+    mapped = functools.partial(_mapped, lanes)
+    searches = mapped(search, scenes, starts)
+    ends = _ends(searches, counts[0], lanes, solver, options.find)
+    return mapped(lambda scene, search, end: result(scene, search.found(end)), scenes, searches, ends)
 
 
 def _in_turn(
@@ -303,7 +345,7 @@ def _in_turn(
     guess: Guess | Equilibrium | None,
     count: Int[Array, ""],
 ) -> Equilibrium:
-    """The first `count` one after another: side by side all would wait for the slowest in each loop within a loop."""
+    """The first `count` one after another."""
     is_each = _is_stack(guess)
 
     def solved(k: Int[Array, ""]) -> Equilibrium:
@@ -319,9 +361,9 @@ def _in_turn(
     return jax.lax.fori_loop(0, count, added, results)
 
 
-def _mapped(function: Callable, *stacks: Any) -> Any:
+def _mapped(lanes: int, function: Callable, *stacks: Any) -> Any:
     """`function` of each entry of the stacks, so many at a time as fit into a processor's cache."""
-    return jax.lax.map(lambda entries: function(*entries), stacks, batch_size=LANES)
+    return jax.lax.map(lambda entries: function(*entries), stacks, batch_size=lanes)
 
 
 class _Lanes(eqx.Module):
@@ -334,10 +376,9 @@ class _Lanes(eqx.Module):
     ends: NewtonEnd
 
 
-def _ends(searches: Search, count: Int[Array, ""], solver: Newton, find: Find) -> NewtonEnd:
+def _ends(searches: Search, count: Int[Array, ""], lanes: int, solver: Newton, find: Find) -> NewtonEnd:
     """Where the first `count` of the searches end."""
     total = searches.point.total_twist.shape[0]
-    lanes = min(LANES, total)
 
     def started(search: Int[Array, "lanes"]) -> tuple[MixedForm, NewtonState]:
         at = jnp.minimum(search, total - 1)

@@ -149,8 +149,9 @@ def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple]) -> Iterato
 
 
 def inherited() -> Callable[[], contextlib.AbstractContextManager]:
-    """What holds in this thread, for threads that it starts to enter: that it is at a part, and the precision."""
+    """What holds in this thread, for threads that it starts to enter: that it is at a part, precision and device."""
     is_at_part, is_double = _here.is_at_part, jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     @contextlib.contextmanager
     def entered() -> Iterator[None]:
@@ -159,6 +160,8 @@ def inherited() -> Callable[[], contextlib.AbstractContextManager]:
                 stack.enter_context(_at_part())
             if is_double != jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
                 stack.enter_context(jax.enable_x64(is_double))
+            if device != jax.config.jax_default_device:  # pyright: ignore[reportAttributeAccessIssue]
+                stack.enter_context(jax.default_device(device))
             yield
 
     return entered
@@ -180,13 +183,19 @@ def _part_done(function: Callable[..., Any], part: tuple) -> Any:
 
 
 def _by_threads(function: Callable[..., Any], parts: Iterable[tuple], count: int) -> Iterator[tuple[int, Any]]:
+    entered = inherited()
+
+    def within(function: Callable[..., Any], *arguments: Any) -> Any:
+        with entered():
+            return function(*arguments)
+
     with ThreadPoolExecutor(count, "rodjax") as pool:
-        # What a block of the user's has set, such as the precision, other threads do not know of.
-        if pool.submit(kept.settings).result() != kept.settings():
+        # What else a block of the user's has set other threads do not know of.
+        if pool.submit(within, kept.settings).result() != kept.settings():
             yield from _one_by_one(function, parts)
             return
         yield from _collected(
-            lambda part: pool.submit(_part_done, function, part), parts, UNDER_WAY_A_THREAD * count, retries=0
+            lambda part: pool.submit(within, _part_done, function, part), parts, UNDER_WAY_A_THREAD * count, retries=0
         )
 
 

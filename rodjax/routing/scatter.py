@@ -17,7 +17,7 @@ from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Free
 from rodjax.notes import bar
-from rodjax.paths.batch import LANES, chunk_size, solve_stack
+from rodjax.paths.batch import chunk_size, lane_count, solve_stack
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import Workers, as_completed, rows_of
@@ -157,7 +157,8 @@ def _scenes(scattering: Scattering, zs: Float[Array, "k p"]) -> Scene:
 def _quantities(scattering: Scattering, rods: Equilibrium) -> Quantities:
     # Not by `batch_size`: there may be no values.
     count = rods.s.shape[0]
-    lanes = jax.tree.map(lambda x: x.reshape(count // LANES, LANES, *x.shape[1:]), rods)
+    at_once = math.gcd(count, lane_count())
+    lanes = jax.tree.map(lambda x: x.reshape(count // at_once, at_once, *x.shape[1:]), rods)
     found = jax.lax.map(jax.vmap(scattering.quantities), lanes)
     return Quantities(*(x.reshape(count, *x.shape[2:]) for x in found))
 

@@ -176,12 +176,14 @@ def _numbers(value: Any) -> Float[Numbers, "..."]:
     return value.values if isinstance(value, Along) else value
 
 
-def _is_rotation(frame: Float[Numbers, "... 3 3"]) -> Bool[Numbers, "... 3"]:
-    xp = namespace(frame)
-    products = xp.einsum("...ki,...kj->...ij", frame, frame)
-    one = xp.broadcast_to(xp.eye(3, dtype=frame.dtype), products.shape)
-    volume = xp.sum(xp.cross(frame[..., 0], frame[..., 1]) * frame[..., 2], axis=-1, keepdims=True)
-    return (xp.max(xp.abs(products - one), axis=-1) <= ROTATION_TOLERANCE) & (volume > 0)
+def _is_rotation(frame: Float[Numbers, "... 3 3"]) -> Bool[Numbers, "..."]:
+    # By components: of many frames `einsum` takes ten times as long.
+    (a, b, c), (d, e, f), (g, h, i) = ([frame[..., row, column] for row in range(3)] for column in range(3))
+    off = [a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c]
+    lengths = [a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i]
+    volume = (b * f - c * e) * g + (c * d - a * f) * h + (a * e - b * d) * i
+    close = [abs(value) <= ROTATION_TOLERANCE for value in (*off, *(length - 1 for length in lengths))]
+    return functools.reduce(operator.and_, close, volume > 0)
 
 
 def _is_misplaced(scenes: Scene) -> Bool[np.ndarray, "..."]:

@@ -1,6 +1,8 @@
 """The window's session, without a browser."""
 
 import contextlib
+import http.client
+import importlib.metadata
 import inspect
 import io
 import math
@@ -18,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import rodjax as rj
 from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
-from rodjax.window import tube
+from rodjax.window import origins, tube
 from rodjax.window.bounds import Asked, asked_of, why_not
 from rodjax.window.browser import started
 from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, shared_obstacles, sliders_of
@@ -750,6 +752,61 @@ def test_only_this_machine_can_connect():
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
+
+
+# Another page's origin; a name that somebody made lead to this machine; and what the window's own page sends.
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("127.0.0.1:{}", None, 200),
+        ("localhost:{}", "http://localhost:{}", 200),
+        ("localhost:9000", "http://localhost:9000", 200),  # through a tunnel of ssh's
+        ("127.0.0.1:{}", "http://127.0.0.1:1", 403),
+        ("127.0.0.1:{}", "https://example.org", 403),
+        ("127.0.0.1:{}", "null", 403),
+        ("example.org:{}", None, 403),
+        ("example.org:{}", "http://example.org:{}", 403),
+    ],
+)
+def test_only_its_own_page_may_talk_to_the_window(host, origin, status, window_server):
+    port = window_server.get_port()
+    headers = {"Host": host.format(port)} | ({} if origin is None else {"Origin": origin.format(port)})
+    upgrade = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        "Sec-WebSocket-Protocol": f"viser-v{importlib.metadata.version('viser')}",
+    }
+    for more, expected in (({}, status), (upgrade, 101 if status == 200 else status)):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("GET", "/", headers=headers | more)
+        assert connection.getresponse().status == expected
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def window_server():
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    server = started(0, "127.0.0.1")
+    yield server
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "host", "is_own"),
+    [
+        ("workstation:80", "0.0.0.0", True),
+        ("workstation", "workstation", True),
+        ("[::1]:8080", "::1", True),
+        ("[::1", "::1", False),
+        ("", "127.0.0.1", False),
+        ("10.0.0.1", "localhost", False),
+    ],
+)
+def test_names_of_a_window(name, host, is_own):
+    assert origins.is_own({"Host": name}, host) is is_own
 
 
 def test_a_port_that_is_taken_is_not_changed_for_another(scene_toml, capsys):

@@ -21,6 +21,7 @@ from rodjax.window.controls import Pose, rods_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
 from rodjax.window.numbers import least_bend_radius, rows
+from rodjax.window.origins import only_own_pages
 from rodjax.window.panel import Buttons, Panel
 from rodjax.window.reading import QUANTITIES, readings_of
 from rodjax.window.session import Report, Session
@@ -375,7 +376,7 @@ def started(port: int, host: str) -> Any:
             probe.bind((host, port))
         except OSError as error:
             raise OSError(f"port {port} of {host} cannot be opened: {error.strerror}") from None
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), only_own_pages(host):
         return viser.ViserServer(host=host, port=port, label="rodjax", verbose=False)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from rodjax.checks import is_known
 from rodjax.programs import kept
 from rodjax.programs.answers import QUICK, Program, knows_quick
-from rodjax.programs.parts import is_outside
+from rodjax.programs.parts import is_outside, is_staged
 
 # A compiled program takes hundreds of memory maps, of which Linux allows a process 65530 or so; beyond, compiling
 # crashes it. Where more than this part of them is taken, programs are dropped until half of it is.
@@ -198,10 +198,8 @@ def _say_once() -> None:
 
 def _is_whole(*args: Any) -> bool:
     """Whether a function of these arguments is called as a program of its own."""
-    if is_outside():
-        return True
-    # Beside the derivatives of something, but not in a program that is being traced.
-    return is_known(args) and is_known(jax.lax.full((), 0.0))
+    # Beside the derivatives of something too, but not in a program that is being traced.
+    return is_outside() or (is_known(args) and not is_staged())
 
 
 def enable_compilation_cache(directory: str | os.PathLike[str] | None = None) -> Path:

@@ -19,6 +19,7 @@ from jax.interpreters import ad, batching, mlir
 from rodjax.checks import is_known
 from rodjax.programs.compilation import compiled
 from rodjax.programs.numpy_rules import INNER
+from rodjax.programs.parts import zeros
 
 # What has been done to a function: ("map", the mapped axis of each leaf) or ("transpose", shapes and types of the
 # leaves of the linear argument).
@@ -117,7 +118,7 @@ def _transpose(
 ) -> list[Any]:
     count = tree.num_leaves
     given = tuple((leaf.aval.shape, leaf.aval.dtype.name) for leaf in leaves[count:])
-    cotangents = list(map(ad.instantiate_zeros, cotangents))
+    cotangents = [zeros(found.aval) if type(found) is ad.Zero else found for found in cotangents]
     steps = (*steps, ("transpose", given))
     changes = _linear.bind(*leaves[:count], *cotangents, program=program, tree=tree, steps=steps, kinds=given)
     return [None] * count + changes

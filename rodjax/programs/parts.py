@@ -10,7 +10,11 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import get_opaque_trace_state
+
+from rodjax.checks import is_known
 
 # So many traces are kept: a described solve has 7 (plain) to 27 (curved) of one structure and mesh.
 MOST = 500
@@ -21,6 +25,17 @@ _OUTSIDE = get_opaque_trace_state()
 def is_outside() -> bool:
     """Whether nothing is being traced or differentiated."""
     return get_opaque_trace_state() == _OUTSIDE
+
+
+def is_staged() -> bool:
+    """Whether what is called becomes a part of a program, and not only of derivatives."""
+    return not is_outside() and not is_known(jax.device_put(np.zeros(())))
+
+
+def zeros(like: Any) -> jax.Array:
+    """As `jnp.zeros_like`, for which JAX compiles a program for each shape where it is part of none."""
+    shape, dtype = like.shape, like.dtype
+    return jnp.zeros(shape, dtype) if is_staged() else jax.device_put(np.zeros(shape, dtype))
 
 
 class _Part:

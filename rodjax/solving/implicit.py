@@ -20,6 +20,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.model.scene import Scene, has_contacts, nondimensional
 from rodjax.programs.linear import linear
+from rodjax.programs.parts import zeros
 from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
 from rodjax.solving.stability import carried_to, examined
 from rodjax.solving.status import Outcome
@@ -38,7 +39,7 @@ def differentiable(scene: Scene, result: Equilibrium) -> Equilibrium:
 def with_zeros(change: Any, value: Any) -> Any:
     """The tangent of a value, zero where `filter_custom_jvp` has `None` for a number that does not change."""
     return jax.tree.map(
-        lambda change, leaf: jnp.zeros_like(leaf) if change is None and leaf is not None else change,
+        lambda change, leaf: zeros(leaf) if change is None and leaf is not None else change,
         change,
         value,
         is_leaf=lambda change: change is None,
@@ -56,8 +57,11 @@ def _(primals, tangents):
     scene_change = with_zeros(tangents[0], scene)
     # With derivatives of its own, for second ones of what is made of it.
     value = _differentiable(scene, result)
-    # It stays what the search found, whatever XLA makes of the same numbers beside the derivatives.
-    return value, _change_of_result(*jax.lax.optimization_barrier((scene, value)), scene_change)
+    if not is_known(scene, value):
+        # It stays what the search found, whatever XLA makes of the same numbers beside the derivatives.
+        scene, kept = jax.lax.optimization_barrier((scene, value))
+        return value, _change_of_result(scene, kept, scene_change)
+    return value, _change_of_result(scene, value, scene_change)
 
 
 @linear

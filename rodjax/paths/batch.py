@@ -182,6 +182,13 @@ def is_on_processor(mesh: Mesh | None = None) -> bool:
     return getattr(device, "platform", device or jax.default_backend()) == "cpu"
 
 
+def _processor() -> Any:
+    """JAX's device for it; `None` where JAX was told to have none."""
+    with contextlib.suppress(RuntimeError):
+        return jax.devices("cpu")[0]
+    return None
+
+
 def lane_count(mesh: Mesh | None = None) -> int:
     """So many rods are computed side by side."""
     return LANES if is_on_processor(mesh) else ACCELERATOR_LANES
@@ -205,12 +212,11 @@ def _in_chunks(
     each = _is_stack(guess)
     devices = 1 if mesh is None else mesh.size
     share = -(-count // devices)
-    lanes, chunk, processor = lane_count(mesh), chunk_size(share, mesh), None
+    lanes, chunk = lane_count(mesh), chunk_size(share, mesh)
     is_traced = not is_known(scenes, guess)
     if _go_in_turn(scenes, options) and not (is_traced or mesh is not None or is_on_processor()):
         # One rod at a time an accelerator only waits for its next small program.
-        with contextlib.suppress(RuntimeError):  # where JAX was told to have no processor
-            processor = jax.devices("cpu")[0]
+        processor = _processor()
         if processor is not None:
             with jax.default_device(processor):
                 scenes, guess = jax.tree.map(np.asarray, (scenes, guess))
@@ -241,8 +247,9 @@ def _in_chunks(
     if len(firsts) == 1:
         parts = {0: solved(0)}
     else:
-        # Of several devices each call uses all.
-        results = as_completed(solved, ((first,) for first in firsts), threads=threads if mesh is None else 1)
+        # Of several devices each call uses all; one accelerator has no room for many.
+        at_once = 1 if mesh is not None else threads if is_on_processor() else min(threads, 2)
+        results = as_completed(solved, ((first,) for first in firsts), threads=at_once)
         parts = {}
         with bar(count, "cases") as drawn:
             for k, part in results:

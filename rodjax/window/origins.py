@@ -37,10 +37,10 @@ def is_own(headers: Mapping[str, str], host: str) -> bool:
     a server that only this machine reaches has no other names than those of this machine.
     """
     asked, origin = headers.get("Host", ""), headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != asked:
-        return False
     try:
         name = urlsplit(f"//{asked}").hostname or ""
+        if origin is not None and urlsplit(origin).netloc != asked:
+            return False
     except ValueError:
         return False
     return name == host.lower() or _is_of_this_machine(name) or not _is_of_this_machine(host)

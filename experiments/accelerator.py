@@ -1,8 +1,9 @@
 """How many independent scenes a second on an accelerator? `rodjax.solve_batch` there and on one core of the processor.
 
 Seeded scenes: a cable between two clamps about 0.7 L apart, their directions about 17 degrees off, under its weight;
-the same with two bending stiffnesses, and over a floor. Then the derivatives of all of them by all their numbers, and a
-scene by itself. Where JAX has no accelerator the same runs on the processor.
+the same with two bending stiffnesses, and over a floor. Then a scene by itself, and a number made of all end forces
+with its derivatives by all bending stiffnesses, in one program. Where JAX has no accelerator the same runs on the
+processor.
 
     python experiments/accelerator.py [--count 100000] [--of-core 256] [--kinds differences elements frames floor]
                                       [--profile]
@@ -103,7 +104,9 @@ def measured(kind: str, count: int, of_core: int) -> Row:
 
 
 def derivatives(count: int) -> tuple[float, float, float]:
-    """Us a scene of a value of all results, and of that with its gradient; relative error of one of its entries."""
+    """Us a scene of a value of all results in one program, and of that with its gradient; relative error of one of its
+    entries.
+    """
     scenes = jax.device_put(stacked("elements", count))
 
     def total(stiffness: jax.Array) -> jax.Array:
@@ -112,8 +115,8 @@ def derivatives(count: int) -> tuple[float, float, float]:
         return jnp.sum(jnp.sum(forces**2, axis=-1))
 
     stiffness = scenes.rod.EI
-    _, _, alone = least_seconds(lambda: total(stiffness))
-    both = jax.jit(jax.value_and_grad(total))
+    value, both = jax.jit(total), jax.jit(jax.value_and_grad(total))
+    _, _, alone = least_seconds(lambda: value(stiffness))
     (_, slopes), _, seconds = least_seconds(lambda: both(stiffness))
     h = 1e-5 * float(stiffness[0])
     by_difference = (both(stiffness.at[0].add(h))[0] - both(stiffness.at[0].add(-h))[0]) / (2 * h)

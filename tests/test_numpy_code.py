@@ -274,6 +274,23 @@ def test_both_codes_of_a_solve_agree(compiled_at_once):
 
 
 @linear
+def sum_and_table(factors, value, change):
+    """Of value = (sum of factors, a table of 7 x 13 such sums)."""
+    return {"sum": jnp.sum(change["x"]), "table": jnp.full((7, 13), jnp.sum(change["x"]))}
+
+
+def test_zeros_beside_derivatives_are_no_programs(caplog):
+    """What has no cotangent has zeros of its shape, 7 x 13 as nothing else here."""
+    value, x = {"sum": jnp.array(3.0), "table": jax.device_put(np.full((7, 13), 3.0))}, jnp.ones(3)
+    with jax.log_compiles():
+        slope = jax.grad(lambda change: sum_and_table({"x": x}, value, {"x": change})["sum"])(x)
+    np.testing.assert_array_equal(slope, np.ones(3))
+    said = [record.getMessage() for record in caplog.records]
+    assert any("tracing" in line for line in said)
+    assert not [line for line in said if "broadcast_in_dim" in line]
+
+
+@linear
 def scaled_change(factors, value, change):
     """Of value = sin(factors) summed, squared: a function that is linear in `change`."""
     return {"sum": 2 * value["sum"] * jnp.sum(jnp.cos(factors["x"]) * change["x"]), "count": None}

@@ -140,6 +140,19 @@ def test_an_executor_works_in_the_precision_of_who_asks():
     np.testing.assert_array_equal(wide, 0.2)
 
 
+def test_threads_work_on_the_device_of_who_asks():
+    """Side by side: one after another they would never meet."""
+    meeting = threading.Barrier(2)
+
+    def device(_):
+        meeting.wait(30.0)
+        return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+    (processor, *_) = jax.devices("cpu")
+    with jax.default_device(processor):
+        assert in_order(device, [(0,), (1,)], threads=2) == [processor] * 2
+
+
 def test_a_worker_with_other_code_is_told():
     other = tasks._Surroundings.here()._replace(source="f" * 64)
     with pytest.raises(TaskError, match=r"^the worker on \S+ is not like the process that asks, different in source "):

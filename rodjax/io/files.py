@@ -215,7 +215,7 @@ DISCRETIZATIONS = ("finite_difference", "hermite", "continuum")
 OBSTACLES = (Plane, Sphere, Capsule, Pipe, Cylinder, Box, Union, Mesh)
 # Loads of which files of older formats have none.
 LATER = ("potentials", "point_couples")
-# The attribute of a group that tells how many entries a group in it has, which files until format 17 may lack.
+# The attribute of a group that tells how many entries a group in it has; older files of each format lack it.
 NUMBER_OF = "number_of_"
 # How deep unions may lie in one another in a file.
 MOST_UNIONS = 2
@@ -460,8 +460,9 @@ def _read_value(
     of_arrays = [one for one in annotations if hasattr(one, "dim_str")]
     entry = group.get(name)
     number = group.attrs.get(NUMBER_OF + name)
-    if number is not None and not (isinstance(entry, h5py.Group) and len(entry) == number):
-        raise ValueError(f"{path} is damaged: {group.name}/{name} has other than its {number} entries")
+    found = len(entry) if isinstance(entry, h5py.Group) else 0
+    if number is not None and not (isinstance(entry, h5py.Group) and np.array_equal(number, found)):
+        raise ValueError(f"{path} is damaged: {group.name}/{name} must have {shown(number)} entries, got {found}")
     if isinstance(entry, h5py.Group) and of_tuple and not (classes and "kind" in entry.attrs):
         items = of_tuple[:1] * len(entry) if of_tuple[-1] is Ellipsis else of_tuple
         return tuple(_read_value(entry, str(k), item, path, shape, kinds) for k, item in enumerate(items))

@@ -279,8 +279,11 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
     """Entries `first` to `last`, and the last of them again up to `size`."""
     if last - first == size == len(x):
         return x
-    rows = np.minimum(np.arange(first, first + size), last - 1)
-    return np.asarray(x)[rows] if is_on_processor() else jnp.asarray(x)[rows]
+    if is_on_processor():
+        return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
+    if last - first == size:
+        return jax.lax.dynamic_slice_in_dim(x, first, size)
+    return jnp.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
 
 
 def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
@@ -397,9 +400,11 @@ def _ends(searches: Search, count: Int[Array, ""], lanes: int, solver: Newton, f
         states = jax.vmap(functools.partial(turn, solver=solver, find=find))(lanes.forms, lanes.states)
         states = _chosen(going, states, lanes.states)
         lanes = eqx.tree_at(lambda lanes: lanes.states, lanes, states)
-        done = ~is_running(states) & (lanes.search < count)
+        # Apart from what is computed of each lane: sums are one block's work on an accelerator, and would draw that along.
+        ends, used = jax.lax.optimization_barrier((~is_running(states), lanes.search < count))
+        done = ends & used
         # Handing over takes longer than a turn of one rod, and so waits for a few.
-        enough = jnp.where(lanes.following < count, len(done) // 4, jnp.sum(lanes.search < count))
+        enough = jnp.where(lanes.following < count, len(done) // 4, jnp.sum(used))
         return jax.lax.cond(jnp.sum(done) >= jnp.maximum(enough, 1), handed_over, lambda lanes, _: lanes, lanes, done)
 
     def handed_over(lanes: _Lanes, done: Bool[Array, "lanes"]) -> _Lanes:

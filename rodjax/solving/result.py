@@ -910,15 +910,16 @@ def warn_if_coarse(equilibrium: Equilibrium) -> None:
     """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that."""
     curvature, s = np.asarray(equilibrium.curvature), np.asarray(equilibrium.s)
     turn = np.maximum(curvature[..., 1:], curvature[..., :-1]) * (s[..., 1:] - s[..., :-1])
-    if equilibrium.discretization == "finite_difference":
-        turn = 2 * np.arctan(turn / 2)  # their curvature is 2 tan(turn/2)/h
-    is_coarse = (turn > MOST_TURN[equilibrium.discretization]).any(-1)
+    by_tangent = equilibrium.discretization == "finite_difference"  # their curvature is 2 tan(turn/2)/h
+    limit = MOST_TURN[equilibrium.discretization]
+    is_coarse = (turn > (2 * math.tan(limit / 2) if by_tangent else limit)).any(-1)
     if not is_coarse.any():
         return
     is_coarse &= np.asarray(equilibrium.converged)
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
         most = np.max(turn[is_coarse])
+        most = 2 * np.arctan(most / 2) if by_tangent else most
         most = f"{most:.1f} rad" if most < 2 * math.pi else "more than a whole turn"  # no figure on such a mesh
         warn(
             f"the mesh of {s.shape[-1] - 1} segments is too coarse{many}: the rod turns by {most} along one of them; "

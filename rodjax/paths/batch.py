@@ -400,7 +400,7 @@ def _ends(searches: Search, count: Int[Array, ""], lanes: int, solver: Newton, f
         states = jax.vmap(functools.partial(turn, solver=solver, find=find))(lanes.forms, lanes.states)
         states = _chosen(going, states, lanes.states)
         lanes = eqx.tree_at(lambda lanes: lanes.states, lanes, states)
-        # Apart from what is computed of each lane: sums are one block's work on an accelerator, and would draw that along.
+        # Apart from what each lane computes: on an accelerator a sum is one block's work, and would draw that along.
         ends, used = jax.lax.optimization_barrier((~is_running(states), lanes.search < count))
         done = ends & used
         # Handing over takes longer than a turn of one rod, and so waits for a few.

@@ -15,6 +15,7 @@ frames, the latter with loads that have no potential.
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,7 @@ from rodjax.discretization import potentials
 from rodjax.discretization.contact_gaps import (
     curve,
     gaps_and_normals,
+    hardness,
     has_inner_contacts,
     model_compliance,
     pressure_rows,
@@ -99,6 +101,8 @@ class NodalForm(PositionForm):
             rough = np.array(rough_obstacles(self.scene))
             forces = tangential(nodal.friction.forces, here.system.contacts.normals[rough])
             nodal = dataclasses.replace(nodal, friction=dataclasses.replace(nodal.friction, forces=forces))
+        if nodal.hardness is not None:
+            nodal = dataclasses.replace(nodal, hardness=hardness(self, here, nodal.pressures[-1]))
         return dataclasses.replace(point, nodal=nodal)
 
     @traced_once
@@ -134,7 +138,8 @@ class NodalForm(PositionForm):
         if self.scene.self_contact:
             far = contacts_with_itself(self, point, pressures[-1])
             gaps = jnp.concatenate([gaps, far.gaps[None]])
-        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=relaxation(self, gaps))
+        hard = jnp.ones((), nodes.dtype) if self.scene.self_contact else None
+        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=relaxation(self, gaps), hardness=hard)
         return dataclasses.replace(point, nodal=nodal)
 
     # --- fields along the elements -----------------------------------------------------------------------------------
@@ -210,8 +215,17 @@ class NodalForm(PositionForm):
             sticks = contacts.is_closed(trial)[k:]
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
+        if nodal.hardness is not None:
+            rows = system.contacts.far
+            assert rows is not None
+            system = eqx.tree_at(lambda system: system.contacts.far, system, rows.times(nodal.hardness))
         found = minimized(system, push + moments, c, contacts)
-        return found.is_minimum, found.x, found.y
+        if nodal.hardness is None:
+            return found.is_minimum, found.x, found.y
+        first, pressures, displacements, forces = system.split(found.y)
+        row = pressure_rows(self.scene) - 1
+        parts = (first, pressures.at[row].multiply(nodal.hardness), displacements, forces)
+        return found.is_minimum, found.x, jnp.concatenate([part.reshape(-1) for part in parts])
 
     def first_closed(self, is_closed: Bool[Array, "k n+1"], contacts: Unilateral) -> Bool[Array, "k n+1"]:
         """The first guess of the closed contacts: a node that lies on an obstacle without pressure counts as closed."""
@@ -261,6 +275,8 @@ class NodalForm(PositionForm):
         model = contact_model(self, point, here.gaps, here.reference_displacements)
         pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.contact_compliance)
         rows = here.system.contacts
+        if point.nodal.hardness is not None:
+            pushing = pushing.at[pressure_rows(self.scene) - 1].multiply(point.nodal.hardness)
         rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
         if rows.inner is not None or rows.far is not None:
             # The gradient by rotations has the pressures as they are.

@@ -48,7 +48,7 @@ from rodjax.solving.equilibrium import (
 )
 from rodjax.solving.first_poses import first_poses
 from rodjax.solving.guess import Guess
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution
 from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
 from rodjax.solving.newton import Newton
 from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
@@ -605,6 +605,15 @@ def finer_meshes(
 def differentiable_harness(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
     """What a search found, with the derivatives by the harness that the search for it has not."""
     return result if is_known(harness) else _differentiable(harness, result)
+
+
+def differentiable_by(subject: Scene | Harness, result: Solution) -> Any:
+    """The same of a scene or a harness."""
+    if isinstance(subject, Harness):
+        assert isinstance(result, HarnessEquilibrium)
+        return differentiable_harness(subject, result)
+    assert isinstance(result, Equilibrium)
+    return differentiable(subject, result)
 
 
 @eqx.filter_custom_jvp

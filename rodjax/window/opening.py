@@ -12,10 +12,10 @@ from rodjax.notes import in_notebook
 from rodjax.routing.limits import Limits
 from rodjax.routing.route import Route
 from rodjax.routing.tolerances import Envelope
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_result import HarnessEquilibrium, solved_in
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.window.browser import Window
-from rodjax.window.session import SEGMENTS, Session, rows_in, scene_in
+from rodjax.window.session import SEGMENTS, Session, rows_in
 
 # Rods of an envelope that are drawn at random and shown.
 DRAWN = 60
@@ -127,7 +127,7 @@ def session_of(shown: Shown, segments: int | None, strain_limit: float = DEFAULT
     if segments is None:
         meshes = [last.s.shape[-1] - 1] if isinstance(last, Equilibrium) else last.segments
         segments = max(meshes)
-    session = Session(scene_in(last), segments=segments, guess=last, strain_limit=strain_limit)
+    session = Session(solved_in(last), segments=segments, guess=last, strain_limit=strain_limit)
     if axes:
         session.add_recorded(rows_in(shown))
     return session
@@ -143,4 +143,4 @@ def _beside(
     """A session that begins with a result beside obstacles that do not touch it."""
     segments = result.s.shape[-1] - 1 if segments is None else segments
     beside = dict(zip(names, obstacles, strict=True))
-    return Session(scene_in(result), segments=segments, guess=result, strain_limit=strain_limit, beside=beside)
+    return Session(solved_in(result), segments=segments, guess=result, strain_limit=strain_limit, beside=beside)

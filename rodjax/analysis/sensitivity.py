@@ -185,9 +185,9 @@ def _field(result: Solution, name: str) -> Float[Array, "..."]:
 
 
 def _by_numbers(
-    scene: _T,
+    scene: Any,
     result: Solution,
-    near: Callable[[_T], Solution],
+    near: Callable[[Any], Solution],
     of: tuple[str, ...],
     wrt: tuple[str, ...],
 ) -> dict[str, dict[str, Float[Array, "..."]]]:

@@ -318,7 +318,7 @@ class Session:
             scene = without_turns(movable(solved_in(one)))
             self.recorded.append(Moment(scene, controls_of(scene), one))
 
-    def solved_in_turn(self, scenes: Scene, guess: Any, *, is_path: bool) -> Iterator[Any]:
+    def solved_in_turn(self, scenes: Scene | Harness, guess: Any, *, is_path: bool) -> Iterator[Any]:
         """The equilibria of stacked scenes, each from the last one of a path, else all from the guess; without those
         that have none.
         """

@@ -8,6 +8,7 @@ from test_harness import END, GRAVITY, START, cut, plain
 
 import rodjax as rj
 from rodjax import Clamp, Harness, Joint, Limits, Newton, Rod, Scene, Sphere, Tolerance, frame
+from rodjax.window import opening
 
 LEVEL = frame((1, 0, 0))
 EA = 1e4
@@ -101,7 +102,7 @@ def test_margins_of_a_harness_are_those_of_its_cables(wire):
 
 
 @pytest.mark.slow
-def test_a_cable_that_is_cut_scatters_as_the_cable():
+def test_a_cable_that_is_cut_scatters_as_the_cable(monkeypatch):
     """To first order, and by the same 60 samples."""
     tight = Newton(tolerance=1e-11)
     whole = rj.solve(Scene(plain(1.0), START, END, gravity=GRAVITY), segments=8, solver=tight)
@@ -134,5 +135,9 @@ def test_a_cable_that_is_cut_scatters_as_the_cable():
     drawn = found.drawn(2, seed=1)
     rods = rj.solve_batch(drawn, segments=4)
     np.testing.assert_allclose(rods["b"].nodes[:, -1], drawn["b"].end.position, atol=1e-12)
+    # The window shows such rods.
+    monkeypatch.setattr(opening, "DRAWN", 3)
+    session = opening.session_of(found, None)
+    assert (len(session.recorded), session.segments) == (3, 4)
     with pytest.raises(ValueError, match="scenes must be several harnesses"):
         rj.solve_batch(parts.harness)

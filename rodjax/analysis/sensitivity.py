@@ -206,7 +206,8 @@ def named_numbers(scene: Scene | Harness) -> dict[str, Float[Array, "..."]]:
     """The numbers of a scene by their dotted names; turns are whole and have no derivative."""
     if isinstance(scene, Harness):
         parts = {f"cables.{name}": one for name, one in zip(scene.names, scene.scenes, strict=True)}
-        parts |= {f"joints.{name}": one for name, one in zip(scene.joint_names, scene.bodies, strict=True)}
+        if scene.joint_names:  # `eqx.tree_at`, in which this is called, has no empty tuples
+            parts |= {f"joints.{name}": one for name, one in zip(scene.joint_names, scene.bodies, strict=True)}
         return {f"{where}.{name}": leaf for where, part in parts.items() for name, leaf in _named(part).items()}
     return _named(scene)
 

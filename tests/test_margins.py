@@ -260,7 +260,7 @@ def test_margins_are_checked():
     scene = rj.Scene(bare, rj.Clamp((0, 0, 0), level), rj.Clamp((0.9, 0, 0), level))
     result = rj.solve(scene, segments=8)
     floor = rj.Plane((0, 0, -1), (0, 0, 1))
-    with pytest.raises(TypeError, match="equilibrium must be an Equilibrium, got 5"):
+    with pytest.raises(TypeError, match="equilibrium must be an Equilibrium or HarnessEquilibrium, got 5"):
         rj.margins(5, rj.Limits(twist=1))  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="limits must be a Limits, got 3"):
         rj.margins(result, 3)  # pyright: ignore[reportArgumentType]

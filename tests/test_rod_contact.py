@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 import rodjax
 from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene
+from rodjax.analysis.sensitivity import moved
 from rodjax.solving.rod_contact_results import touching_rods
 
 RADIUS, LENGTH, YOUNGS_MODULUS = 0.01, 1.0, 1e7
@@ -230,3 +231,9 @@ def test_a_beam_of_two_parts_is_pressed_by_one_by_frames(pressed):
     # Residuals of 1e-11 EI/L^2.
     np.testing.assert_allclose(supports, -force, atol=1e-9)
     np.testing.assert_allclose(found["lower"].end_force - found["lower"].start_force, force, atol=1e-9)
+
+
+def test_numbers_of_a_harness_without_joints_change():
+    changed = moved(crossing(0.016), {"cables.upper.rod.length": jnp.asarray(0.1)})
+    assert float(changed["upper"].rod.length) == pytest.approx(LENGTH + 0.1, rel=1e-15)
+    assert float(changed["lower"].rod.length) == LENGTH

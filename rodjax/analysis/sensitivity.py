@@ -15,8 +15,8 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.harness import differentiable_harness
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness import differentiable_by, differentiable_harness
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
@@ -75,14 +75,14 @@ def sensitivities(
     instance(scene, "scene", (Scene, Harness))
     if isinstance(scene, Harness):
         of = _checked_names("of", of, _fields_of(scene), "real fields of this harness")
-        wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this harness")
-        found = _derivatives_of(scene, solve(scene, **options), of, wrt)
+        kind = "numbers of this harness"
     else:
         of = _checked_names("of", of, FIELDS, "real fields of Equilibrium")
         if "shear_strain" in of and scene.rod.GA is None:
             raise ValueError("of must not have 'shear_strain' of a rod without GA: its sections do not shear")
-        wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), "numbers of this scene")
-        found = _derivatives(scene, solve(scene, **options), of, wrt)
+        kind = "numbers of this scene"
+    wrt = _checked_names("wrt", wrt, tuple(named_numbers(scene)), kind)
+    found = _derivatives(scene, solve(scene, **options), of, wrt)
     return {field: {number: found[field][number] for number in wrt} for field in of}  # JAX sorts names
 
 
@@ -158,17 +158,10 @@ def moved(scene: _T, changes: dict[str, Float[Array, "..."]]) -> _T:
 
 @functools.partial(compiled, static_argnames=("of", "wrt"))
 def _derivatives(
-    scene: Scene, result: Equilibrium, of: tuple[str, ...], wrt: tuple[str, ...]
+    scene: Scene | Harness, result: Solution, of: tuple[str, ...], wrt: tuple[str, ...]
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
     """By the implicit function theorem at a result, whose mesh is kept."""
-    return _by_numbers(scene, result, lambda near: differentiable(near, result), of, wrt)
-
-
-@functools.partial(compiled, static_argnames=("of", "wrt"))
-def _derivatives_of(
-    harness: Harness, result: HarnessEquilibrium, of: tuple[str, ...], wrt: tuple[str, ...]
-) -> dict[str, dict[str, Float[Array, "..."]]]:
-    return _by_numbers(harness, result, lambda near: differentiable_harness(near, result), of, wrt)
+    return _by_numbers(scene, result, lambda near: differentiable_by(near, result), of, wrt)
 
 
 def _fields_of(harness: Harness) -> tuple[str, ...]:
@@ -183,7 +176,7 @@ def _fields_of(harness: Harness) -> tuple[str, ...]:
     return (*of_rods, *of_joints, "energy")
 
 
-def _field(result: Equilibrium | HarnessEquilibrium, name: str) -> Float[Array, "..."]:
+def _field(result: Solution, name: str) -> Float[Array, "..."]:
     if isinstance(result, Equilibrium) or name == "energy":
         return getattr(result, name)
     kind, rest = name.split(".", 1)
@@ -192,9 +185,9 @@ def _field(result: Equilibrium | HarnessEquilibrium, name: str) -> Float[Array, 
 
 
 def _by_numbers(
-    scene: _T,
-    result: Equilibrium | HarnessEquilibrium,
-    near: Callable[[_T], Equilibrium | HarnessEquilibrium],
+    scene: Any,
+    result: Solution,
+    near: Callable[[Any], Solution],
     of: tuple[str, ...],
     wrt: tuple[str, ...],
 ) -> dict[str, dict[str, Float[Array, "..."]]]:
@@ -213,7 +206,8 @@ def named_numbers(scene: Scene | Harness) -> dict[str, Float[Array, "..."]]:
     """The numbers of a scene by their dotted names; turns are whole and have no derivative."""
     if isinstance(scene, Harness):
         parts = {f"cables.{name}": one for name, one in zip(scene.names, scene.scenes, strict=True)}
-        parts |= {f"joints.{name}": one for name, one in zip(scene.joint_names, scene.bodies, strict=True)}
+        if scene.joint_names:  # `eqx.tree_at`, in which this is called, has no empty tuples
+            parts |= {f"joints.{name}": one for name, one in zip(scene.joint_names, scene.bodies, strict=True)}
         return {f"{where}.{name}": leaf for where, part in parts.items() for name, leaf in _named(part).items()}
     return _named(scene)
 

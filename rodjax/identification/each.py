@@ -37,7 +37,7 @@ from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import checked_executor, checked_threads, in_order, rows_of
 from rodjax.solving.equilibrium import Discretization
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.harness_result import Solution
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Fits:
     converged: Bool[np.ndarray, "e"]
     steps: Int[np.ndarray, "e"]
     determined: Bool[np.ndarray, "e"]
-    equilibria: Equilibrium
+    equilibria: Any
     error_estimate: float
     is_log: Bool[np.ndarray, "p"]
 
@@ -173,7 +173,7 @@ class _Found(eqx.Module):
     rms: Float[Array, "e m"]
     converged: Bool[Array, "e"]
     steps: Int[Array, "e"]
-    equilibria: Equilibrium
+    equilibria: Any
 
 
 def _in_parts(
@@ -181,7 +181,7 @@ def _in_parts(
     problem: Problem,
     starts: Float[Array, "e p"],
     is_free: Bool[np.ndarray, "e p"],
-    shapes: Equilibrium,
+    shapes: Solution,
     executor: Executor | None,
     threads: int,
 ) -> _Found:
@@ -210,9 +210,9 @@ def _each(
     problem: Problem,
     starts: Float[Array, "e p"],
     is_free: Bool[Array, "e p"],
-    shapes: Equilibrium,
+    shapes: Solution,
 ) -> _Found:
-    def one(experiment: Experiment, start: Float[Array, "p"], is_free: Bool[Array, "p"], shape: Equilibrium) -> _Found:
+    def one(experiment: Experiment, start: Float[Array, "p"], is_free: Bool[Array, "p"], shape: Solution) -> _Found:
         alone = Group(jax.tree.map(lambda x: x[None], experiment), jnp.ones(1, starts.dtype))
         here = eqx.tree_at(
             lambda problem: (problem.groups, problem.is_free),
@@ -263,7 +263,7 @@ def _fits(
     deviations = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     is_log = np.array([unknown.scale == "log" for unknown in setup.shared])
     estimates = np.asarray(found.values, float)
-    by_size = rates(setup.shared, estimates, float(setup.experiments[0].scene.rod.length))
+    by_size = rates(setup.shared, estimates, setup.length)
     covariance = covariance * by_size[:, :, None] * by_size[:, None, :]
     errors = np.where(is_free, deviations * by_size, np.nan)
     determined = np.all((deviations < LARGEST_DEVIATION) | ~is_free, axis=1)

@@ -290,6 +290,8 @@ def _experiments(
         content = toml_tables(read_text(path))
         if "path" in content:
             raise SceneFileError("path is not allowed in a fit, which is of single scenes; leave [[path]] out")
+        if "cables" in content:
+            raise SceneFileError("cables are not allowed in a fit from files; in Python rodjax.fit takes a Harness")
         variations = SceneVariations(content, table.keys)
     first = _scene(variations, table.experiments[0], path, data)
     variations.in_si()
@@ -308,7 +310,9 @@ def _experiments(
 
 def _scene(variations: SceneVariations, one: MeasuredRows, path: Path, data: Path) -> SceneFile:
     try:
-        return variations.read(one.values)
+        file = variations.read(one.values)
+        assert isinstance(file, SceneFile), "harnesses are refused before"
+        return file
     except SceneFileError as mistake:
         if not one.values:
             raise SceneFileError(f"{path}: {mistake}") from None

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import stats
 
+from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import leaf
 from rodjax.identification.least_squares import Coordinates
 from rodjax.identification.loss import Loss
@@ -35,7 +36,8 @@ from rodjax.notes import note
 from rodjax.paths.continuation import critical_point
 from rodjax.programs.answers import one_answer
 from rodjax.solving.equilibrium import Discretization
-from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.solving.harness_result import Solution
+from rodjax.solving.result import NotConvergedWarning
 from rodjax.warn import warn
 
 # The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.
@@ -64,7 +66,7 @@ def fit(
 
     **Arguments:**
 
-    - `experiments`: `Experiment`s, of any structures, and `CriticalValue`s.
+    - `experiments`: `Experiment`s, of scenes and harnesses of any structures, and `CriticalValue`s, of scenes.
     - `unknowns`: `Unknown`s, or their names.
     - `loss`: `"linear"`: least squares; `"huber"`, `"cauchy"`, `"welsch"`: deviations beyond `threshold` standard
         deviations count less, those of `"welsch"` in the end not at all. `threshold`: `None` for 95 % efficiency
@@ -110,7 +112,7 @@ def fit(
 
 
 def _settled(
-    setup: Setup, structure: Structure, problem: Problem, at: Coordinates, results: tuple[Equilibrium, ...]
+    setup: Setup, structure: Structure, problem: Problem, at: Coordinates, results: tuple[Solution, ...]
 ) -> tuple[Found, Problem]:
     """Searched until the scatter and the critical values, which are found between searches, stay as they are."""
     needs_scale = not setup.has_sd and (structure.loss != "linear" or _has_priors(problem))
@@ -154,13 +156,16 @@ def _scatter(setup: Setup, found: Found, loss: Loss) -> float:
 def _held_numbers(setup: Setup, groups: Sequence[Group]) -> list[Unknown]:
     """Material numbers of all rods that are not sought: whether the data would tell them is worth a sentence."""
     sought = {name for unknown in (*setup.shared, *setup.own) for name in unknown.names}
-    rods = [group.experiments.scene.rod for group in groups]
+    numbers = [named_numbers(group.experiments.scene) for group in groups]
     found = []
-    for name in ("EI", "GJ", "EA", "mass_per_length"):
-        values = [getattr(rod, name) for rod in rods]
-        is_number = all(isinstance(value, jax.Array) for value in values)
-        if is_number and f"rod.{name}" not in sought and all(np.all(np.asarray(value) > 0) for value in values):
-            found.append(Unknown(f"rod.{name}"))
+    for kind in ("EI", "GJ", "EA", "mass_per_length"):
+        for name in numbers[0]:
+            values = [of_group[name] for of_group in numbers if name in of_group]
+            # One number a rod, along the axis of the experiments.
+            is_number = len(values) == len(numbers) and all(value.ndim == 1 for value in values)
+            is_kind = name == f"rod.{kind}" or name.endswith(f".rod.{kind}")
+            if is_kind and is_number and name not in sought and all(np.all(np.asarray(value) > 0) for value in values):
+                found.append(Unknown(name))
     return found
 
 

@@ -17,10 +17,12 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.checks import instance, is_known, leaf, number_array, number_list, one_of, positive, shown, vector
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, check_without_friction
 from rodjax.model.supports import frame, rotate
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import Solution
 from rodjax.solving.result import Equilibrium
 
 # Places on a rod among which the one nearest to a measured point is sought, for each segment of the mesh.
@@ -33,10 +35,16 @@ class Measurement(eqx.Module):
     """Numbers measured on one rod.
 
     `weights` (k,): the inverse standard deviations of its rows, 0 of what is absent, 1 where they are not known.
+    `cable`: the name of the rod, of a harness.
     """
 
     weights: eqx.AbstractVar[Float[Array, "k"]]
     has_sd: eqx.AbstractVar[bool]
+    cable: eqx.AbstractVar[str | None]
+
+    def of_rod(self, result: Solution) -> Any:
+        """The part of a result that it is of: its cable; of what names none, as a `Reading` may, the whole."""
+        return result if self.cable is None or isinstance(result, Equilibrium) else result[self.cable]
 
     @abstractmethod
     def deviations(self, equilibrium: Equilibrium) -> Float[Array, "k d"]:
@@ -82,6 +90,7 @@ class Centerline(Measurement):
     - Nuisance parameters of the rig, which the fit can take for unknowns: what is measured is `scale` times the
       position in the scene, turned by the rotation vector `turn` [rad] and moved by `offset` [m]; `s` is too small by
       `shift` [m].
+    - `cable`: of a harness the name of the rod.
 
     Raises `ValueError` or `TypeError` for shapes and numbers that make no sense.
     """
@@ -95,6 +104,7 @@ class Centerline(Measurement):
     offset: Float[Array, "3"]
     shift: Float[Array, ""]
     has_sd: bool = eqx.field(static=True)
+    cable: str | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -107,6 +117,7 @@ class Centerline(Measurement):
         turn: Any = (0.0, 0.0, 0.0),
         offset: Any = (0.0, 0.0, 0.0),
         shift: Any = 0.0,
+        cable: str | None = None,
     ):
         shape = np.shape(points)
         components = 3 if camera is None else 2
@@ -124,6 +135,7 @@ class Centerline(Measurement):
         self.offset = leaf(vector(offset, "offset"))
         self.shift = leaf(number_array(shift, "shift"))
         self.has_sd = sd is not None
+        self.cable = _cable(cable)
 
     @property
     def numbers(self) -> int:
@@ -215,14 +227,16 @@ class _EndLoad(Measurement):
     weights: Float[Array, "1"]
     end: str = eqx.field(static=True)
     has_sd: bool = eqx.field(static=True)
+    cable: str | None = eqx.field(static=True)
 
-    def __init__(self, value: Any, sd: Any, end: str, direction: Any):
+    def __init__(self, value: Any, sd: Any, end: str, direction: Any, cable: str | None):
         self.value = leaf(vector(value, "value") if direction is None else number_array(value, "value").reshape(1))
         self.direction = None if direction is None else leaf(vector(direction, "direction"))
         one_of(end, "end", ("start", "end"))
         self.weights = _weights(sd, 1)
         self.end = end
         self.has_sd = sd is not None
+        self.cable = _cable(cable)
 
     @property
     def numbers(self) -> int:
@@ -251,11 +265,13 @@ class EndForce(_EndLoad):
     """The force (3,) [N] that a support applies to the rod, `end`: `"start"` or `"end"`.
 
     `direction` (3,): that in which a load cell measures; the force is then one number. `sd`: standard deviation of each
-    component [N], `None` as in `Centerline`.
+    component [N], `None` as in `Centerline`. `cable`: of a harness the name of the rod.
     """
 
-    def __init__(self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None):
-        super().__init__(value, sd, end, direction)
+    def __init__(
+        self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None, cable: str | None = None
+    ):
+        super().__init__(value, sd, end, direction, cable)
 
     def computed(self, equilibrium: Equilibrium) -> Float[Array, "3"]:
         return equilibrium.end_force if self.end == "end" else equilibrium.start_force
@@ -268,8 +284,10 @@ class EndForce(_EndLoad):
 class EndMoment(_EndLoad):
     """The moment (3,) [N m] about the centerline that a support applies to the rod; otherwise as `EndForce`."""
 
-    def __init__(self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None):
-        super().__init__(value, sd, end, direction)
+    def __init__(
+        self, value: Any, sd: Any = None, *, end: str = "end", direction: Any = None, cable: str | None = None
+    ):
+        super().__init__(value, sd, end, direction, cable)
 
     def computed(self, equilibrium: Equilibrium) -> Float[Array, "3"]:
         return equilibrium.end_moment if self.end == "end" else equilibrium.start_moment
@@ -282,16 +300,20 @@ class EndMoment(_EndLoad):
 class Reading(Measurement):
     """Anything else that an equilibrium tells: `of(equilibrium)` gives numbers (k,), or one, to compare with `value`.
 
-    `of`: a function in JAX, the same object for all experiments of a kind; `unit`: for the report.
+    `of`: a function in JAX, the same object for all experiments of a kind; `unit`: for the report; `cable`: of a
+    harness the name of the rod whose `Equilibrium` it takes, `None`: it takes the `HarnessEquilibrium`.
     """
 
     value: Float[Array, "k"]
     weights: Float[Array, "k"]
-    of: Callable[[Equilibrium], Any] = eqx.field(static=True)
+    of: Callable[[Any], Any] = eqx.field(static=True)
     quantity: str = eqx.field(static=True)
     has_sd: bool = eqx.field(static=True)
+    cable: str | None = eqx.field(static=True)
 
-    def __init__(self, of: Callable[[Equilibrium], Any], value: Any, sd: Any = None, *, unit: str = ""):
+    def __init__(
+        self, of: Callable[[Any], Any], value: Any, sd: Any = None, *, unit: str = "", cable: str | None = None
+    ):
         if not callable(of):
             raise TypeError(f"of must be a function of an Equilibrium, got {shown(of)}")
         self.of = of
@@ -299,6 +321,7 @@ class Reading(Measurement):
         self.weights = _weights(sd, len(self.value))
         self.quantity = unit
         self.has_sd = sd is not None
+        self.cable = _cable(cable)
 
     @property
     def numbers(self) -> int:
@@ -315,23 +338,24 @@ class Reading(Measurement):
     def moved(self, change: Float[Array, "k 1"]) -> "Reading":
         return eqx.tree_at(lambda measured: measured.value, self, self.value + change[:, 0])
 
-    def deviations(self, equilibrium: Equilibrium) -> Float[Array, "k 1"]:
+    def deviations(self, equilibrium: Any) -> Float[Array, "k 1"]:
         return (self.value - jnp.reshape(self.of(equilibrium), self.value.shape))[:, None]
 
 
 class Experiment(eqx.Module):
-    """A rod at rest and what was measured on it.
+    """A rod or harness at rest and what was measured on it.
 
-    - `scene`: `Scene`, as nominal; unknowns replace numbers of it.
-    - `measured`: one measurement or a list: `Centerline`, `EndForce`, `EndMoment`, `Reading`.
+    - `scene`: `Scene` or `Harness`, as nominal; unknowns replace numbers of it.
+    - `measured`: one measurement or a list: `Centerline`, `EndForce`, `EndMoment`, `Reading`; in a harness each names
+      its `cable`.
     - `cluster`: name of the repeat, day or specimen, whose measurements share their errors; `None`: the experiment is a
       cluster of its own.
     - `guess`: `Guess` for the first solve; `None`: the measured centerline, where it has arclengths, three coordinates
-      and spans nine tenths of the rod, else the library's own.
+      and spans nine tenths of the rod, else the library's own, which is that of a harness too.
     - `name`: for the report.
     """
 
-    scene: Scene
+    scene: Scene | Harness
     measured: tuple[Measurement, ...]
     guess: Guess | None
     cluster: str | None = eqx.field(static=True)
@@ -339,25 +363,29 @@ class Experiment(eqx.Module):
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Harness,
         measured: Measurement | Sequence[Measurement],
         *,
         cluster: Any = None,
         guess: Guess | None = None,
         name: str | None = None,
     ):
-        instance(scene, "scene", Scene)
-        if scene.rod.length.ndim:
-            raise ValueError(f"scene must be a single scene, got a stack of shape {scene.rod.length.shape}")
-        check_without_friction(scene, "an Experiment")
+        instance(scene, "scene", (Scene, Harness))
+        length = (scene.scenes[0] if isinstance(scene, Harness) else scene).rod.length
+        if length.ndim:
+            raise ValueError(f"scene must be a single one, got a stack of shape {length.shape}")
+        if isinstance(scene, Scene):  # rods of harnesses have none
+            check_without_friction(scene, "an Experiment")
         measured = (measured,) if isinstance(measured, Measurement) else tuple(measured)
         if not measured:
             raise ValueError("measured must hold at least one measurement, got none")
         for k, measurement in enumerate(measured):
             instance(measurement, f"measured[{k}]", Measurement)
-            _check_arclengths(measurement, scene, k)
+            _check_arclengths(measurement, _scene_of(measurement, scene, k), k)
         if guess is not None:
             instance(guess, "guess", Guess)
+            if isinstance(scene, Harness):
+                raise ValueError("guess must be None for a harness, whose first shape is the library's own")
         self.scene = scene
         self.measured = measured
         self.guess = guess
@@ -438,7 +466,29 @@ def _of_length(value: Any, name: str, count: int) -> Float[Array, "count"]:
     return leaf(numbers)
 
 
-def _check_arclengths(measurement: Measurement, scene: Scene, k: int) -> None:
+def _cable(name: Any) -> str | None:
+    if name is not None:
+        instance(name, "cable", str)
+    return name
+
+
+def _scene_of(measurement: Measurement, scene: Scene | Harness, k: int) -> Scene | None:
+    """Of the rod on which it was measured; of the whole harness none."""
+    name = measurement.cable
+    if isinstance(scene, Scene):
+        if name is not None:
+            raise ValueError(f"measured[{k}].cable must be None for a Scene, which has one, got {name!r}")
+        return scene
+    if name is None and isinstance(measurement, Reading):
+        return None
+    if name not in scene.names:
+        raise ValueError(f"measured[{k}].cable must be one of {', '.join(map(repr, scene.names))}, got {name!r}")
+    return scene[name]
+
+
+def _check_arclengths(measurement: Measurement, scene: Scene | None, k: int) -> None:
+    if scene is None:
+        return
     if isinstance(measurement, Centerline) and measurement.s is not None and is_known(measurement.s, scene.rod.length):
         largest, length = float(np.max(np.asarray(measurement.s))), float(scene.rod.length)
         if largest > length * (1 + 1e-9):

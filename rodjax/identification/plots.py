@@ -235,7 +235,7 @@ def _seen(fit: Fit, place: Place) -> _Seen:
     )
     measured = experiment.measured[j]
     assert isinstance(measured, Centerline)
-    equilibrium = fit.equilibrium(k)
+    equilibrium = measured.of_rod(fit.equilibrium(k))
     along = jnp.linspace(equilibrium.s[0], equilibrium.s[-1], POINTS)
     curve = np.asarray(measured.seen(equilibrium.position_at(along)))
     points = np.asarray(measured.points)

@@ -21,9 +21,9 @@ from rodjax.identification.setup import Setup, beginnings, begun, clusters_of, p
 from rodjax.identification.statistics import Blocks, rates
 from rodjax.identification.unknowns import outside
 from rodjax.programs.compilation import compiled
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.harness_result import Solution
 
-Equilibria = tuple[Equilibrium, ...]
+Equilibria = tuple[Solution, ...]
 
 
 class _Refits(NamedTuple):
@@ -222,7 +222,7 @@ def next_experiment(
         gains[k] = 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(known)[1])
         errors[k] = np.sqrt(dispersion * np.diag(np.linalg.inv(both)))
     shared = np.asarray(values(structure, problem, found.at)[0], float)[:p]
-    errors = errors * rates(setup.shared, shared, float(setup.experiments[0].scene.rod.length))
+    errors = errors * rates(setup.shared, shared, setup.length)
     order = [int(k) for k in np.argsort(-np.where(np.isnan(gains), -np.inf, gains))]
     labels = [unknown.label for unknown in setup.shared]
     return Ranking(order, gains, {label: errors[:, k] for k, label in enumerate(labels)})

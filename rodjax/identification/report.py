@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from rodjax.identification.setup import name_of
 from rodjax.model.supports import Clamp
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 from rodjax.solving.status import CONVERGED, Status
 
@@ -127,7 +128,11 @@ def _remarks(fit: "Fit") -> list[str]:
 def _of_turns(fit: "Fit") -> list[str]:
     """What is odd about a torsional stiffness, which shapes tell by the torque alone: GJ times the twist."""
     names = {name for unknown in (*fit.setup.shared, *fit.setup.own) for name in unknown.names}
-    results = [result for result in fit.found.evaluation.results if result.scene.rod.is_plain]
+    results = [
+        result
+        for result in fit.found.evaluation.results
+        if not isinstance(result, HarnessEquilibrium) and result.scene.rod.is_plain
+    ]
     if not names & {"rod.EI", "rod.GJ"} or len(results) < len(fit.found.evaluation.results):
         return []
     ratios = np.concatenate([np.asarray(result.scene.rod.GJ / result.scene.rod.EI) for result in results])
@@ -152,9 +157,11 @@ def _is_usual(ratios: Float[np.ndarray, "e"]) -> Bool[np.ndarray, "e"]:
 def _of_taken_turns(fit: "Fit") -> list[str]:
     """Which other torsional stiffness fits as well with another whole turn between clamps, where none was stated."""
     labels = [unknown.label for unknown in fit.setup.shared if unknown.names == ("rod.GJ",)]
-    results = fit.found.evaluation.results
+    results = [result for result in fit.found.evaluation.results if not isinstance(result, HarnessEquilibrium)]
     scenes = [result.scene for result in results]
-    if not labels or not all(
+    if not labels or len(results) < len(fit.found.evaluation.results):
+        return []
+    if not all(
         scene.rod.is_plain and isinstance(scene.start, Clamp) and isinstance(scene.end, Clamp) and scene.turns is None
         for scene in scenes
     ):

@@ -18,7 +18,6 @@ from rodjax.identification.problem import Found, Problem, Structure, values
 from rodjax.identification.setup import Setup, clusters_of
 from rodjax.identification.statistics import Blocks, Combination, clustered, held_numbers, rates, undetermined
 from rodjax.identification.unknowns import Unknown
-from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
 
@@ -82,7 +81,7 @@ class Fit:
         held: Sequence[Unknown],
         error: float,
     ) -> "Fit":
-        length = float(setup.experiments[0].scene.rod.length)
+        length = setup.length
         p = len(setup.shared)
         is_used = np.asarray(found.evaluation.is_used)
         is_free = np.asarray(problem.is_free.own) & is_used[:, None]
@@ -186,11 +185,11 @@ class Fit:
                 return float(value * np.exp(-reach / value)), float(value * np.exp(reach / value))
         return value - reach, value + reach
 
-    def equilibrium(self, k: int) -> Equilibrium:
-        """That of the k-th experiment with the estimate."""
+    def equilibrium(self, k: int) -> Any:
+        """That of the k-th experiment with the estimate, an `Equilibrium` or `HarnessEquilibrium`."""
         row = self.setup.order.index(k)
         for result in self.found.evaluation.results:
-            count = result.s.shape[0]
+            count = result.energy.shape[0]
             if row < count:
                 # Not JAX's arrays, of which each shape would be a program.
                 return jax.tree.map(lambda numbers, row=row: leaf(np.asarray(numbers)[row]), result)

@@ -19,11 +19,15 @@ from rodjax.identification.measurements import Centerline, CriticalValue, Experi
 from rodjax.identification.plausible import check_points
 from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
-from rodjax.model.scene import held_position
+from rodjax.model.harness import Harness
+from rodjax.model.scene import Scene, held_position
+from rodjax.paths.harness_path import are_harnesses, harness_batch, stack_harnesses, unstacked
 from rodjax.paths.path import stack_scenes
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, checked_options, first_state
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness import clamped_rods
+from rodjax.solving.harness_result import Solution, rods_of
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.solving.solve import solve
@@ -48,6 +52,16 @@ class Setup(NamedTuple):
     own: tuple[Unknown, ...]
     order: tuple[int, ...]
     has_sd: bool
+
+    @property
+    def length(self) -> float:
+        """Of the rod of the first experiment, of a harness the longest [m]."""
+        return max(float(scene.rod.length) for scene in rod_scenes(self.experiments[0].scene))
+
+
+def rod_scenes(scene: Scene | Harness) -> tuple[Scene, ...]:
+    """Of all its rods."""
+    return scene.scenes if isinstance(scene, Harness) else (scene,)
 
 
 def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setup:
@@ -128,6 +142,8 @@ def _tells_shape(experiment: Experiment) -> bool:
 
 def _spanning(experiment: Experiment) -> Centerline | None:
     """The measured centerline that spans the rod, if there is one."""
+    if isinstance(experiment.scene, Harness):
+        return None
     length = float(experiment.scene.rod.length)
     for measured in experiment.measured:
         if isinstance(measured, Centerline) and measured.s is not None and measured.is_affine:
@@ -143,6 +159,7 @@ def _first_guess(experiment: Experiment) -> Guess:
         points, twist = np.asarray(experiment.guess.points), experiment.guess.total_twist
         return Guess(_resampled(np.linspace(0, 1, len(points)), points, np.linspace(0, 1, GUESS_POINTS)), twist)
     measured, scene = _spanning(experiment), experiment.scene
+    assert isinstance(scene, Scene)
     assert measured is not None
     assert measured.s is not None
     points = measured.lifted(np.asarray(held_position(scene)))
@@ -164,9 +181,10 @@ def stacked(setup: Setup) -> tuple[tuple[Group, ...], tuple[Guess | None, ...]]:
         most = [max(len(m.weights) for m in same) for same in zip(*(one.measured for one in chosen), strict=True)]
         measured = [tuple(m.with_rows(rows) for m, rows in zip(one.measured, most, strict=True)) for one in chosen]
         bare = Experiment(chosen[0].scene, chosen[0].measured)
-        scenes = stack_scenes([one.scene for one in chosen])
+        each: Any = [one.scene for one in chosen]
+        scenes = stack_harnesses(each) if are_harnesses(each) else stack_scenes(each)
         experiments = eqx.tree_at(lambda one: (one.scene, one.measured), bare, (scenes, _stack(measured)))
-        groups.append(Group(experiments, leaf(np.ones(len(chosen), scenes.rod.length.dtype))))
+        groups.append(Group(experiments, leaf(np.ones(len(chosen), rod_scenes(scenes)[0].rod.length.dtype))))
         guesses.append(_stack([_first_guess(one) for one in chosen]) if _tells_shape(chosen[0]) else None)
     return tuple(groups), tuple(guesses)
 
@@ -177,12 +195,11 @@ def _stack(parts: Sequence[Any]) -> Any:
 
 def begun(setup: Setup, groups: tuple[Group, ...], threshold: float) -> tuple[Problem, Coordinates]:
     """The problem, and the unknowns as nominal."""
-    length = float(setup.experiments[0].scene.rod.length)
     subjects: list[Subject] = [*setup.experiments, *(_one_scene(value) for value in setup.critical)]
     shared = [_start(unknown, _first_with(unknown, subjects)) for unknown in setup.shared]
     own, is_free = (np.concatenate(x) for x in zip(*(_of_group(setup.own, group) for group in groups), strict=True))
     dtype = np.asarray(groups[0].weights).dtype
-    of_shared, of_own = _ranges(setup.shared, length, dtype), _ranges(setup.own, length, dtype)
+    of_shared, of_own = (_ranges(unknowns, setup.length, dtype) for unknowns in (setup.shared, setup.own))
     p = len(setup.shared)
     problem = Problem(
         groups=groups,
@@ -285,7 +302,17 @@ def structure_of(
     if rtol is None and segments is None:
         rtol = DEFAULT_RTOL
     scene = setup.experiments[0].scene
-    options, tolerance = checked_options(scene, segments, rtol, discretization, None, None, planar)
+    if isinstance(scene, Harness):
+        if discretization not in (None, "hermite"):
+            raise ValueError(f"discretization must be 'hermite' for a harness, got {discretization!r}")
+        if planar:
+            raise ValueError("planar must be False for a harness, in space")
+    each = [
+        checked_options(one, segments, rtol, discretization, None, None, planar)
+        for one in (clamped_rods(scene) if isinstance(scene, Harness) else [scene])
+    ]
+    # The rods of a harness all get as many as one needs.
+    options, tolerance = max(each, key=lambda found: found[0].segments)
     structure = Structure(
         shared=tuple(Sought(unknown.names, unknown.scale) for unknown in setup.shared),
         own=tuple(Sought(unknown.names, unknown.scale) for unknown in setup.own),
@@ -315,18 +342,34 @@ def finer(structure: Structure, error: float, tolerance: float | None) -> Struct
     return structure._replace(segments=next_size(structure.segments, error, tolerance, structure.discretization))
 
 
-@functools.partial(compiled, static_argnames=("structure",))
 def beginnings(
     structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Any, ...]
-) -> tuple[Equilibrium, ...]:
+) -> tuple[Solution, ...]:
     """What a solve begins from, with some values of the unknowns: equilibria of which only the state is one.
 
     `guesses`: for each group first shapes, `None`, or equilibria on another mesh.
     """
+    found = _beginnings(structure, problem, at, guesses)
+    return tuple(
+        # A harness has no first shape that is not solved for.
+        harness_batch(unstacked(one), segments=structure.segments, guess=guess, strain_limit=None, is_told=False)
+        if isinstance(one, Harness)
+        else one
+        for one, guess in zip(found, guesses, strict=True)
+    )
+
+
+@functools.partial(compiled, static_argnames=("structure",))
+def _beginnings(
+    structure: Structure, problem: Problem, at: Coordinates, guesses: tuple[Any, ...]
+) -> tuple[Equilibrium | Harness, ...]:
+    """The same; of a harness what is to be solved."""
     shared, own = values(structure, problem, at)
 
-    def one(experiment: Experiment, own: Float[Array, "q"], guess: Guess | Equilibrium | None) -> Equilibrium:
+    def one(experiment: Experiment, own: Float[Array, "q"], guess: Any) -> Equilibrium | Harness:
         scene = with_unknowns(structure, experiment, shared, own).scene
+        if isinstance(scene, Harness):
+            return scene
         options, _ = checked_options(
             scene, structure.segments, None, structure.discretization, None, guess, structure.planar
         )
@@ -345,13 +388,14 @@ def beginnings(
     )
 
 
-def largest_error(results: tuple[Equilibrium, ...], tolerance: float | None) -> float:
+def largest_error(results: tuple[Solution, ...], tolerance: float | None) -> float:
     """Of the shapes that have converged, by the length; not a number where nobody asks for a tolerance."""
     if tolerance is None:
         return math.nan
     errors = [
-        np.max(np.linalg.norm(estimated_errors(result).nodes, axis=-1), axis=-1)[np.asarray(result.converged)]
+        np.max(np.linalg.norm(estimated_errors(rod).nodes, axis=-1), axis=-1)[np.asarray(rod.converged)]
         for result in results
+        for rod in rods_of(result).values()
     ]
     return float(np.max(np.concatenate(errors), initial=0.0))
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, leaf, namespace, number_array, one_of, positive, sequence, shown
 from rodjax.identification.measurements import Experiment
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.model.supports import rotate
 
@@ -18,7 +19,7 @@ Scale = Literal["log", "linear"]
 Per = Literal["all", "experiment"]
 
 # Numbers that are positive by their nature, and so sought by their logarithm where nothing else is said.
-POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.GA", "rod.mass_per_length", "rod.length", "rod.radius", "scale")
+POSITIVE = ("rod.EI", "rod.GJ", "rod.EA", "rod.GA", "rod.mass_per_length", "rod.length", "rod.radius", "mass", "scale")
 UNITS = {
     "jumps": "m",
     "rod.EI": "N m^2",
@@ -41,6 +42,9 @@ UNITS = {
     "gravity": "m/s^2",
     "scale": "",
     "turn": "rad",
+    "mass": "kg",
+    "translation": "N/m",
+    "rotation": "N m",
     "offset": "m",
     "shift": "m",
 }
@@ -109,17 +113,17 @@ class Unknown:
 
 def unit_of(name: str) -> str:
     """SI unit of a number by its dotted name; none of a number without one."""
-    if name.startswith("distributed.") and _matches(name, ("force",)):
+    if _matches(name, ("distributed",)) and _matches(name, ("force",)):
         return "N/m"
-    if name.startswith("point_couples.") and _matches(name, ("couple",)):
+    if _matches(name, ("point_couples",)) and _matches(name, ("couple",)):
         return "N m"
-    if name.startswith("obstacles."):
+    if _matches(name, ("obstacles",)):
         return "rad" if _matches(name, ("frame",)) else "" if _matches(name, ("normal", "friction")) else "m"
     return next((unit for part, unit in UNITS.items() if _matches(name, (part,))), "")
 
 
 class Target(NamedTuple):
-    """A number of an experiment or a scene: a leaf, by its name, and the component of it, if it is one."""
+    """A number of an experiment, a scene or a harness: a leaf, by its name, and the component of it, if it is one."""
 
     leaf: str
     component: int | None
@@ -129,17 +133,17 @@ class Target(NamedTuple):
         return _is_turned(self.leaf)
 
 
-Subject = Experiment | Scene
+Subject = Experiment | Scene | Harness
 
 
 def _is_turned(leaf: str) -> bool:
     """Whether a leaf is a direction or a frame, which changes by a rotation vector."""
-    return leaf.endswith((".frame", ".tangent"))
+    return leaf.endswith((".frame", ".tangent", ".axis"))
 
 
 def _numbers(subject: Subject) -> dict[str, Float[Array, "..."]]:
     """The numbers that can be unknown, by name."""
-    if isinstance(subject, Scene):
+    if not isinstance(subject, Experiment):
         return named_numbers(subject)
     numbers = dict(named_numbers(subject.scene))
     for k, measurement in enumerate(subject.measured):
@@ -187,11 +191,11 @@ def _component(numbers: dict[str, Float[Array, "..."]], at: Target) -> Float[Arr
     return number if at.component is None else number[at.component]
 
 
-S = TypeVar("S", Experiment, Scene)
+S = TypeVar("S", Experiment, Scene, Harness)
 
 
 def with_values(subject: S, names: Sequence[Sequence[str]], scales: Sequence[str], values: Sequence[Array]) -> S:
-    """The experiment or scene with these numbers for its unknowns, each of one or more names."""
+    """The experiment, scene or harness with these numbers for its unknowns, each of one or more names."""
     numbers = _numbers(subject)
     changed: dict[str, Any] = {}
     for tied, scale, value in zip(names, scales, values, strict=True):

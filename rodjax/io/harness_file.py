@@ -76,6 +76,16 @@ class HarnessFile(NamedTuple):
     strain_limit: float = DEFAULT_STRAIN_LIMIT
 
     @property
+    def scenes(self) -> list[Harness]:
+        """The only one, as of a scene file."""
+        return [self.harness]
+
+    @property
+    def discretization(self) -> None:
+        """None is stated: harnesses are solved on elements."""
+        return None
+
+    @property
     def settings(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("segments", "rtol", "strain_limit")}
 

@@ -1,7 +1,8 @@
 """Values by key, such as `end.position.2`, beside a scene file, and the scenes that the file makes with them.
 
 Keys are those of the file with dots; one component of a vector goes by its number. Values are as the file has them, or
-plain numbers in SI units.
+plain numbers in SI units. Of a harness they begin with `cables.NAME`, before a key of the scene of a cable, or
+`joints.NAME`.
 """
 
 import functools
@@ -21,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rodjax.checks import Numbers, line, shown
+from rodjax.io.harness_file import HarnessFile, harness_file
 from rodjax.io.quantities import (
     NUMBER_AND_UNIT,
     QUANTITIES,
@@ -38,6 +40,8 @@ from rodjax.solving.ranges import suspects
 Place = tuple[str | int, ...]
 # The tables whose numbers may vary.
 TABLES = ("rod", "start", "end", "loads", "clips", "obstacles")
+# Of a harness, whose tables have names.
+OWNERS = ("cables", "joints")
 _log = logging.getLogger("rodjax")
 
 
@@ -57,7 +61,7 @@ class SceneVariations:
         """Puts the tables into SI units, in which numbers are read much faster; where there are many scenes."""
         self._content = {name: _in_si(table, name) for name, table in self._content.items()}
 
-    def read(self, values: Mapping[str, Float[np.ndarray, "..."]]) -> SceneFile:
+    def read(self, values: Mapping[str, Float[np.ndarray, "..."]]) -> SceneFile | HarnessFile:
         """With these values in SI units; keys without one keep what the file has."""
         numbers: dict[Place, np.ndarray] = {}
         for key, value in values.items():
@@ -66,12 +70,15 @@ class SceneVariations:
         content = dict(self._content)
         for place, number in numbers.items():
             _put(content, place, _as_text(number, str(place[-1]), _dotted(place[:-1])))
-        return self._reader.read(content)
+        return harness_file(content) if "cables" in content else self._reader.read(content)
 
     def stacked(self, values: Mapping[str, Float[np.ndarray, "k ..."]]) -> tuple[Scene, Bool[np.ndarray, "k"]] | None:
         """The scenes with these values, along a leading axis, all made at once by a compiled program; and which of them
-        are to be read by themselves, as they may make no sense. `None` where the scenes differ in more than numbers.
+        are to be read by themselves, as they may make no sense. `None` where the scenes differ in more than numbers,
+        and of harnesses, whose solves take longer than making them.
         """
+        if "cables" in self._content:
+            return None
         scenes = _program(pickle.dumps((self._content, self._places, self._templates)))
         try:
             stack = jax.tree.map(np.asarray, scenes(dict(values)))
@@ -132,13 +139,18 @@ def check_keys(keys: Sequence[str]) -> None:
 def _target(key: str) -> tuple[Place, tuple[int, ...]]:
     """Where a key is in the tables, and which component of its numbers is meant."""
     names = key.split(".")
-    numbers = [int(name) if re.fullmatch("[0-9]{1,9}", name) else None for name in names]
+    of_owner = 2 if names[0] in OWNERS and len(names) > 2 else 0
+    numbers = [
+        int(name) if k >= of_owner and re.fullmatch("[0-9]{1,9}", name) else None for k, name in enumerate(names)
+    ]
     end = max((k + 1 for k, number in enumerate(numbers) if number is None), default=0)
     known = QUANTITIES | of_table(".".join(names[: max(end - 1, 0)]))
-    if names[0] not in TABLES or names[end - 1] not in known:
+    is_in_table = (bool(of_owner) and names[0] == "joints") or names[of_owner] in TABLES
+    if not is_in_table or names[end - 1] not in known:
         raise SceneFileError(
             f"{line(key)} cannot vary; allowed are the keys of {', '.join(TABLES[:-1])} and {TABLES[-1]} that hold "
-            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position, obstacles.0.radius"
+            "numbers, such as rod.EI, end.position.2, loads.point_force.0.at, clips.0.position, obstacles.0.radius; of "
+            "a harness cables.NAME.rod.EI, joints.NAME.mass"
         )
     place = tuple(name if number is None else number for name, number in zip(names[:end], numbers, strict=False))
     component = tuple(number for number in numbers[end:] if number is not None)

@@ -24,7 +24,7 @@ from rodjax.discretization.mixed import MixedForm
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, has_friction, has_node_positions, slides
 from rodjax.notes import bar
-from rodjax.paths.harness_path import harness_batch
+from rodjax.paths.harness_path import harness_batch, unstacked
 from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -67,7 +67,7 @@ ACCELERATOR_CHUNKS = ((1024, 1024), (8192, 8192), (65536, math.inf))
 
 @one_answer
 def solve_batch(
-    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene | Sequence[Harness],
+    scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene | Sequence[Harness] | Harness,
     *,
     segments: int | None = None,
     rtol: float | None = None,
@@ -87,7 +87,7 @@ def solve_batch(
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
         one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps; or
-        `Harness`es of one structure, which are solved one after another.
+        `Harness`es of one structure, or one `Harness` with a leading axis, which are solved one after another.
     - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each, from which friction acts.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
@@ -100,6 +100,10 @@ def solve_batch(
     Returns an `Equilibrium` with a leading axis, one entry a scene; for paths with two. A scene that does not converge
     is marked, and all others are not affected. Of harnesses a `HarnessEquilibrium`.
     """
+    if isinstance(scenes, Harness):
+        if scenes.scenes[0].rod.length.ndim != 1:
+            raise ValueError("scenes must be several harnesses, a list or one with a leading axis, got a single one")
+        scenes = unstacked(scenes)
     if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
         if mesh is not None:
             raise ValueError("mesh must be None for harnesses, which are solved one after another")

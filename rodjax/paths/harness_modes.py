@@ -35,8 +35,10 @@ class HarnessMode(eqx.Module):
     """The motion in which the equilibrium of a harness is softest.
 
     - `stiffness` N: the second variation of the energy in this motion, by the integral along all rods of the squared
-      change of the tangents, or of the frames where these are unknown; negative where the energy falls
-    - `displacements`: by the names of the rods, of their nodes (n+1, 3), the largest of all 1
+      change of the tangents, or of the frames where these are unknown; negative where the energy falls. Derivatives by
+      the harness are exact, of two motions equally soft those of one
+    - `displacements`: by the names of the rods, of their nodes (n+1, 3), the largest of all 1; taken as fixed by
+      derivatives
     """
 
     stiffness: Float[Array, ""]
@@ -96,11 +98,24 @@ def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
     """See `rodjax.paths.modes.lowest_mode`."""
     assembly, groups = _groups(result)
     system = _system(result, assembly, groups)
+    fixed = jax.lax.stop_gradient((result, assembly, groups, system))
+    stiffness, motion = _softest(*fixed[2:])
+    # As of one rod (`solving.stability.softest`): the quotient is stationary at its motion.
+    residual = system.times(motion)
+    works = [jnp.sum(a * b) for a, b in zip(jax.tree.leaves(motion), jax.tree.leaves(residual), strict=True)]
+    quotient = sum(works[1:], works[0]) / system.metric.inner(motion, motion)
+    mode = _mode(*fixed, motion, stiffness)
+    stiffness += quotient - jax.lax.stop_gradient(quotient)
+    return eqx.tree_at(lambda mode: mode.stiffness, mode, stiffness * unit_of_stiffness(assembly))
+
+
+def _softest(groups: list[_Group], system: AssembledSystem) -> tuple[Float[Array, ""], HarnessMotion]:
+    """The lowest eigenvalue, in the unit of the assembly, and its motion."""
 
     def lies_below(value: Float[Array, ""]) -> Bool[Array, ""]:
         return system.shifted(-value).factored(factor).negative > 0
 
-    low = below_lowest(lies_below, jnp.ones((), result.positions.dtype))
+    low = below_lowest(lies_below, jnp.ones((), system.springs.dtype))
     factors, metric = system.shifted(-low).factored(factor), system.metric
 
     def closer(_, found: tuple[HarnessMotion, Float[Array, ""]]) -> tuple[HarnessMotion, Float[Array, ""]]:
@@ -112,7 +127,7 @@ def harness_mode(result: HarnessEquilibrium) -> HarnessMode:
     linearized = tuple(group.linearized for group in groups)
     generic = generic_motion(linearized, tuple(group.point for group in groups), system)
     motion, stiffness = jax.lax.fori_loop(0, INVERSE_ITERATIONS, closer, (generic, low))
-    return _mode(result, assembly, groups, system, motion, stiffness)
+    return stiffness, motion
 
 
 @compiled

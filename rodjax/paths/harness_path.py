@@ -45,8 +45,8 @@ def harness_path(
 def harness_batch(
     harnesses: Sequence[Harness],
     *,
-    segments: int | None,
-    rtol: float | None,
+    segments: int | list[int] | None,
+    rtol: float | None = None,
     guess: HarnessEquilibrium | None,
     **options: Any,
 ) -> HarnessEquilibrium:
@@ -91,10 +91,17 @@ def stack_harnesses(harnesses: Sequence[Harness]) -> Harness:
     return jax.tree.map(lambda *leaves: leaf(xp.stack(leaves)), *harnesses)
 
 
+def unstacked(stack: Harness) -> list[Harness]:
+    """Harnesses whose leaves have a leading axis, one by one."""
+    xp = namespace(stack)
+    leaves, tree = jax.tree.flatten(jax.tree.map(xp.asarray, stack))
+    return [jax.tree.unflatten(tree, [leaf(x[k]) for x in leaves]) for k in range(len(leaves[0]))]
+
+
 def _on_one_mesh(
     first: HarnessEquilibrium,
     solved: Callable[[HarnessEquilibrium], list[HarnessEquilibrium]],
-    segments: int | None,
+    segments: int | list[int] | None,
     rtol: float | None,
     options: dict[str, Any],
 ) -> HarnessEquilibrium:

@@ -47,7 +47,7 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
 
     Motions out of a plane in which the rod lies count too. The metric is that of the tangents, or of the frames
     where these are unknown, which spin too: eigenvalues are in N, `EI/L^2` in nondimensional form. O(n). Of a harness
-    a `HarnessMode`, of all rods and joints together, without derivatives. A rod slides through its sliding clips in the
+    a `HarnessMode`, of all rods and joints together. A rod slides through its sliding clips in the
     motion; where one holds its direction, sliding has no energy of its own, and the eigenvalue is that of the
     linearised equilibrium.
 
@@ -62,7 +62,7 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
             raise ValueError("equilibrium must have a potential: a dead moment on a joint has none")
         if equilibrium.harness.contact:
             raise ValueError("equilibrium must be of a harness with contact=False: with it no softest motion is sought")
-        return harness_mode(jax.lax.stop_gradient(equilibrium))
+        return harness_mode(equilibrium)
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
     return _lowest_mode(equilibrium)

@@ -1,5 +1,6 @@
 """By how much a rod at rest keeps to limits: of each limit the value that decides, where it is, and its margin."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -16,10 +17,14 @@ from rodjax.discretization.hermite import Curve
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Value, value_at
 from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.model.scene import Scene
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of
 from rodjax.solving.result import Equilibrium, beside_nodes, over_leading_axes
 
+# What the name of a clearance is told by, before that of the obstacle.
+CLEARANCE = "clearance to "
 # Steps of the secant method towards the nearest place of a piece of the rod.
 NEARER = 6
 
@@ -79,12 +84,13 @@ class Measured(eqx.Module):
         return jnp.where(is_finite, gap / jnp.where(self.limit == 0, 1.0, self.limit), self.value)
 
 
-def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names: Any = None) -> Margins:
+def margins(equilibrium: Solution, limits: Limits, obstacles: Any = (), names: Any = None) -> Margins:
     """The margins of an equilibrium to limits.
 
     **Arguments:**
 
-    - `equilibrium`: of one scene or of many.
+    - `equilibrium`: of one scene or of many; or of a harness, each of whose cables the limits are of, and the stability
+        that of the whole: names are then as "trunk: bend radius".
     - `limits`: `Limits`.
     - `obstacles`: a list of `Obstacle`, from which `limits.clearance` is kept.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
@@ -101,10 +107,10 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     Raises `ValueError` or `TypeError` for a limit on what the scene lacks: a radius, clips, obstacles, for obstacles
     without a limit of clearance, and for a stability that `rodjax.lowest_mode` refuses.
     """
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     obstacles, names = checked(equilibrium, limits, obstacles, names)
     found = measured_margins(equilibrium, limits, obstacles)
-    labels = [each.name if each.obstacle is None else f"clearance to {names[each.obstacle]}" for each in found]
+    labels = [_label(each, names) for each in found]
     value, limit, margin, s = (
         jnp.concatenate(rows, axis=-1)
         for rows in zip(*((each.value, each.limit, each.margin, each.s) for each in found), strict=True)
@@ -120,10 +126,19 @@ def margins(equilibrium: Equilibrium, limits: Limits, obstacles: Any = (), names
     )
 
 
-def checked(subject: Any, limits: Limits, obstacles: Any, names: Any) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
-    """The obstacles and their names, where the limits suit them and the rod of an equilibrium, or of a `Scene`."""
+def _label(each: Measured, names: tuple[str, ...]) -> str:
+    """With the obstacle by its name."""
+    if each.obstacle is None:
+        return each.name
+    return f"{each.name[: each.name.rindex(CLEARANCE)]}{CLEARANCE}{names[each.obstacle]}"
+
+
+def checked(
+    subject: Solution | Scene, limits: Limits, obstacles: Any, names: Any
+) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
+    """The obstacles and their names, where the limits suit them and the rods of an equilibrium, or of a `Scene`."""
     instance(limits, "limits", Limits)
-    scene = subject.scene if isinstance(subject, Equilibrium) else subject
+    rods = {"": subject} if isinstance(subject, Scene) else {name: rod.scene for name, rod in rods_of(subject).items()}
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if obstacles:
         obstacles = checked_obstacles(obstacles)
@@ -140,26 +155,50 @@ def checked(subject: Any, limits: Limits, obstacles: Any, names: Any) -> tuple[t
     if len(names) != len(obstacles) or not all(isinstance(name, str) for name in names) or len({*names}) < len(names):
         raise ValueError(f"names must be {len(obstacles)} different ones, one for each obstacle, got {list(names)}")
     for field in ("bend_radius", "clearance"):
-        if getattr(limits, field) is not None and scene.rod.radius is None:
-            raise ValueError(f"limits.{field} must be None for a rod without a radius; rodjax.Rod takes one")
+        for name, scene in rods.items():
+            if getattr(limits, field) is not None and scene.rod.radius is None:
+                raise ValueError(f"{name}limits.{field} must be None for a rod without a radius; rodjax.Rod takes one")
     for field in ("clip_force", "clip_moment"):
-        if getattr(limits, field) is not None and not scene.clips:
+        if getattr(limits, field) is not None and not any(scene.clips for scene in rods.values()):
             raise ValueError(f"limits.{field} must be None for a scene without clips")
     return obstacles, names
 
 
 @over_leading_axes
-def measured_margins(equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...]) -> list[Measured]:
+def measured_margins(equilibrium: Solution, limits: Limits, obstacles: tuple[Obstacle, ...]) -> list[Measured]:
     """Of each limit the worst."""
     return measured(equilibrium, limits, obstacles)
 
 
 def measured(
-    equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...], everywhere: bool = False
+    equilibrium: Solution, limits: Limits, obstacles: tuple[Obstacle, ...], everywhere: bool = False
 ) -> list[Measured]:
     """What the limits of an equilibrium are compared with; `everywhere`: limits along the rod at every place looked
     at, of clearances at the nearest place of every piece between two of these, in place of the worst alone.
     """
+    if isinstance(equilibrium, Equilibrium):
+        return _measured_of_rod(equilibrium, limits, obstacles, everywhere)
+    of_rods = eqx.tree_at(lambda limits: limits.stability, limits, None, is_leaf=lambda x: x is None)
+    found = [
+        dataclasses.replace(each, name=f"{name}{each.name}")
+        for name, rod in rods_of(equilibrium).items()
+        for each in _measured_of_rod(rod, of_rods, obstacles, everywhere)
+    ]
+    if limits.stability is not None:
+        rods = [rod.scene.rod for rod in equilibrium.values()]
+        unit = jnp.mean(jnp.stack([rod.bending_scale / rod.length**2 for rod in rods]))
+        found.append(_stability(equilibrium, limits.stability, unit))
+    return found
+
+
+def _stability(equilibrium: Solution, limit: Float[Array, ""], unit: Float[Array, ""]) -> Measured:
+    stiffness = lowest_mode(equilibrium).stiffness
+    return _single("stability", "N", True, stiffness, limit, (stiffness - limit) / (limit + unit))
+
+
+def _measured_of_rod(
+    equilibrium: Equilibrium, limits: Limits, obstacles: tuple[Obstacle, ...], everywhere: bool
+) -> list[Measured]:
     scene = equilibrium.scene
     found = []
     if limits.bend_radius is not None:
@@ -190,10 +229,7 @@ def measured(
         if limit is not None:
             found.append(_largest(name, unit, values, limit, along.s, everywhere))
     if limits.stability is not None:
-        stiffness = lowest_mode(equilibrium).stiffness
-        unit = limits.stability + scene.rod.bending_scale / scene.rod.length**2
-        slack = (stiffness - limits.stability) / unit
-        found.append(_single("stability", "N", True, stiffness, limits.stability, slack))
+        found.append(_stability(equilibrium, limits.stability, scene.rod.bending_scale / scene.rod.length**2))
     for name, unit, limit, value in (
         ("length", "m", limits.length, scene.rod.length),
         ("mass", "kg", limits.mass, scene.rod.mean_mass_per_length * scene.rod.length),
@@ -275,7 +311,7 @@ def _clearances(
         distance = obstacle.distance(equilibrium.position_at(s)) - radii
         limit = jnp.broadcast_to(limits[number], distance.shape)
         slack = (distance - limit) / (2 * radii)
-        return Measured(f"clearance to obstacle {number}", "m", True, distance, limit, slack, s, number)
+        return Measured(f"{CLEARANCE}obstacle {number}", "m", True, distance, limit, slack, s, number)
 
     return [to(number, obstacle) for number, obstacle in enumerate(obstacles)]
 

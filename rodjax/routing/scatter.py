@@ -1,4 +1,4 @@
-"""How the quantities of a rod at rest scatter with numbers of its scene: by derivatives, and by solves."""
+"""How the quantities of a rod or harness at rest scatter with numbers of it: by derivatives, and by solves."""
 
 import functools
 import math
@@ -13,17 +13,20 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import Numbers
 from rodjax.identification.unknowns import nominal, with_values
+from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import Scene, has_potential
+from rodjax.model.scene import has_potential
 from rodjax.model.supports import Free
 from rodjax.notes import bar
 from rodjax.paths.batch import chunk_size, lane_count, solve_stack
+from rodjax.paths.harness_path import harness_batch, unstacked
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import Workers, as_completed, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
-from rodjax.solving.implicit import differentiable
+from rodjax.solving.harness import differentiable_by
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of, solved_in
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
 from rodjax.warn import silenced
 
@@ -32,11 +35,13 @@ STEP = math.sqrt(3.0)
 
 
 class Quantities(NamedTuple):
-    """What scatters: values of limits, nodes of the centerline across itself, forces at both ends; or changes of it."""
+    """What scatters: values of limits, nodes of the centerline across itself, forces at both ends; or changes of it.
+    Nodes and forces are those of one rod after another.
+    """
 
     values: Float[Numbers, "... m"]
-    nodes: Float[Numbers, "... n+1 3"]
-    forces: Float[Numbers, "... 2 3"]
+    nodes: Float[Numbers, "... n 3"]
+    forces: Float[Numbers, "... 2r 3"]
 
 
 class Moments(NamedTuple):
@@ -44,8 +49,8 @@ class Moments(NamedTuple):
 
     shift: Quantities
     values: Float[np.ndarray, "m"]
-    nodes: Float[np.ndarray, "n+1 3 3"]
-    forces: Float[np.ndarray, "2 3 3"]
+    nodes: Float[np.ndarray, "n 3 3"]
+    forces: Float[np.ndarray, "2r 3 3"]
 
     @staticmethod
     def sums(changes: Quantities) -> "Moments":
@@ -67,36 +72,57 @@ class Slopes(NamedTuple):
     stiffness_by: Float[Numbers, "p"]
 
 
-class Scattering(eqx.Module):
-    """An equilibrium whose scene scatters: the numbers of these keys by `root` times independent normal ones."""
+class Part(NamedTuple):
+    """Of one rod among all: what its names begin with, where its nodes are, and its number."""
 
-    equilibrium: Equilibrium
+    prefix: str
+    nodes: slice
+    number: int
+
+
+class Scattering(eqx.Module):
+    """An equilibrium whose scene or harness scatters: the numbers of these keys by `root` times independent normal
+    ones.
+    """
+
+    equilibrium: Solution
     keys: tuple[str, ...] = eqx.field(static=True)
     root: Float[Array, "p p"]
     limits: Limits | None
     obstacles: tuple[Obstacle, ...]
 
-    def scene(self, z: Float[Array, "p"]) -> Scene:
-        scene = self.equilibrium.scene
+    @property
+    def parts(self) -> list[Part]:
+        """The rods."""
+        rods = rods_of(self.equilibrium)
+        ends = np.cumsum([0, *(rod.s.shape[-1] for rod in rods.values())]).tolist()
+        return [Part(prefix, slice(*ends[k : k + 2]), k) for k, prefix in enumerate(rods)]
+
+    def scene(self, z: Float[Array, "p"]) -> Any:
+        scene: Any = solved_in(self.equilibrium)
         changes = self.root.astype(z.dtype) @ z
         values = [nominal([key], scene) + change for key, change in zip(self.keys, changes, strict=True)]
         return with_values(scene, [[key] for key in self.keys], ["linear"] * len(self.keys), values)
 
-    def scenes(self, zs: Float[np.ndarray, "k p"]) -> Scene:
+    def scenes(self, zs: Float[np.ndarray, "k p"]) -> Any:
         """Along a leading axis."""
         return _scenes(self, zs)
 
-    def quantities(self, equilibrium: Equilibrium) -> Quantities:
-        values = jnp.zeros(0, equilibrium.s.dtype)
+    def quantities(self, equilibrium: Solution) -> Quantities:
+        values = jnp.zeros(0, equilibrium.energy.dtype)
         if self.limits is not None:
             values = jnp.concatenate([each.value for each in measured(equilibrium, self.limits, self.obstacles)])
-        along = self.equilibrium.tangents
-        scene = self.equilibrium.scene
-        for end, node in ((scene.start, 0), (scene.end, -1)):
-            if isinstance(end, Free):
-                along = along.at[node].set(0.0)
-        nodes = equilibrium.nodes - jnp.sum(equilibrium.nodes * along, axis=1)[:, None] * along
-        return Quantities(values, nodes, jnp.stack([equilibrium.start_force, equilibrium.end_force]))
+        nodes, forces = [], []
+        pairs = zip(rods_of(equilibrium).values(), rods_of(self.equilibrium).values(), strict=True)
+        for rod, as_it_should_be in pairs:
+            along = as_it_should_be.tangents
+            scene = as_it_should_be.scene
+            for end, node in ((scene.start, 0), (scene.end, -1)):
+                if isinstance(end, Free):
+                    along = along.at[node].set(0.0)
+            nodes.append(rod.nodes - jnp.sum(rod.nodes * along, axis=1)[:, None] * along)
+            forces += [rod.start_force, rod.end_force]
+        return Quantities(values, jnp.concatenate(nodes), jnp.stack(forces))
 
     def slopes(self) -> Slopes:
         return jax.tree.map(np.asarray, _slopes(self))
@@ -108,8 +134,13 @@ class Scattering(eqx.Module):
         which of its rods are at rest.
         """
         size, total = chunk_size(len(zs)), len(zs)
-        n = self.equilibrium.s.shape[-1] - 1
-        options: dict[str, Any] = {"segments": n, "discretization": self.equilibrium.discretization}
+        if isinstance(self.equilibrium, HarnessEquilibrium):
+            # One after another: none is solved to fill a part.
+            size = min(size, total)
+            options: dict[str, Any] = {"segments": self.equilibrium.segments}
+        else:
+            n = self.equilibrium.s.shape[-1] - 1
+            options = {"segments": n, "discretization": self.equilibrium.discretization}
         # A saddle that is kept would be left otherwise.
         options["find"] = "minimum" if bool(self.equilibrium.stable) else "equilibrium"
         parts = ((self, zs[rows_of(first, size, total)], options) for first in range(0, total, size))
@@ -128,35 +159,44 @@ def _solved_part(
 ) -> tuple[Quantities, Bool[np.ndarray, "k"]]:
     # How many did not converge is what the caller is told.
     with silenced(NotConvergedWarning):
-        rods = solve_stack(scattering.scenes(zs), guess=scattering.equilibrium, strain_limit=None, **options)
+        scenes, guess = scattering.scenes(zs), scattering.equilibrium
+        if isinstance(scenes, Harness):
+            assert isinstance(guess, HarnessEquilibrium)
+            rods: Any = harness_batch(unstacked(scenes), guess=guess, strain_limit=None, is_told=False, **options)
+        else:
+            assert isinstance(guess, Equilibrium)
+            rods = solve_stack(scenes, guess=guess, strain_limit=None, **options)
     return jax.tree.map(np.asarray, (_quantities(scattering, rods), rods.converged))
 
 
 @compiled
 def _slopes(scattering: Scattering) -> Slopes:
     result = scattering.equilibrium
-    is_examined = has_potential(result.scene)
+    if isinstance(result, HarnessEquilibrium):
+        is_examined = result.harness.has_potential and not result.harness.contact
+    else:
+        is_examined = has_potential(result.scene)
 
     def found(z: Float[Array, "p"]) -> tuple[Quantities, Float[Array, ""]]:
-        near = differentiable(scattering.scene(z), result)
+        near = differentiable_by(scattering.scene(z), result)
         stiffness = lowest_mode(near).stiffness if is_examined else jnp.full_like(near.energy, jnp.nan)
         return scattering.quantities(near), stiffness
 
-    z = jnp.zeros(len(scattering.root), result.s.dtype)
+    z = jnp.zeros(len(scattering.root), result.energy.dtype)
     along = jax.vmap(lambda direction: jax.jvp(found, (z,), (direction,)), out_axes=(None, 0))
     (here, stiffness), (by, stiffness_by) = along(jnp.eye(len(z), dtype=z.dtype))
     return Slopes(here, by, stiffness, stiffness_by)
 
 
 @compiled
-def _scenes(scattering: Scattering, zs: Float[Array, "k p"]) -> Scene:
-    return jax.vmap(scattering.scene)(zs.astype(scattering.equilibrium.s.dtype))
+def _scenes(scattering: Scattering, zs: Float[Array, "k p"]) -> Any:
+    return jax.vmap(scattering.scene)(zs.astype(scattering.equilibrium.energy.dtype))
 
 
 @compiled
-def _quantities(scattering: Scattering, rods: Equilibrium) -> Quantities:
+def _quantities(scattering: Scattering, rods: Solution) -> Quantities:
     # Not by `batch_size`: there may be no values.
-    count = rods.s.shape[0]
+    count = rods.energy.shape[0]
     at_once = math.gcd(count, lane_count())
     lanes = jax.tree.map(lambda x: x.reshape(count // at_once, at_once, *x.shape[1:]), rods)
     found = jax.lax.map(jax.vmap(scattering.quantities), lanes)

@@ -1,4 +1,4 @@
-"""tolerances(): how far a rod at rest scatters where what holds it does, and how likely it then breaks its limits.
+"""tolerances(): how far a rod or harness at rest scatters where its numbers do, and how likely it breaks its limits.
 
 To first order: the derivatives J of all quantities by the tolerated numbers, through the implicit function theorem, and
 J Sigma J^T. Whether the first order is enough is looked at by a few solves at distances of sqrt(3) standard deviations,
@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,12 +19,14 @@ from scipy import linalg, stats
 from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, is_known, leaf, number_array, positive, sequence, shown, whole_number
 from rodjax.identification.unknowns import Unknown, known_names, target
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, check_without_friction
 from rodjax.programs.answers import one_answer
 from rodjax.programs.tasks import Workers, checked_executor, checked_threads
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of, solved_in
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
@@ -46,12 +48,13 @@ NOT_FINITE = "not finite as it should be, so that nothing can be said to first o
 
 
 class Tolerance:
-    """The scatter of a number of a scene, or of each component of a vector.
+    """The scatter of a number of a scene or harness, or of each component of a vector.
 
     **Arguments:**
 
     - `key`: dotted name of a number or vector, `"rod.length"`, `"clips.0.at"`, `"clips.0.position"`,
         `"end.position.2"`; or of a direction or frame, `"clips.0.tangent"`, which turns about the global axes [rad].
+        Of a harness `"cables.NAME.rod.length"`, of the scene of a cable, and `"joints.NAME.mass"`, of a `Body`.
     - `sigma`: the standard deviation in SI units, of a vector of each component; or its (n, n) covariance matrix.
 
     Raises `ValueError` or `TypeError` where it is not positive, or the matrix not symmetric and positive. Whether the
@@ -91,31 +94,46 @@ class Scatter:
     - `position` (n+1,) m: largest standard deviation of the centerline at each node across itself, and at a free end in
       any direction
     - `start_force`, `end_force` (3,) N: standard deviations
+
+    Of a harness `position` has the nodes of all cables, one cable after another, and the forces are (cables, 3).
     """
 
     deviation: Float[np.ndarray, "m"]
     probability: Float[np.ndarray, "m"]
     any_broken: float
     position: Float[np.ndarray, "n+1"]
-    start_force: Float[np.ndarray, "3"]
-    end_force: Float[np.ndarray, "3"]
+    start_force: Float[np.ndarray, "... 3"]
+    end_force: Float[np.ndarray, "... 3"]
 
     @staticmethod
-    def of(moments: Moments, probability: Float[np.ndarray, "m"], any_broken: float) -> "Scatter":
+    def of(
+        scattering: Scattering, moments: Moments, probability: Float[np.ndarray, "m"], any_broken: float
+    ) -> "Scatter":
         # Of what does not scatter, roundings may be left of either sign.
-        start, end = (np.sqrt(np.maximum(np.diag(covariance), 0.0)) for covariance in moments.forces)
-        return Scatter(np.sqrt(moments.values), probability, any_broken, _largest(moments.nodes), start, end)
+        forces = np.sqrt(np.maximum(np.diagonal(moments.forces, axis1=1, axis2=2), 0.0))
+        forces = forces if isinstance(scattering.equilibrium, Equilibrium) else forces.reshape(-1, 2, 3).swapaxes(0, 1)
+        return Scatter(np.sqrt(moments.values), probability, any_broken, _largest(moments.nodes), *forces)
+
+
+class CableScatter(NamedTuple):
+    """Of one cable of a harness: arclengths `s` (n+1,) m of its nodes, and the others as of `Scatter`."""
+
+    s: Float[np.ndarray, "n+1"]
+    position: Float[np.ndarray, "n+1"]
+    start_force: Float[np.ndarray, "3"]
+    end_force: Float[np.ndarray, "3"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Envelope:
-    """How a rod at rest scatters with its tolerances.
+    """How a rod or harness at rest scatters with its tolerances; of a harness `envelope["trunk"]` is the `CableScatter`
+    of a cable.
 
     - `margins`: `Margins` of the rod as it should be, m of them; none without limits
     - `first_order`: `Scatter` by the derivatives; `any_bound`: the sum of its probabilities, which that of any limit
       being broken cannot exceed
     - `shares` (m, k): the part of the variance of each value that each tolerance brings
-    - `s` (n+1,) m: arclengths of the nodes
+    - `s` (n+1,) m: arclengths of the nodes, of a harness those of one cable after another
     - `stiffness`, `stiffness_deviation` N: of the softest motion, as by `rodjax.lowest_mode`, not numbers where that
       has none
     - `sampled`: `Scatter` of the Monte Carlo, `None` without samples; `samples`: how many of its solves converged
@@ -123,7 +141,7 @@ class Envelope:
       `first_order`; `is_certain`: whether one does
     - `scattering`: what scatters: the `equilibrium`, the `limits` and `obstacles` of the margins
     - `flags`: sentences by what they concern, where the first order is not enough: names of the margins, "centerline",
-      "start_force", "end_force", or of all "rod"
+      "start_force", "end_force", of a harness "trunk: centerline" and so on, or of all "rod"
     """
 
     tolerances: tuple[Tolerance, ...]
@@ -139,9 +157,19 @@ class Envelope:
     scattering: Scattering
     flags: dict[str, str]
 
-    def drawn(self, count: int, seed: int = 0) -> Scene:
-        """So many scenes, drawn at random within the tolerances, along a leading axis. `rodjax.view(envelope)` shows
-        such rods, `rodjax.solve_batch(envelope.drawn(100), segments=32)` solves them.
+    def __getitem__(self, cable: str) -> CableScatter:
+        """Of a cable of a harness, by what holds. Raises `KeyError` where there is none of this name."""
+        equilibrium = self.scattering.equilibrium
+        if isinstance(equilibrium, Equilibrium) or cable not in equilibrium.names:
+            known = "" if isinstance(equilibrium, Equilibrium) else ", ".join(map(repr, equilibrium.names))
+            raise KeyError(f"no cable {cable!r} in this envelope: it is of {known or 'a single rod'}")
+        part = self.scattering.parts[equilibrium.names.index(cable)]
+        forces = self.scatter.start_force[part.number], self.scatter.end_force[part.number]
+        return CableScatter(self.s[part.nodes], self.scatter.position[part.nodes], *forces)
+
+    def drawn(self, count: int, seed: int = 0) -> Any:
+        """So many scenes, drawn at random within the tolerances, as one `Scene` or `Harness` with a leading axis.
+        `rodjax.view(envelope)` shows such rods, `rodjax.solve_batch(envelope.drawn(100), segments=32)` solves them.
         """
         count = whole_number(count, "count", 1, MOST_SAMPLES)
         rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63))
@@ -181,16 +209,18 @@ class Envelope:
             text = f"any limit broken with probability {leading.any_broken:.2g}"
             text += "" if is_sampled else f", at most {self.any_bound:.2g}"
             lines.append(text if other is None else f"{text}; {beside} {other.any_broken:.2g}")
-        k = int(np.nanargmax(leading.position)) if np.any(np.isfinite(leading.position)) else 0
-        text = f"centerline: +- {leading.position[k]:.2g} m at most, at s = {self.s[k]:.4g} m"
-        lines.append(text if other is None else f"{text}; {beside} {np.max(other.position):.2g}")
+        for part in self.scattering.parts:
+            of_rod, s = leading.position[part.nodes], self.s[part.nodes]
+            k = int(np.nanargmax(of_rod)) if np.any(np.isfinite(of_rod)) else 0
+            text = f"{part.prefix}centerline: +- {of_rod[k]:.2g} m at most, at s = {s[k]:.4g} m"
+            lines.append(text if other is None else f"{text}; {beside} {np.max(other.position[part.nodes]):.2g}")
         lines += [f"not of first order: {name}: {flag}" for name, flag in self.flags.items()]
         return "\n".join(lines)
 
 
 @one_answer
 def tolerances(
-    equilibrium: Equilibrium,
+    equilibrium: Solution,
     tolerances: Sequence[Tolerance],
     *,
     limits: Limits | None = None,
@@ -202,14 +232,15 @@ def tolerances(
     threads: int | None = None,
     progress: bool | None = None,
 ) -> Envelope:
-    """The scatter of an equilibrium whose scene has numbers with tolerances, normally distributed and independent.
+    """The scatter of an equilibrium whose scene or harness has numbers with tolerances, normally distributed and
+    independent.
 
     **Arguments:**
 
     - `equilibrium`: a single one that converged, on its mesh.
     - `tolerances`: a list of `Tolerance`.
-    - `limits`, `obstacles`, `names`: as for `rodjax.margins`, which are then looked at; `None` for the shape and the
-        forces alone.
+    - `limits`, `obstacles`, `names`: as for `rodjax.margins`, which are then looked at, of a harness those of every
+        cable; `None` for the shape and the forces alone.
     - `samples`: solves of a Monte Carlo, warm from the equilibrium, besides the first order; `None`: a few solves that
         tell whether the first order is enough, and where it is not, 2000 samples; 0: the few solves alone.
     - `seed`: of the random numbers.
@@ -222,21 +253,24 @@ def tolerances(
     Flagged are quantities whose standard deviation by the solves differs by more than 5 % from that of the first order,
     or whose mean is off by more than a tenth of it, both beyond what so few samples may be off by (two standard
     errors); solves that do not converge; and the rod where the stiffness of its softest motion vanishes within three
-    standard deviations. Where the equilibrium is critical the first order is not a number, and a flag says so.
+    standard deviations (not of harnesses with contact between rods, whose softest motion is not sought). Where the
+    equilibrium is critical the first order is not a number, and a flag says so. Samples of harnesses are solved one
+    after another.
 
-    Raises `ValueError` or `TypeError` for names that the scene does not have, and for invalid arguments.
+    Raises `ValueError` or `TypeError` for names that the scene or harness does not have, and for invalid arguments.
     """
     workers = Workers(checked_executor(executor), checked_threads(threads))
-    instance(equilibrium, "equilibrium", Equilibrium)
+    instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     if not is_known(equilibrium):
         raise ValueError("equilibrium must hold numbers, got a traced one: call tolerances outside jax.jit and vmap")
-    if equilibrium.s.ndim > 1:
-        raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.s.shape[:-1]}")
-    if equilibrium.discretization == "continuum":
+    if equilibrium.energy.ndim:
+        raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.energy.shape}")
+    if isinstance(equilibrium, Equilibrium) and equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
     if not bool(equilibrium.converged):
         raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
-    check_without_friction(equilibrium.scene, "tolerances")
+    if isinstance(equilibrium, Equilibrium):  # rods of harnesses have none
+        check_without_friction(equilibrium.scene, "tolerances")
     tolerances = sequence(tolerances, "tolerances", "Tolerance")
     samples = None if samples is None else whole_number(samples, "samples", 0, MOST_SAMPLES)
     rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63))
@@ -244,8 +278,8 @@ def tolerances(
     if limits is None and obstacles:
         raise ValueError(f"limits must be given where there are obstacles, got {len(obstacles)} of them and no limits")
     kept = None if limits is None else margins(equilibrium, limits, obstacles, names)
-    keys, owners, root = _scattering(equilibrium.scene, tolerances)
-    scattering = Scattering(equilibrium, keys, leaf(root.astype(equilibrium.s.dtype)), limits, obstacles)
+    keys, owners, root = _scattering(solved_in(equilibrium), tolerances)
+    scattering = Scattering(equilibrium, keys, leaf(root.astype(equilibrium.energy.dtype)), limits, obstacles)
     # Of values that are not finite, as the bend radius of a straight rod, nothing is said but that.
     with np.errstate(invalid="ignore"):
         return _envelope(scattering, tolerances, owners, kept, samples, rng, workers)
@@ -264,14 +298,14 @@ def _envelope(
     first = by_derivatives(slopes)
     values, p = slopes.here.values, len(owners)
     deviation = np.sqrt(first.values)
-    length = float(scattering.equilibrium.s[-1])
+    s = np.concatenate([np.asarray(rod.s) for rod in rods_of(scattering.equilibrium).values()])
     stiffness, stiffness_deviation = float(slopes.stiffness), float(np.linalg.norm(slopes.stiffness_by))
     flags, sampled, count = {}, None, 0
 
     def flag(unsolved: int, compared: Sequence[Moments], count: int) -> None:
         """What was flagged before stays."""
         found = [_flags_of_rod(stiffness, stiffness_deviation, unsolved, first)]
-        found += [_flags(slopes.here, first, moments, kept, length, count) for moments in compared]
+        found += [_flags(scattering, slopes.here, first, moments, kept, s, count) for moments in compared]
         for each in found:
             for name, told in each.items():
                 flags.setdefault(name, told)
@@ -287,7 +321,7 @@ def _envelope(
         is_broken = _broken(rods, kept)
         if count:
             parts = np.mean(is_broken, axis=0), float(np.mean(np.any(is_broken, axis=1)))
-            sampled = Scatter.of(second, *parts)
+            sampled = Scatter.of(scattering, second, *parts)
     probability = _probabilities(values, deviation, kept)
     draws = values[None] + rng.standard_normal((DRAWS, p)) @ slopes.by.values
     any_broken = float(np.max([np.mean(np.any(_broken(draws, kept), axis=1)), *probability]))
@@ -295,10 +329,10 @@ def _envelope(
     return Envelope(
         tolerances=tolerances,
         margins=kept,
-        first_order=Scatter.of(first, probability, any_broken),
+        first_order=Scatter.of(scattering, first, probability, any_broken),
         any_bound=min(1.0, float(np.sum(probability))),
         shares=(variances / np.where(first.values > 0, first.values, 1.0)[None]).T,
-        s=np.asarray(scattering.equilibrium.s),
+        s=s,
         stiffness=stiffness,
         stiffness_deviation=stiffness_deviation,
         sampled=sampled,
@@ -309,13 +343,14 @@ def _envelope(
 
 
 def _scattering(
-    scene: Scene, tolerances: Sequence[Tolerance]
+    scene: Scene | Harness, tolerances: Sequence[Tolerance]
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "p"], Float[np.ndarray, "p p"]]:
     """The names of the numbers that scatter, which tolerance each is of, and a root of their covariance matrix."""
     if not tolerances:
         raise ValueError("tolerances must hold at least one Tolerance, got none")
     numbers = named_numbers(scene)
-    sliding = {f"clips.{k}.at" for k, clip in enumerate(scene.clips) if clip.sliding}
+    clips = scene.clips if isinstance(scene, Scene) else ()  # none slides on a rod of a harness
+    sliding = {f"clips.{k}.at" for k, clip in enumerate(clips) if clip.sliding}
     keys, owners, roots = [], [], []
     for k, tolerance in enumerate(tolerances):
         instance(tolerance, f"tolerances[{k}]", Tolerance)
@@ -325,7 +360,8 @@ def _scattering(
             own = [f"{key}.{j}" for j in range(len(numbers[key]))]
         if any(target(name, scene) is None for name in own) or key in sliding:
             allowed = ", ".join(name for name in known_names(scene) if name not in sliding)
-            raise ValueError(f"tolerances[{k}]: key must be a number of the scene: {allowed}; got {key!r}")
+            kind = "scene" if isinstance(scene, Scene) else "harness"
+            raise ValueError(f"tolerances[{k}]: key must be a number of the {kind}: {allowed}; got {key!r}")
         repeated = [name for name in own if name in keys]
         if repeated:
             raise ValueError(f"tolerances[{k}]: {repeated[0]} has a tolerance already, got {key!r}")
@@ -391,7 +427,13 @@ def _flags_of_rod(stiffness: float, deviation: float, unsolved: int, first: Mome
 
 
 def _flags(
-    here: Quantities, first: Moments, second: Moments, kept: Margins | None, length: float, count: int
+    scattering: Scattering,
+    here: Quantities,
+    first: Moments,
+    second: Moments,
+    kept: Margins | None,
+    s: Float[np.ndarray, "n"],
+    count: int,
 ) -> dict[str, str]:
     """Of what differs between the first order and solves, `count` of them at random, or 0."""
     flags = {}
@@ -405,11 +447,13 @@ def _flags(
         if flag:
             flags[name] = flag
     force = float(np.max(np.linalg.norm(here.forces, axis=1)))
-    of_shape = *(float(np.max(_largest(moments.nodes))) for moments in (first, second)), second.shift.nodes, length
-    named = {"centerline": of_shape}
-    for k, end in enumerate(("start", "end")):
-        spread, solved = (math.sqrt(max(np.trace(moments.forces[k]), 0.0)) for moments in (first, second))
-        named[f"{end}_force"] = (spread, solved, second.shift.forces[k][None], force)
+    named = {}
+    for prefix, nodes, number in scattering.parts:
+        spread, solved = (float(np.max(_largest(moments.nodes[nodes]))) for moments in (first, second))
+        named[f"{prefix}centerline"] = (spread, solved, second.shift.nodes[nodes], float(s[nodes][-1]))
+        for k, end in ((2 * number, "start"), (2 * number + 1, "end")):
+            spread, solved = (math.sqrt(max(np.trace(moments.forces[k]), 0.0)) for moments in (first, second))
+            named[f"{prefix}{end}_force"] = (spread, solved, second.shift.forces[k][None], force)
     for name, (spread, solved, shifts, size) in named.items():
         flag = _flag(spread, solved, float(np.max(np.linalg.norm(shifts, axis=1))), size, count)
         if flag:

@@ -48,7 +48,7 @@ from rodjax.solving.equilibrium import (
 )
 from rodjax.solving.first_poses import first_poses
 from rodjax.solving.guess import Guess
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution
 from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
 from rodjax.solving.newton import Newton
 from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
@@ -115,7 +115,7 @@ def solve_harness(
     kept = [None] * len(fixed) if guess is None else guess.segments
     counts = segments if isinstance(segments, list) else [segments] * len(fixed)
     all_options, tolerance = [], rtol
-    for scene, count, before in zip(_structures(fixed), counts, kept, strict=True):
+    for scene, count, before in zip(clamped_rods(fixed), counts, kept, strict=True):
         # The mesh of a guess comes first, as of one rod.
         wanted = before if count is None and rtol is None else count
         options, tolerance = checked_options(scene, wanted, rtol, "hermite", solver, find=find)
@@ -205,7 +205,7 @@ def _followed(harness: Harness, guess: HarnessEquilibrium) -> Poses:
     return Poses(*Bodies.of(harness).followed(Bodies.of(guess.harness), guess.positions, guess.frames))
 
 
-def _structures(harness: Harness, counts: Sequence[int] | None = None) -> list[Scene]:
+def clamped_rods(harness: Harness, counts: Sequence[int] | None = None) -> list[Scene]:
     """The scenes of the rods with clamps, at no place in particular, where their ends are joints; `counts`: of elements
     of each rod, where they are known.
     """
@@ -264,7 +264,7 @@ def _solved(
     shape: Guess | None = None,
 ) -> HarnessEquilibrium:
     """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
-    structures = _structures(harness, [options.segments for options in all_options])
+    structures = clamped_rods(harness, [options.segments for options in all_options])
     members = _members(structures, all_options)
     starts = []
     for group in members:
@@ -605,6 +605,15 @@ def finer_meshes(
 def differentiable_harness(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
     """What a search found, with the derivatives by the harness that the search for it has not."""
     return result if is_known(harness) else _differentiable(harness, result)
+
+
+def differentiable_by(subject: Scene | Harness, result: Solution) -> Any:
+    """The same of a scene or a harness."""
+    if isinstance(subject, Harness):
+        assert isinstance(result, HarnessEquilibrium)
+        return differentiable_harness(subject, result)
+    assert isinstance(result, Equilibrium)
+    return differentiable(subject, result)
 
 
 @eqx.filter_custom_jvp

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
+from rodjax.model.scene import Scene
 from rodjax.solving.result import Described, Equilibrium, describe
 from rodjax.solving.rod_contact_results import RodContacts, rod_contacts
 from rodjax.solving.status import Status
@@ -147,6 +148,21 @@ class HarnessEquilibrium(Described):
                 force = np.linalg.norm(found.forces.sum(0))
                 told.append(f"{first} and {second} touch, {where}, and push one another with {force:.4g} N")
         return told if told else ["no rods touch one another"]
+
+
+Solution = Equilibrium | HarnessEquilibrium
+
+
+def solved_in(result: Solution) -> Scene | Harness:
+    """Of which an equilibrium is."""
+    return result.scene if isinstance(result, Equilibrium) else result.harness
+
+
+def rods_of(result: Solution) -> dict[str, Equilibrium]:
+    """Its rods, by what the names of their quantities begin with: nothing where there is only one."""
+    if isinstance(result, Equilibrium):
+        return {"": result}
+    return {f"{name}: ": rod for name, rod in result.items()}
 
 
 def _range(name: str, s: np.ndarray) -> str:

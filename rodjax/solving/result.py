@@ -408,9 +408,9 @@ def over_leading_axes(function: Callable, *, is_patient: bool = True) -> Callabl
     """
 
     @functools.wraps(function)
-    def mapped(equilibrium: Equilibrium, *shared: Any):
+    def mapped(equilibrium: Any, *shared: Any):
         mapped = function
-        for _ in range(equilibrium.s.ndim - 1):
+        for _ in range(equilibrium.status.ndim):
             mapped = jax.vmap(mapped, in_axes=(0, *[None] * len(shared)))
         return mapped(equilibrium, *shared)
 

@@ -22,6 +22,11 @@ need more again on meshes 2, 4, 8, ... times as fine. What misses `rtol` on the 
 `parameters/<key>` in SI units; each has the attributes `units` and `description`. Attributes of the file: the texts
 `scene` and `over`, and what is in `rodjax.sweeps.manifest.Manifest`, with its `fingerprint`.
 
+**Of a harness** (`rodjax.io.harness_file`) keys begin with `cables.NAME` or `joints.NAME`: `cables.trunk.rod.EI`,
+`joints.y.mass`. What is of a rod is then in groups, `cables/NAME/end_force`, and there is `joints/NAME/position`;
+`energy`, `status` and the like are those of the whole, the errors those of the cable whose are largest; `segments` is
+that of every cable. In tables columns are `cables.NAME.end_force.0 [N]`. Cases are solved one after another.
+
 Further quantities are written where they are asked for (`also=["bend_radius", "clip_forces"]`, `--also
 bend_radius,clip_forces`): `bend_radius` the smallest one of the centerline, `clearance` to each obstacle, `clip_forces`
 and `clip_moments` of each clip, `obstacle_forces` of each obstacle, `largest_tension`, `least_tension`,

@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rodjax.checks import line, shown
+from rodjax.io.harness_file import HarnessFile
 from rodjax.io.quantities import SceneFileError
 from rodjax.io.scene_file import SceneFile, read_text, toml_tables
 from rodjax.io.scene_keys import SceneVariations, cell, check_keys, si_number
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.programs.tasks import rows_of
 
@@ -185,17 +187,17 @@ class CaseScenes:
     def __init__(self, scene: Path, over: Path, variations: SceneVariations):
         self._scene, self._over, self._variations = scene, over, variations
 
-    def read(self, case: int, values: Mapping[str, np.ndarray], row: int) -> SceneFile:
+    def read(self, case: int, values: Mapping[str, np.ndarray], row: int) -> SceneFile | HarnessFile:
         """Of one case, whose values are in a row."""
         try:
             return self._variations.read({key: numbers[row] for key, numbers in values.items()})
         except SceneFileError as mistake:
             raise SweepError(f"{self._over}: case {case}: {mistake} (in {self._scene} with these values)") from None
 
-    def scenes(self, cases: Int[np.ndarray, "k"], values: Mapping[str, np.ndarray]) -> list[Scene]:
+    def scenes(self, cases: Int[np.ndarray, "k"], values: Mapping[str, np.ndarray]) -> list[Any]:
         return [self.read(int(case), values, row).scenes[0] for row, case in enumerate(cases)]
 
-    def stacked(self, cases: Int[np.ndarray, "k"], values: Mapping[str, np.ndarray], size: int) -> Scene:
+    def stacked(self, cases: Int[np.ndarray, "k"], values: Mapping[str, np.ndarray], size: int) -> Scene | Harness:
         """Of all cases, along a leading axis; so many, of which those that lack are the last case.
 
         Of many they are made column by column, and read one by one only where they may make no sense.
@@ -229,11 +231,11 @@ class CaseReader:
         self.first = self.of_cases.read(0, self.cases.of(np.array([0])), 0)
         variations.in_si()
 
-    def scenes(self, cases: Int[np.ndarray, "k"]) -> list[Scene]:
+    def scenes(self, cases: Int[np.ndarray, "k"]) -> list[Any]:
         return self.of_cases.scenes(cases, self.cases.of(cases))
 
 
-def _stacked(scenes: list[Scene]) -> Scene:
+def _stacked(scenes: list[Any]) -> Any:
     """One scene with a leading axis on every leaf. What many scenes share is one array, which is looked at once."""
     known: dict[int, np.ndarray] = {}
 

@@ -1,5 +1,6 @@
 """The cases of one chunk of a sweep, solved: what one thread, process or machine does of it."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -9,8 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rodjax.io.files import FIELDS
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_batch
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution
 from rodjax.solving.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
 from rodjax.solving.result import (
     Equilibrium,
@@ -25,10 +28,9 @@ from rodjax.sweeps.manifest import Manifest
 from rodjax.sweeps.quantities import QUANTITIES
 from rodjax.warn import silenced
 
-RESULTS = (
-    *("status", "converged", "stable", "iterations", "residual", "energy", "elastic_energy"),
-    *("total_twist", "start_force", "start_moment", "end_force", "end_moment", "nodes"),
-)
+# Of the whole, and of each rod.
+RESULTS = ("status", "converged", "stable", "iterations", "residual", "energy")
+OF_ROD = ("elastic_energy", "total_twist", "start_force", "start_moment", "end_force", "end_moment", "nodes")
 # Estimated errors of the mesh, each relative as in `Equilibrium`.
 ERRORS = ("error_estimate", "force_error", "moment_error", "curvature_error")
 DESCRIPTIONS = FIELDS | {
@@ -37,7 +39,8 @@ DESCRIPTIONS = FIELDS | {
     "force_error": ("1", "of the mesh: largest error of the force, by the largest force in the rod"),
     "moment_error": ("1", "of the mesh: largest error of the moment, by the largest moment in the rod"),
     "curvature_error": ("1", "of the mesh: largest error of the curvature, by the largest curvature"),
-    "segments": ("1", "of the mesh on which the case was solved"),
+    "segments": ("1", "of the mesh on which the case was solved, of a harness that of each cable"),
+    "position": ("m", "of the joint"),
     **{name: (quantity.unit, quantity.description) for name, quantity in QUANTITIES.items()},
 }
 
@@ -74,14 +77,29 @@ def solved_chunk(chunk: Chunk) -> dict[str, np.ndarray]:
     return {"case": cases} | arrays | {f"parameters/{key}": values for key, values in chunk.values.items()}
 
 
-def _values(result: Equilibrium, manifest: Manifest) -> dict[str, np.ndarray]:
-    also = {name: np.asarray(QUANTITIES[name].of(result)) for name in manifest.quantities}
-    return {name: np.asarray(getattr(result, name)) for name in RESULTS} | _errors(result) | also
+def _values(result: Solution, manifest: Manifest) -> dict[str, np.ndarray]:
+    arrays = {name: np.asarray(getattr(result, name)) for name in RESULTS}
+    rods = _rods_of(result)
+    for prefix, rod in rods.items():
+        arrays |= {f"{prefix}{name}": np.asarray(getattr(rod, name)) for name in OF_ROD}
+        arrays |= {f"{prefix}{name}": np.asarray(QUANTITIES[name].of(rod)) for name in manifest.quantities}
+    if isinstance(result, HarnessEquilibrium):
+        arrays |= {f"joints/{name}/position": np.asarray(body.position) for name, body in result.joints.items()}
+    # Of a harness those of the rod whose are largest.
+    each = [_errors(rod) for rod in rods.values()]
+    return arrays | {name: functools.reduce(np.maximum, [errors[name] for errors in each]) for name in ERRORS}
 
 
-def _errors(result: Equilibrium) -> dict[str, np.ndarray]:
+def _rods_of(result: Solution) -> dict[str, Equilibrium]:
+    """By what the names of their datasets begin with."""
+    if isinstance(result, Equilibrium):
+        return {"": result}
+    return {f"cables/{name}/": rod for name, rod in result.items()}
+
+
+def _errors(rod: Equilibrium) -> dict[str, np.ndarray]:
     """All estimated errors at once: each property of a result would compute the estimate anew."""
-    errors = estimated_errors(result)
+    errors = estimated_errors(rod)
     shape = np.max(np.linalg.norm(errors.nodes, axis=-1), axis=-1)
     sections = (np.asarray(error) for error in (errors.force, errors.moment, errors.curvature))
     return dict(zip(ERRORS, (shape, *sections), strict=True))
@@ -94,12 +112,13 @@ def error_by_rtol(arrays: Arrays) -> Float[np.ndarray, "k"]:
 
 
 def _refined(
-    arrays: Arrays, scenes: Scene, result: Equilibrium, manifest: Manifest, settings: dict[str, Any]
+    arrays: Arrays, scenes: Scene | Harness, result: Solution, manifest: Manifest, settings: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """With the cases whose estimated error is above `rtol` solved again, on finer meshes, each from the last one."""
     arrays = {name: values.copy() for name, values in arrays.items()}
     segments, rtol, finest = manifest.segments, manifest.rtol, SIZES[manifest.discretization][-1]
-    s, cases = np.asarray(result.s), np.arange(len(arrays["segments"]))
+    s = {prefix: np.asarray(rod.s) for prefix, rod in _rods_of(result).items()}
+    cases = np.arange(len(arrays["segments"]))
     while True:
         error = error_by_rtol(arrays)[cases]
         which = np.flatnonzero(arrays["converged"][cases] & ~(error <= rtol))
@@ -111,9 +130,9 @@ def _refined(
         settings = settings | {"segments": segments}
         result = solve_batch(scenes, guess=result, **settings)
         found = _values(result, manifest) | {
-            "nodes": _nodes_at(result, s[cases]),
-            "segments": np.full(len(cases), segments),
+            f"{prefix}nodes": _nodes_at(rod, s[prefix][cases]) for prefix, rod in _rods_of(result).items()
         }
+        found["segments"] = np.full(len(cases), segments)
         # What does not converge on a finer mesh stays as it was, above `rtol`.
         better = np.flatnonzero(found["converged"])
         for name, values in found.items():
@@ -121,7 +140,7 @@ def _refined(
         cases, (scenes, result) = cases[better], _rows((scenes, result), better)
 
 
-def _rows(stacks: tuple[Scene, Equilibrium], which: Int[np.ndarray, "k"]) -> tuple[Scene, Equilibrium]:
+def _rows(stacks: tuple[Any, Any], which: Int[np.ndarray, "k"]) -> tuple[Any, Any]:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[which], stacks)
 
 

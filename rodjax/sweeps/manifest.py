@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,8 @@ FORMAT = 4
 
 class Manifest(NamedTuple):
     """All that the result depends on. `scene_sha256` and `over_sha256` are of the texts; `shard` is i/n; `rtol` is 0
-    where the mesh is given; `also`: names of further quantities, with commas.
+    where the mesh is given; `also`: names of further quantities, with commas; `cables`, `joints`: names of those of a
+    harness, as JSON.
     """
 
     scene_sha256: str
@@ -38,6 +39,8 @@ class Manifest(NamedTuple):
     jaxlib: str
     platform: str
     also: str = ""
+    cables: str = "[]"
+    joints: str = "[]"
 
     @property
     def fingerprint(self) -> str:
@@ -57,6 +60,17 @@ class Manifest(NamedTuple):
     def quantities(self) -> list[str]:
         """Names of those that are written beside the results of every sweep."""
         return [name for name in self.also.split(",") if name]
+
+    @property
+    def prefixes(self) -> list[str]:
+        """What the names of the datasets of each rod begin with."""
+        return [f"cables/{name}/" for name in json.loads(self.cables)] or [""]
+
+    def names(self, of_whole: Sequence[str], of_rod: Sequence[str]) -> list[str]:
+        """Of the datasets of the whole and of each rod."""
+        of_joints = [f"joints/{name}/position" for name in json.loads(self.joints)]
+        of_rods = [f"{prefix}{name}" for prefix in self.prefixes for name in (*of_rod, *self.quantities)]
+        return [*of_whole, *of_rods, *of_joints]
 
     @property
     def rows(self) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 from rodjax.analysis.clearance import clearance
 from rodjax.analysis.curvature import curvature_along
 from rodjax.checks import sequence, shown
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.solving.result import Equilibrium, over_leading_axes
 from rodjax.sweeps.cases import SweepError
@@ -60,8 +61,9 @@ QUANTITIES = {
 }
 
 
-def checked_quantities(names: Any, scene: Scene) -> tuple[str, ...]:
-    """The names, where there are such quantities of the scene. Raises `SweepError`."""
+def checked_quantities(names: Any, scene: Scene | Harness) -> tuple[str, ...]:
+    """The names, where there are such quantities of the scene, or of all cables. Raises `SweepError`."""
+    rods = {"": scene} if isinstance(scene, Scene) else dict(zip(scene.names, scene.scenes, strict=True))
     try:
         given: Sequence[Any] = sequence(names, "also", "names of quantities")
     except TypeError as error:
@@ -70,10 +72,11 @@ def checked_quantities(names: Any, scene: Scene) -> tuple[str, ...]:
         if not isinstance(name, str) or name not in QUANTITIES:
             raise SweepError(f"also must be some of {', '.join(QUANTITIES)}, got {shown(name)}")
         for need in QUANTITIES[name].needs:
-            owner = scene.rod if need.startswith("rod.") else scene
-            value = getattr(owner, need.removeprefix("rod."))
-            if value is None or (isinstance(value, tuple) and not value):
-                raise SweepError(f"also: {name} needs a scene with {need}, got one without")
+            for cable, own in rods.items():
+                value = getattr(own.rod if need.startswith("rod.") else own, need.removeprefix("rod."))
+                if value is None or (isinstance(value, tuple) and not value):
+                    of_cable = f": the cable {cable!r}" if cable else ""
+                    raise SweepError(f"also: {name} needs a scene with {need}, got one without{of_cable}")
     if len({*given}) < len(given):
         raise SweepError(f"also must be different names, got {', '.join(given)}")
     return tuple(given)

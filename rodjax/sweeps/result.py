@@ -17,7 +17,7 @@ from rodjax.checks import file_path
 from rodjax.io.scene_keys import unit_of
 from rodjax.solving.status import Status
 from rodjax.sweeps.cases import SweepError
-from rodjax.sweeps.chunk import DESCRIPTIONS, ERRORS, INTEGERS, RESULTS, Arrays, error_by_rtol
+from rodjax.sweeps.chunk import DESCRIPTIONS, ERRORS, INTEGERS, OF_ROD, RESULTS, Arrays, error_by_rtol
 from rodjax.sweeps.manifest import Manifest, differences, manifest_of, opened
 
 PARQUET_SUFFIX = ".parquet"
@@ -93,7 +93,8 @@ def arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> dic
 
     with opened(path) as file:
         file.visititems(add)
-    missing = [name for name in ("case", "segments", *RESULTS, *ERRORS, *manifest.quantities) if name not in arrays]
+    names = manifest.names(("case", "segments", *RESULTS, *ERRORS), OF_ROD)
+    missing = [name for name in names if name not in arrays]
     if missing:
         raise SweepError(f"{path} is damaged: it lacks {', '.join(missing)}")
     if not np.array_equal(arrays["case"], cases):
@@ -107,12 +108,18 @@ def arrays(path: Path, manifest: Manifest, chunk: int, position: int = 0) -> dic
 
 def _kind_and_shape(name: str, values: np.ndarray, manifest: Manifest) -> tuple[str, tuple[int, ...]]:
     """What NumPy calls the numbers of a dataset, and their shape for each case."""
-    if name.startswith("parameters/") or name in manifest.quantities:
+    is_parameter, name = name.startswith("parameters/"), _field(name)
+    if is_parameter or name in manifest.quantities:
         return "f", values.shape[1:]
     kind = "b" if name in ("converged", "stable") else "i" if name in INTEGERS else "f"
     if name == "nodes":
         return kind, (manifest.segments + 1, 3)
-    return kind, (3,) if name.endswith(("_force", "_moment")) else ()
+    return kind, (3,) if name.endswith(("_force", "_moment", "position")) else ()
+
+
+def _field(name: str) -> str:
+    """What a dataset is, of whichever cable or joint."""
+    return name.rpartition("/")[2]
 
 
 def assemble(
@@ -150,7 +157,7 @@ def _dataset(file: h5py.File, name: str, rows: int, values: np.ndarray) -> h5py.
         unit = unit_of(name.removeprefix("parameters/"))
         dataset.attrs["units"], dataset.attrs["description"] = unit, "value of this key of the scene file"
     else:
-        dataset.attrs["units"], dataset.attrs["description"] = DESCRIPTIONS[name]
+        dataset.attrs["units"], dataset.attrs["description"] = DESCRIPTIONS[_field(name)]
     return dataset
 
 
@@ -163,11 +170,12 @@ def columns(sweep: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
 
     def add(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and name != "nodes":
+        if isinstance(entry, h5py.Dataset) and _field(name) != "nodes":
             unit, values = entry.attrs["units"], entry[()]
             for index in np.ndindex(values.shape[1:]):
                 place = "".join(f".{k}" for k in index)
-                found[f"{name.removeprefix('parameters/')}{place} [{unit}]"] = values[(slice(None), *index)]
+                column = name.removeprefix("parameters/") if name.startswith("parameters/") else name.replace("/", ".")
+                found[f"{column}{place} [{unit}]"] = values[(slice(None), *index)]
 
     with opened(file_path(sweep, "sweep")) as file:
         Manifest.of(file.attrs, Path(sweep))

@@ -18,11 +18,14 @@ import numpy as np
 from rodjax.atomic_write import replace_file, seal
 from rodjax.checks import file_path, whole_number
 from rodjax.file_lock import LockedError, locked
+from rodjax.io.harness_file import HarnessFile
 from rodjax.io.scene_file import SceneFile
+from rodjax.model.harness import Harness
 from rodjax.model.scene import check_without_friction
 from rodjax.notes import bar, told
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
 from rodjax.solving.equilibrium import DEFAULT_RTOL
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.solve import solve
 from rodjax.sweeps.cases import MAX_CASES, CaseReader, SweepError
@@ -43,7 +46,7 @@ DEFAULT_CHUNK = 1024
 
 def _manifest(reader: CaseReader, shard: tuple[int, int], chunk: int | None) -> Manifest:
     """What is to be solved, but for the mesh."""
-    count = reader.cases.count
+    count, scene = reader.cases.count, reader.first.scenes[0]
     return Manifest(
         scene_sha256=sha256(reader.scene_text),
         over_sha256=sha256(reader.over_text),
@@ -59,16 +62,27 @@ def _manifest(reader: CaseReader, shard: tuple[int, int], chunk: int | None) -> 
         version=__version__,
         jaxlib=importlib.metadata.version("jaxlib"),
         platform=jax.default_backend(),
+        cables=json.dumps(_checked_names(scene.names) if isinstance(scene, Harness) else ()),
+        joints=json.dumps(_checked_names(scene.joint_names) if isinstance(scene, Harness) else ()),
     )
 
 
-def _with_mesh(manifest: Manifest, first: SceneFile) -> Manifest:
+def _checked_names(names: Sequence[str]) -> Sequence[str]:
+    for name in names:
+        if "/" in name or name in ("", ".", ".."):
+            raise SweepError(f"names of cables and joints must be those of groups of HDF5, without /, got {name!r}")
+    return names
+
+
+def _with_mesh(manifest: Manifest, first: SceneFile | HarnessFile) -> Manifest:
     """The mesh of the scene file, or one on which the first case has the error that is asked for."""
     if first.segments is not None:
         return manifest._replace(segments=first.segments, discretization=first.discretization or "hermite")
     # As a case of the sweep it is counted, and has its errors.
     with silenced(NotConvergedWarning, OverstretchedWarning, MeshWarning):
         result = solve(first.scenes[0], rtol=manifest.rtol, discretization=first.discretization)
+    if isinstance(result, HarnessEquilibrium):
+        return manifest._replace(segments=max(result.segments), discretization="hermite")
     return manifest._replace(segments=result.s.shape[-1] - 1, discretization=result.discretization)
 
 
@@ -95,7 +109,7 @@ def sweep(
 
     **Arguments:**
 
-    - `scene`: a scene file without `[[path]]`.
+    - `scene`: a scene file without `[[path]]`, or the file of a harness.
     - `over`: `.toml`, a grid, or `.csv`, a table.
     - `output`: the `.h5` file to write; it appears when all is done.
     - `shard`: `(i, n)`: only chunk i of every n, from 1; `rodjax merge` puts the n results together. For array jobs,
@@ -126,7 +140,8 @@ def sweep(
     executor, threads = checked_executor(executor), checked_threads(threads)
     reader = CaseReader(file_path(scene, "scene"), file_path(over, "over"))
     try:
-        check_without_friction(reader.first.scenes[0], "a sweep")
+        if isinstance(reader.first, SceneFile):  # rods of harnesses have none
+            check_without_friction(reader.first.scenes[0], "a sweep")
     except ValueError as error:
         raise SweepError(f"{scene}: {error}") from None
     parts = output.with_name(output.name + ".parts")

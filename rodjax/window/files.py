@@ -12,10 +12,11 @@ from rodjax.io.scene_writing import scene_text
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp
+from rodjax.solving.harness_result import solved_in
 from rodjax.solving.result import Equilibrium
 from rodjax.window.controls import rods_of
 from rodjax.window.reading import Shown
-from rodjax.window.session import Session, scene_in
+from rodjax.window.session import Session
 
 # By the length: shapes further apart than this are two.
 SAME_SHAPE = 1e-3
@@ -27,7 +28,7 @@ def scene_file(session: Session) -> tuple[bytes, str]:
     """
     found = _rods(session.result)
     turns = np.zeros(len(found))
-    scene = _with_turns(scene_in(session.result), turns)
+    scene = _with_turns(solved_in(session.result), turns)
     cold = session.solved(scene, None)
     twists = [float(rod.total_twist) - float(other.total_twist) for rod, other in zip(found, _rods(cold), strict=True)]
     states = [rod.turns is not None for rod in rods_of(scene).values()]

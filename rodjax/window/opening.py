@@ -10,17 +10,16 @@ from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene
 from rodjax.notes import in_notebook
 from rodjax.routing.limits import Limits
+from rodjax.routing.margins import CLEARANCE
 from rodjax.routing.route import Route
 from rodjax.routing.tolerances import Envelope
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_result import HarnessEquilibrium, solved_in
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.window.browser import Window
-from rodjax.window.session import SEGMENTS, Session, rows_in, scene_in
+from rodjax.window.session import SEGMENTS, Session, rows_in
 
 # Rods of an envelope that are drawn at random and shown.
 DRAWN = 60
-# What the names of margins from obstacles begin with.
-CLEARANCE = "clearance to "
 Shown = Scene | Harness | Equilibrium | HarnessEquilibrium | Route | Envelope
 
 
@@ -111,8 +110,8 @@ def session_of(shown: Shown, segments: int | None, strain_limit: float = DEFAULT
         return session
     if isinstance(shown, Envelope):
         scattering, margins = shown.scattering, shown.margins
-        names = () if margins is None else [name for name in margins.names if name.startswith(CLEARANCE)]
-        names = [name.removeprefix(CLEARANCE) for name in names]
+        told = () if margins is None else [name.partition(CLEARANCE) for name in margins.names]
+        names = list(dict.fromkeys(obstacle for _, clearance, obstacle in told if clearance))
         session = _beside(scattering.equilibrium, segments, strain_limit, scattering.obstacles, names)
         session.add_recorded(session.solved_in_turn(shown.drawn(DRAWN), session.result, is_path=False))
         return session
@@ -125,22 +124,26 @@ def session_of(shown: Shown, segments: int | None, strain_limit: float = DEFAULT
         raise ValueError("shown must be of elements or finite differences, got one of the continuum")
     last = jax.tree.map(lambda leaf: leaf[-1], shown) if axes else shown
     if segments is None:
-        meshes = [last.s.shape[-1] - 1] if isinstance(last, Equilibrium) else last.segments
-        segments = max(meshes)
-    session = Session(scene_in(last), segments=segments, guess=last, strain_limit=strain_limit)
+        segments = _mesh_of(last)
+    session = Session(solved_in(last), segments=segments, guess=last, strain_limit=strain_limit)
     if axes:
         session.add_recorded(rows_in(shown))
     return session
 
 
+def _mesh_of(result: Equilibrium | HarnessEquilibrium) -> int:
+    """The most segments of its rods."""
+    return result.s.shape[-1] - 1 if isinstance(result, Equilibrium) else max(result.segments)
+
+
 def _beside(
-    result: Equilibrium,
+    result: Equilibrium | HarnessEquilibrium,
     segments: int | None,
     strain_limit: float,
     obstacles: Sequence[Obstacle],
     names: Sequence[str],
 ) -> Session:
     """A session that begins with a result beside obstacles that do not touch it."""
-    segments = result.s.shape[-1] - 1 if segments is None else segments
+    segments = _mesh_of(result) if segments is None else segments
     beside = dict(zip(names, obstacles, strict=True))
-    return Session(scene_in(result), segments=segments, guess=result, strain_limit=strain_limit, beside=beside)
+    return Session(solved_in(result), segments=segments, guess=result, strain_limit=strain_limit, beside=beside)

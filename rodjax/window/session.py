@@ -20,6 +20,7 @@ from rodjax.model.supports import Directed
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import compiled_only
 from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.harness_result import solved_in
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
     Equilibrium,
@@ -314,10 +315,10 @@ class Session:
         """Takes equilibria of the structure of this scene for what was recorded."""
         self.recorded = []
         for one in itertools.islice(steps, MOST_RECORDED):
-            scene = without_turns(movable(scene_in(one)))
+            scene = without_turns(movable(solved_in(one)))
             self.recorded.append(Moment(scene, controls_of(scene), one))
 
-    def solved_in_turn(self, scenes: Scene, guess: Any, *, is_path: bool) -> Iterator[Any]:
+    def solved_in_turn(self, scenes: Scene | Harness, guess: Any, *, is_path: bool) -> Iterator[Any]:
         """The equilibria of stacked scenes, each from the last one of a path, else all from the guess; without those
         that have none.
         """
@@ -339,11 +340,6 @@ def rows_in(stack: Any) -> Iterator[Any]:
     stack = jax.tree.map(np.asarray, stack)
     for k in range(len(jax.tree.leaves(stack)[0])):
         yield jax.tree.map(lambda x, k=k: leaf(x[k]), stack)
-
-
-def scene_in(shown: Shown) -> Scene | Harness:
-    """Of which an equilibrium is."""
-    return shown.scene if isinstance(shown, Equilibrium) else shown.harness
 
 
 def movable(scene: Any) -> Any:

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -65,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _parser().parse_args(argv)
         _set_up_jax()
         # A window lives for hours, and tells of each of its solves.
-        with contextlib.nullcontext() if arguments.run is _view else told(None):
+        has_window = arguments.run is _view or getattr(arguments, "view", False)
+        with contextlib.nullcontext() if has_window else told(None):
             code = arguments.run(arguments)
         sys.stdout.flush()
         return code
@@ -129,18 +131,22 @@ def _add_view(commands: Any) -> None:
         type=Path,
         help=f"of a rod or a harness; or a result{SUFFIX}, such as a recording",
     )
-    view.add_argument(
+    _add_window(view)
+    view.set_defaults(run=_view)
+
+
+def _add_window(command: Any) -> None:
+    command.add_argument(
         "--port", metavar="N", type=_port, default=8080, help="of the window; 0 for any that is free; 8080"
     )
-    view.add_argument(
+    command.add_argument(
         "--host",
         metavar="ADDRESS",
         default="127.0.0.1",
         help="address to listen on: by default this machine only; whoever reaches it can move the rod",
     )
-    view.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
-    view.add_argument("--dark", action="store_true", help="a dark page")
-    view.set_defaults(run=_view)
+    command.add_argument("--no-browser", action="store_true", help="do not open it in the browser")
+    command.add_argument("--dark", action="store_true", help="a dark page")
 
 
 def _add_sweep(commands: Any) -> None:
@@ -196,6 +202,8 @@ def _add_report(commands: Any) -> None:
     route.add_argument("--out", metavar="DIR", type=Path, default=Path("rodjax-route"), help="folder for the results")
     route.add_argument("--starts", metavar="N", type=_chunk, help="starting points of the search; 16")
     _add_scheduler(route)
+    route.add_argument("--view", action="store_true", help="show the designs of the search in a window, as view does")
+    _add_window(route.add_argument_group("the window of --view"))
     route.set_defaults(run=_route)
 
 
@@ -359,7 +367,7 @@ def _file_to_view(path: Path) -> SceneFile | HarnessFile | rodjax.Equilibrium | 
 
 def _view(arguments: argparse.Namespace) -> int:
     file = _file_to_view(arguments.scene)
-    from rodjax.window.opening import session_of, show  # takes a second, which the other commands need not wait for
+    from rodjax.window.opening import session_of  # takes a second, which the other commands need not wait for
 
     with warnings.catch_warnings():
         for category in (NotConvergedWarning, OverstretchedWarning, MeshWarning):
@@ -375,11 +383,18 @@ def _view(arguments: argparse.Namespace) -> int:
         except ValueError as error:
             print(f"rodjax: {arguments.scene}: {' '.join(str(error).split())}", file=sys.stderr)
             return 3
+    _show(session, arguments)
+    return 0
+
+
+def _show(session: Any, arguments: argparse.Namespace, limits: rodjax.Limits | None = None) -> None:
+    """A session in its window, until Ctrl-C."""
+    from rodjax.window.opening import show
+
     try:
-        show(session, arguments.port, arguments.host, not arguments.no_browser, dark=arguments.dark)
+        show(session, arguments.port, arguments.host, not arguments.no_browser, limits=limits, dark=arguments.dark)
     except ImportError as error:
         raise CommandError(str(error)) from None
-    return 0
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
@@ -535,6 +550,8 @@ def _route(arguments: argparse.Namespace) -> int:
     from rodjax.routing.outcome import starts_table, written_route
 
     _check_folder(arguments.out, "--out")
+    if arguments.view and find_spec("viser") is None:
+        raise CommandError("--view needs viser, got none: pip install 'rodjax[view]'")
     file = read_route_file(arguments.file, for_route=True)
     (scene,) = file.cables.values()
     starts = arguments.starts or file.starts
@@ -569,11 +586,20 @@ def _route(arguments: argparse.Namespace) -> int:
     )
     print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
     written = [*report.save(arguments.out), *written_route(route, arguments.out)]
-    print(f"\nwritten: {', '.join(map(str, written))}")
-    if route.feasible:
-        return 0
-    print(f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr)
-    return 3
+    print(f"\nwritten: {', '.join(map(str, written))}", flush=True)
+    if not route.feasible:
+        print(
+            f"rodjax: {arguments.file}: no route was found that keeps to all limits; {report.verdict}", file=sys.stderr
+        )
+    if arguments.view:
+        from rodjax.window.opening import session_of
+
+        with warnings.catch_warnings():
+            for category in (NotConvergedWarning, OverstretchedWarning, MeshWarning):
+                warnings.simplefilter("ignore", category)  # said by the window
+            session = session_of(route, None)
+        _show(session, arguments, route.limits)
+    return 0 if route.feasible else 3
 
 
 def _source(path: Path, *scenes: SceneFile | HarnessFile) -> str:

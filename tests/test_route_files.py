@@ -368,9 +368,22 @@ def test_a_report_of_a_route_knows_what_was_asked(found, files):
     assert set(wider.margins) == {"bend radius"}
 
 
-def test_a_route_that_is_not_found_exits_with_3(found, files, capsys):
+def test_a_route_that_is_not_found_exits_with_3(found, files, capsys, monkeypatch):
+    """With --view it is shown all the same."""
+    monkeypatch.setattr("rodjax.cli.find_spec", lambda name: None)
+    assert main(["route", "brake_line.toml", "--view"]) == 2
+    assert "--view needs viser, got none: pip install 'rodjax[view]'" in capsys.readouterr().err
+    assert not found  # nothing was sought
+    shown = []
+    monkeypatch.setattr("rodjax.cli.find_spec", lambda name: name)
+    monkeypatch.setattr("rodjax.window.opening.session_of", lambda route, segments: route)
+    monkeypatch.setattr("rodjax.window.opening.show", lambda *args, **options: shown.append((args, options)))
     found["feasible"] = False
-    assert main(["route", "brake_line.toml"]) == 3
+    assert main(["route", "brake_line.toml", "--view", "--port", "0", "--no-browser"]) == 3
+    (((route, port, host, is_opened), options),) = shown
+    assert isinstance(route, rj.Route)
+    assert (port, host, is_opened) == (0, "127.0.0.1", False)
+    assert options["limits"] is route.limits
     out, err = capsys.readouterr()
     assert out.startswith("No route was found that keeps to all limits")
     assert err.startswith("rodjax: brake_line.toml: no route was found that keeps to all limits; ")

@@ -347,9 +347,24 @@ def test_a_harness_is_taken_in_the_hand(tmp_path):
     assert gravity[2] == pytest.approx(-0.9 * 9.81)
     refused = session.move({"right/end": ((math.nan, 0.0, 0.0), None)})
     assert "right/end.position must be finite" in refused.message
+    assert session.can_settle
+    unit = float(cable.bending_scale)  # EI/L^2, as L = 1 m
+    session.softest = 0.4 * unit
+    assert session.is_soft
+    found = {row.label: row for row in rows(session, refused)}
+    assert found["softest motion"].text.endswith("about to snap")
+    assert found["softest motion"].is_bad
+    session.softest = 0.6 * unit
+    assert not session.is_soft
     labels = [row.label for row in rows(session, refused)]
     assert "left: bend radius" in labels
     assert len(set(labels)) == len(labels)
+    assert "left: end moment" not in labels
+    limited = {row.label: row for row in rows(session, refused, rj.Limits(end_moment=1e-6, end_force=1e3))}
+    assert limited["left: end moment"].is_bad
+    (force,) = (row for label, row in limited.items() if label.startswith("left: force, "))
+    assert force.text.endswith(" of at most 1000 N")
+    assert not force.is_bad
     content, _ = path_file(session)
     (tmp_path / "path.vtkhdf").write_bytes(content)
     replayed = session_of(rj.load(tmp_path / "path.vtkhdf"), None)
@@ -401,6 +416,13 @@ def test_a_floor_under_a_harness_lifts_all_its_rods():
         assert before < -0.2
         assert float(np.min(found.nodes[:, 2])) == pytest.approx(-0.15 + radius, abs=1e-3)
         assert float(np.sum(found.contact_forces[:, 2])) > 0
+    shown = {row.label: row for row in rows(session, report, rj.Limits(clearance=0.01))}
+    for name in session.result:
+        # Of ball, box and floor the floor is nearest, as it is touched.
+        (row,) = (row for label, row in shown.items() if label.startswith(f"{name}: clearance, "))
+        assert "pushed by" in row.text
+        assert row.is_bad
+    assert session.settle() == pytest.approx(float(rj.lowest_mode(session.result).stiffness))
     session.undo()
 
 

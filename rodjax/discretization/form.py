@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -164,6 +165,10 @@ class Form(eqx.Module):
         """The changes of a step beside rotations and forces, from its multipliers; `None` without such unknowns."""
         return None
 
+    def scaled(self, others: Any, motion: Any, multipliers: Any) -> Any:
+        """`others` of a step with these parts of their motions and of their multipliers."""
+        return jax.tree.map(lambda change: motion * change, others)
+
     @abstractmethod
     def in_plane(self, point: Any, normal: Float[Array, "3"], axes: Float[Array, "3 2"]) -> tuple["Form", Any]:
         """The form of a rod that stays in the plane of two axes, and the point projected into it."""
@@ -204,8 +209,8 @@ class Form(eqx.Module):
         """The point from which the search goes on, updated by its linearisation."""
         return point
 
-    def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
-        """The merit that a step from `point` has to lower, at the linearisation it leads to."""
+    def objective(self, here: Linearization, point: Any, others: Any) -> Float[Array, ""]:
+        """The merit that a step from `point` has to lower, with its `others`, at a linearisation along it."""
         return here.energy
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:

@@ -60,6 +60,10 @@ from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
 TOUCHES = 1e-2
+# Compliance of contacts in the merit of a step [L^3/EI]. A step goes along tangent planes, and a node that slides on a
+# surface leaves it by the square of its way: with the stiffness that contacts have in the model, the merit would refuse
+# all but short steps.
+MERIT_COMPLIANCE = 1e-4
 
 
 class NodalForm(PositionForm):
@@ -174,16 +178,18 @@ class NodalForm(PositionForm):
 
     # --- the search --------------------------------------------------------------------------------------------------
 
-    def objective(self, here: Linearization, point: Any) -> Float[Array, ""]:
-        """L with the contact energy of the model, with the pressures of `point`."""
+    def scaled(self, others: NodalChange, motion: Any, multipliers: Any) -> NodalChange:
+        return NodalChange(motion * others.displacements, multipliers * others.pressures)
+
+    def objective(self, here: Linearization, point: Any, others: NodalChange) -> Float[Array, ""]:
+        """L with the energy of contacts as soft as `MERIT_COMPLIANCE`, with the pressures after the step."""
         assert here.gaps is not None
-        assert isinstance(here.system, ChainSystem)
-        contact_compliance = here.system.contacts.contact_compliance
         model = contact_model(self, point, here.gaps, here.reference_displacements)
-        return here.energy + model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
+        pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE
+        return here.energy + model.energy(pushing, jnp.asarray(MERIT_COMPLIANCE, pushing.dtype))
 
     def contact_energy(self, there: Any, point: Any) -> Float[Array, ""]:
-        """The contact energy of `objective` at a trial of a step from `point`."""
+        """The contact energy of the model of a step from `point` at a trial of it, with the pressures of `point`."""
         gaps, _ = gaps_and_normals(self, there.nodal.positions)
         if smooth_obstacles(self.scene):
             gaps = jnp.concatenate([gaps, within_elements(self, there)[2]])
@@ -273,7 +279,8 @@ class NodalForm(PositionForm):
         assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
         model = contact_model(self, point, here.gaps, here.reference_displacements)
-        pushing = model.allowed(model.pressures - model.gaps / here.system.contacts.contact_compliance)
+        # With the new pressures in place of the old ones.
+        pushing = model.allowed(model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE)
         rows = here.system.contacts
         if point.nodal.hardness is not None:
             pushing = pushing.at[pressure_rows(self.scene) - 1].multiply(point.nodal.hardness)

@@ -312,8 +312,11 @@ class SlidingForm(Form):
         assert isinstance(system, BorderedSystem)
         return dataclasses.replace(system, inner=self.at(point.arclengths).coupled(point.inner, system.inner))
 
-    def objective(self, here: Any, point: SlidingPoint) -> Float[Array, ""]:
-        of_inner = self.at(here.arclengths).objective(here.at_arclengths, point.inner)
+    def scaled(self, others: SlidingChange, motion: Any, multipliers: Any) -> SlidingChange:
+        return SlidingChange(motion * others.arclengths, self.first.scaled(others.others, motion, multipliers))
+
+    def objective(self, here: Any, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
+        of_inner = self.at(here.arclengths).objective(here.at_arclengths, point.inner, others.others)
         return of_inner - jnp.sum(point.excess * (here.arclengths - point.arclengths))
 
     def half_square(self, here: Any) -> Float[Array, ""]:

@@ -112,31 +112,45 @@ def _through(
         points = jnp.tile(start, (2, 1)) + times[:, None] * jnp.tile(displacements, (2, 1))
         return mapped(jax.grad(distance, argnums=1), times, points)
 
-    times = jnp.linspace(0.0, 1.0, TIMES, dtype=start.dtype)
-    numbered = jnp.arange(TIMES)[None]
-    first = distances(jnp.broadcast_to(times[None], (len(start), TIMES)))
-    lowest = jnp.argmin(first, axis=1)[:, None]
-    is_outside = first >= rim[:, None]
-    enters = jnp.max(jnp.where(is_outside & (numbered < lowest), numbered, 0), axis=1)
-    leaves = jnp.min(jnp.where(is_outside & (numbered > lowest), numbered, TIMES - 1), axis=1)
-    least, middle, width = jnp.min(first, axis=1), times[lowest], 1 / (TIMES - 1)
-    for _ in range(ZOOMS):
-        near = jnp.clip(middle + width * jnp.linspace(-1.0, 1.0, ZOOM_PARTS + 1, dtype=start.dtype)[None], 0.0, 1.0)
-        found = distances(near)
-        least = jnp.minimum(least, jnp.min(found, axis=1))
-        middle = jnp.take_along_axis(near, jnp.argmin(found, axis=1)[:, None], axis=1)
-        width *= 2 / ZOOM_PARTS
-    # Both at once, to compile them once.
-    both = jnp.concatenate([times[enters], times[leaves]])
-    entering, leaving = jnp.split(normals(both), 2)
-    is_opposed = jnp.sum(entering * leaving, axis=1) < OPPOSED
-    begins_on_a_side = first[:, 0] > jnp.minimum(least / 2, 0.0)
-    passed = is_opposed & begins_on_a_side & (least < rim / 2)
+    begin, end = (mapped(distance, jnp.full_like(rim, time), start + time * displacements) for time in (0.0, 1.0))
+
+    def followed() -> tuple[Bool[Array, "p"], Float[Array, "p"]]:
+        """Which places come through, and how near they come."""
+        times = jnp.linspace(0.0, 1.0, TIMES, dtype=start.dtype)
+        numbered = jnp.arange(TIMES)[None]
+        first = distances(jnp.broadcast_to(times[None], (len(start), TIMES)))
+        lowest = jnp.argmin(first, axis=1)[:, None]
+        is_outside = first >= rim[:, None]
+        enters = jnp.max(jnp.where(is_outside & (numbered < lowest), numbered, 0), axis=1)
+        leaves = jnp.min(jnp.where(is_outside & (numbered > lowest), numbered, TIMES - 1), axis=1)
+        least, middle, width = jnp.min(first, axis=1), times[lowest], 1 / (TIMES - 1)
+        for _ in range(ZOOMS):
+            near = jnp.clip(middle + width * jnp.linspace(-1.0, 1.0, ZOOM_PARTS + 1, dtype=start.dtype)[None], 0.0, 1.0)
+            found = distances(near)
+            least = jnp.minimum(least, jnp.min(found, axis=1))
+            middle = jnp.take_along_axis(near, jnp.argmin(found, axis=1)[:, None], axis=1)
+            width *= 2 / ZOOM_PARTS
+        # Both at once, to compile them once.
+        both = jnp.concatenate([times[enters], times[leaves]])
+        entering, leaving = jnp.split(normals(both), 2)
+        is_opposed = jnp.sum(entering * leaving, axis=1) < OPPOSED
+        begins_on_a_side = first[:, 0] > jnp.minimum(least / 2, 0.0)
+        return is_opposed & begins_on_a_side & (least < rim / 2), least
+
+    # Along its way a place is nowhere nearer than this to an obstacle that stands still.
+    nearest = (begin + end - jnp.sqrt(jnp.sum(displacements**2, axis=1))) / 2
+    is_same = jax.tree.map(lambda a, b: jnp.all(a == b), old, new)
+    stands = jnp.all(jnp.stack([jnp.array(True), *jax.tree.leaves(is_same)]))
+    passed, least = jax.lax.cond(
+        stands & jnp.all(nearest >= rim / 2),
+        lambda: (jnp.zeros(len(start), bool), jnp.minimum(begin, end)),
+        followed,
+    )
     of_held = mapped(distance, jnp.ones_like(rim), beside)
     is_beside = ~jnp.isnan(beside[:, 0])
     least_distance = jnp.where(is_beside, jnp.minimum(of_held, 0.0), 0.0) - WITHIN * rim
-    within = first[:, -1] < least_distance
-    passed &= ~jnp.any(first[:, 0] < least_distance)
+    within = end < least_distance
+    passed &= ~jnp.any(begin < least_distance)
     spread = jnp.zeros(len(after), bool)
     depths = jnp.zeros_like(radius).at[::step].set(rim - least)
     return spread.at[::step].set(passed), spread.at[::step].set(within), depths

@@ -103,6 +103,7 @@ def plot_route(
         label=colors.label,
         shrink=0.6,
         pad=0.08,
+        panchor=False,  # the axes stay in the middle of what is left, not at the bar
         extend="both" if colors.is_margin else "neither",
         format=PercentFormatter(1.0) if colors.is_margin else None,
     )

@@ -791,9 +791,13 @@ def on_one_side(search: Search, form: Form, found: Found, before: Before | None)
     begin, _, _ = begun.samples(positions, search.point)
     begin = search.units.origin[None] + search.units.length * begin
     before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
-    begins, _ = passage_to(begun, search.point, positions, search.units, before)
     passed, now = passage_to(form, found.point, found.state.shape.nodes, found.state.units, before)
-    is_sound = passed.is_sound | (begins.is_sound & ~passed.lies_within)
+
+    def stayed() -> Bool[Array, ""]:
+        begins, _ = passage_to(begun, search.point, positions, search.units, before)
+        return begins.is_sound & ~passed.lies_within
+
+    is_sound = jax.lax.cond(passed.is_sound, lambda: jnp.array(True), stayed)
     converged = is_converged(found.outcome.status)
     status = jnp.where(converged & ~is_sound, Status.PASSED_THROUGH, found.outcome.status)
     kept = jax.tree.map(lambda new, old: jnp.where(converged & is_sound, new, old), now, before)

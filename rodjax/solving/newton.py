@@ -135,12 +135,14 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     descends = _descends(form, find)
     rotation = state.step * state.rotation
     force_change = state.force_change if descends else state.step * state.force_change
-    others = jax.tree.map(lambda change: state.step * change, state.others)
+    others = form.scaled(state.others, state.step, 1.0 if descends else state.step)
     retracted = form.retract(state.point, state.bases, rotation, force_change, others)
     trial = jax.tree.map(lambda here, there: jnp.where(state.restart, here, there), state.point, retracted)
     linearization = form.linearized(trial)
     constraint_residual = form.force_components(linearization.constraint_residual)
-    objective = form.objective(linearization, state.point) if descends else form.half_square(linearization)
+    objective = (
+        form.objective(linearization, state.point, state.others) if descends else form.half_square(linearization)
+    )
     merit = objective + state.weight / 2 * jnp.sum(constraint_residual**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
@@ -208,14 +210,14 @@ def _advanced(
     if longest is not None:
         step = jnp.minimum(step, longest)
     if _descends(form, find):
-        force_change = step * force_change
+        force_change, others = step * force_change, form.scaled(others, 1.0, step)
 
     if _descends(form, find):
-        # With the new force in place of the old one.
+        # With the new forces in place of the old ones.
         constraint_residual, constraint_rate, change, along = form.under_force(
             point, here, rotation, force_change, others
         )
-        objective = form.objective(here, point) + change
+        objective = form.objective(here, point, others) + change
         along += jnp.sum(rotation * here.gradient)
     else:
         constraint_residual = form.force_components(here.constraint_residual)

@@ -31,6 +31,8 @@ from rodjax.window.tube import Scale, covers, scale_over
 # Seconds: without a move after which a rod is at rest, between numbers and between looks at stability while it moves,
 # between frames of a recording, and without a number after which a slider is taken anew.
 REST, NUMBERS, STABILITY, FRAME, STRETCH = 0.05, 0.1, 0.25, 1 / 30, 0.5
+# While a rod moves, the time between looks at stability is so many times that of a look: few moves wait for one.
+SELDOM = 200
 # Shapes that a fan shows at most, and pixels of a film, which the browser shall have drawn in so many seconds each.
 MOST_IN_FAN, FILM, FILM_SECONDS = 100, (960, 640), 20.0
 MARGIN = "share of the bend limit"
@@ -66,8 +68,9 @@ class Window:
         self.scales: dict[str, Scale] = {}
         self.report = Report(session.readings, "", True, False, int(session.result.iterations), 0.0)
         self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
+        self._has_fan = False
         self.on_drawn: Callable[[Report], None] = lambda report: None
-        self._numbers_at = self._stability_at = self._slid_at = 0.0
+        self._numbers_at = self._stability_due = self._slid_at = 0.0
         self._slid = ""
         self.server = started(port, host)
         shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
@@ -130,7 +133,7 @@ class Window:
             fit_colors=lambda: later(self.fit_colors),
             show_loads=lambda on: later(lambda: self.show_loads(on)),
             show_handles=self.stage.show_handles,
-            show_dark=self.show_dark,
+            show_dark=lambda on: later(lambda: self.show_dark(on)),
             number=self._number,
             record=lambda on: later(lambda: self.record(on)),
             play=lambda: later(self.play),
@@ -222,7 +225,7 @@ class Window:
         self.server.flush()
         self.on_drawn(self.report)
         now = time.monotonic()
-        if self._mailbox.is_empty and now - self._stability_at > STABILITY:
+        if self._mailbox.is_empty and now > self._stability_due:
             self._look_at_stability()
         if self.report.message or now - self._numbers_at > NUMBERS:
             self._show_numbers()
@@ -234,8 +237,10 @@ class Window:
         self._show_numbers()
 
     def _look_at_stability(self) -> None:
+        begin = time.monotonic()
         self.session.settle()
-        self._stability_at = time.monotonic()
+        now = time.monotonic()
+        self._stability_due = now + max(STABILITY, SELDOM * (now - begin))
 
     def _show_numbers(self) -> None:
         self._numbers_at = time.monotonic()
@@ -306,6 +311,8 @@ class Window:
         self.is_dark = on
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=on)
+        if self._has_fan:
+            self.show_fan(True)  # in other colours
 
     def record(self, on: bool) -> None:
         self.session.record(on)
@@ -320,9 +327,10 @@ class Window:
 
     def show_fan(self, on: bool) -> None:
         """All steps that are recorded at once, or every so many of them."""
+        self._has_fan = on
         steps = self.session.recorded
         chosen = np.unique(np.linspace(0, len(steps) - 1, MOST_IN_FAN).round().astype(int)) if on and steps else []
-        self.stage.draw_fan([readings_of(steps[k].result) for k in chosen])
+        self.stage.draw_fan([readings_of(steps[k].result) for k in chosen], self.is_dark)
 
     def save_film(self, client: Any) -> None:
         """All steps as the browser that asks for it shows them."""

@@ -44,7 +44,7 @@ def rows(session: Session, report: Report, limits: Limits | None = None) -> list
 
 
 def _stability_rows(session: Session, limits: Limits | None) -> list[Row]:
-    if not isinstance(session.result, Equilibrium):
+    if session.softest is None and not session.can_settle and not isinstance(session.result, Equilibrium):
         is_stable = bool(session.result.stable)
         return [Row("stability", "stable" if is_stable else "not stable, or not known", not is_stable)]
     if session.softest is None:
@@ -77,10 +77,24 @@ def _cable_rows(session: Session, number: int, name: str, limits: Limits | None)
     scene = result.harness[name]
     radius = float(session.figures[number].bend_radius)
     forces = np.linalg.norm(reading.forces, axis=1)
-    most = max(range(len(forces)), key=lambda k: float(forces[k]))
+
+    def beyond_limit(k: int) -> tuple[float, float]:
+        limit = None if limits is None else limits.end_force if k < 2 else limits.clip_force
+        return -np.inf if limit is None else float(forces[k]) - float(limit), float(forces[k])
+
+    # Of the forces that which breaks its limit by most, or is nearest to it; the largest where there are none.
+    most = max(range(len(forces)), key=beyond_limit)
     where = "start" if most == 0 else "end" if most == 1 else f"clip {most - 2}"
-    load = _most(f"{name}: force, {where}", float(forces[most]), "N", limits, "end_force" if most < 2 else "clip_force")
-    return [_bend_row(f"{name}: bend radius", radius, scene, limits), load]
+    loads = [
+        _most(f"{name}: force, {where}", float(forces[most]), "N", limits, "end_force" if most < 2 else "clip_force")
+    ]
+    if limits is not None and limits.end_moment is not None:
+        moment = float(np.max(np.linalg.norm(reading.moments, axis=1)))
+        loads.append(_most(f"{name}: end moment", moment, "N m", limits, "end_moment"))
+    # From the obstacle with the least margin.
+    clearances = sorted(_clearances(session, number, limits), key=lambda one: one.margin)[:1]
+    nearest = [Row(f"{name}: clearance, {one.name}", one.text, one.is_bad) for one in clearances]
+    return [_bend_row(f"{name}: bend radius", radius, scene, limits), *nearest, *loads]
 
 
 def _strain_row(label: str, strains: np.ndarray, session: Session, limits: Limits | None) -> Row:
@@ -105,22 +119,47 @@ def _bend_row(label: str, radius: float, scene: Scene, limits: Limits | None) ->
     return Row(label, f"{text} of at least {metres(least)}", radius < least)
 
 
-def _clearance_rows(session: Session, limits: Limits | None) -> list[Row]:
+class _Clearance(NamedTuple):
+    """From an obstacle [m], the force [N] with which it pushes the rod, `None` where it does not touch rods, and the
+    least distance that a limit allows.
+    """
+
+    name: str
+    distance: float
+    push: float | None
+    least: float | None
+
+    @property
+    def is_bad(self) -> bool:
+        return self.least is not None and self.distance < self.least
+
+    @property
+    def margin(self) -> float:
+        return self.distance - (self.least or 0.0)
+
+    @property
+    def text(self) -> str:
+        between = " between nodes" if self.push is not None and self.distance < 0 else ""
+        return metres(self.distance) + between + (f", pushed by {self.push:.3g} N" if self.push else "")
+
+
+def _clearances(session: Session, number: int, limits: Limits | None) -> list[_Clearance]:
+    """Of a rod, from the obstacles of its scene and those beside it."""
     least = None if limits is None or limits.clearance is None else np.asarray(limits.clearance)
-    figures, found = session.figures[0], []
+    figures, found = session.figures[number], []
     touching = len(figures.obstacle_forces)
     names = [*(f"obstacle {k}" for k in range(touching)), *session.beside]
     # Limits are those of the obstacles beside the rod, where there are such.
     first = touching if session.beside else 0
-    for k, (name, clearance) in enumerate(zip(names, figures.clearances, strict=True)):
-        text = metres(float(clearance))
-        if k < touching:
-            push = float(np.linalg.norm(figures.obstacle_forces[k]))
-            text += " between nodes" if clearance < 0 else ""
-            text += f", pushed by {push:.3g} N" if push else ""
+    for k, (name, distance) in enumerate(zip(names, figures.clearances, strict=True)):
+        push = float(np.linalg.norm(figures.obstacle_forces[k])) if k < touching else None
         limit = None if least is None or k < first else float(least if least.ndim == 0 else least[k - first])
-        found.append(Row(f"clearance, {name}", text, limit is not None and float(clearance) < limit))
+        found.append(_Clearance(name, float(distance), push, limit))
     return found
+
+
+def _clearance_rows(session: Session, limits: Limits | None) -> list[Row]:
+    return [Row(f"clearance, {one.name}", one.text, one.is_bad) for one in _clearances(session, 0, limits)]
 
 
 def _load_rows(session: Session, scene: Scene, limits: Limits | None) -> list[Row]:

@@ -262,23 +262,25 @@ class Session:
     @property
     def can_settle(self) -> bool:
         """Whether the stiffness of the softest motion can be told."""
-        return isinstance(self.scene, Scene) and has_potential(self.scene)
+        if isinstance(self.scene, Harness):
+            return self.scene.has_potential and not self.scene.contact
+        return has_potential(self.scene)
 
     def settle(self) -> float | None:
         """The stiffness of the softest motion [N], as by `rodjax.lowest_mode`; `None` where it cannot be told."""
         if self.can_settle:
-            assert isinstance(self.result, Equilibrium)
             self.softest = float(lowest_mode(self.result).stiffness)
         return self.softest
 
     @property
     def is_soft(self) -> bool:
-        """Whether the rod is about to snap: its softest motion, where that is known, has next to no stiffness left."""
+        """Whether the rods are about to snap: their softest motion, where that is known, has next to no stiffness left;
+        by the rod with the least EI/L^2.
+        """
         if self.softest is None:
             return False
-        assert isinstance(self.result, Equilibrium)
-        rod = self.result.scene.rod
-        return self.softest * float(rod.length) ** 2 < SOFT * float(rod.bending_scale)
+        rods = [scene.rod for scene in rods_of(scene_in(self.result)).values()]
+        return self.softest < SOFT * min(float(rod.bending_scale) / float(rod.length) ** 2 for rod in rods)
 
     # --- undo, record ---
 

@@ -21,14 +21,15 @@ from rodjax.window.session import Session
 LEAST_RADIUS, DEFAULT_RADIUS, ARROW, HANDLE = 0.002, 0.004, 0.15, 0.1
 CAMERA, PANEL = 0.8, 0.16
 # By the largest radius, that of a joint; and how pale other shapes are.
-JOINT, FAN_OPACITY = 1.6, 0.18
+JOINT, FAN_OPACITY, DARK_FAN_OPACITY = 1.6, 0.18, 0.3
 # Scales that differ by less look the same.
 SAME_SCALE = 0.01
 # Below these parts of EI/L^2 and EI/L forces and moments are rounding.
 LEAST_LOAD = 1e-6
 # Of Okabe and Ito, told apart by all eyes: forces, moments.
 FORCE_COLOR, MOMENT_COLOR, OBSTACLE_COLOR, JOINT_COLOR = (213, 94, 0), (0, 114, 178), (150, 155, 160), (120, 120, 120)
-FAN_COLOR = (110, 120, 130)
+# Of other shapes, on a light and on a dark page.
+FAN_COLOR, DARK_FAN_COLOR = (110, 120, 130), (215, 222, 230)
 
 Moved = Callable[[str, Pose, str], None]
 
@@ -120,15 +121,16 @@ class Stage:
             batched_colors=colors, lod="off", cast_shadow=False, receive_shadow=False, **more,
         )  # fmt: skip
 
-    def draw_fan(self, many: Sequence[Sequence[Reading]]) -> None:
-        """Other shapes of the rods, pale; none where there are none."""
+    def draw_fan(self, many: Sequence[Sequence[Reading]], is_dark: bool) -> None:
+        """Other shapes of the rods, pale, on a light or a dark page; none where there are none."""
         fan = self.meshes.pop("fan", None)
         if fan is not None:
             fan.remove()
         if many:
             pieces = Pieces(*map(np.concatenate, zip(*map(self._pieces, many), strict=True)))
+            color, opacity = (DARK_FAN_COLOR, DARK_FAN_OPACITY) if is_dark else (FAN_COLOR, FAN_OPACITY)
             self.meshes["fan"] = self._batched(
-                "/fan", tube.cylinder(), pieces, tube.as_light(np.array(FAN_COLOR)), opacity=FAN_OPACITY
+                "/fan", tube.cylinder(), pieces, tube.as_light(np.array(color)), opacity=opacity
             )
 
     def draw_joints(self, positions: Float[np.ndarray, "j 3"]) -> None:

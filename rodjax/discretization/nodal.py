@@ -222,14 +222,16 @@ class NodalForm(PositionForm):
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
         if nodal.hardness is not None:
-            rows = system.contacts.far
+            rows, row = system.contacts.far, pressure_rows(self.scene) - 1
             assert rows is not None
+            gaps = contacts.gaps.at[row].multiply(nodal.hardness)
+            pressures = contacts.pressures.at[row].divide(nodal.hardness)
+            contacts = Unilateral(gaps, pressures, contacts.bounds)
             system = eqx.tree_at(lambda system: system.contacts.far, system, rows.times(nodal.hardness))
         found = minimized(system, push + moments, c, contacts)
         if nodal.hardness is None:
             return found.is_minimum, found.x, found.y
         first, pressures, displacements, forces = system.split(found.y)
-        row = pressure_rows(self.scene) - 1
         parts = (first, pressures.at[row].multiply(nodal.hardness), displacements, forces)
         return found.is_minimum, found.x, jnp.concatenate([part.reshape(-1) for part in parts])
 
@@ -282,8 +284,6 @@ class NodalForm(PositionForm):
         # With the new pressures in place of the old ones.
         pushing = model.allowed(model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE)
         rows = here.system.contacts
-        if point.nodal.hardness is not None:
-            pushing = pushing.at[pressure_rows(self.scene) - 1].multiply(point.nodal.hardness)
         rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
         if rows.inner is not None or rows.far is not None:
             # The gradient by rotations has the pressures as they are.

@@ -153,10 +153,6 @@ def contact_model(
     """The contacts of the quadratic model of a step, with these gaps and displacements since the last equilibrium."""
     nodal = point.nodal
     gaps = gaps + nodal.relaxed[:, None]
-    if nodal.hardness is not None:
-        gaps = gaps.at[-1].multiply(nodal.hardness)
-        pressures = nodal.pressures.at[-1].divide(nodal.hardness)
-        nodal = dataclasses.replace(nodal, pressures=pressures)
     if nodal.friction is None or displacements is None:
         return Unilateral(gaps, nodal.pressures)
     _, normals = gaps_and_normals(form, nodal.positions)

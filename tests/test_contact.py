@@ -375,6 +375,14 @@ def test_clips_and_obstacles_share_the_weight(touching):
     np.testing.assert_allclose(clip, [0.68, 0.02, 0.09], rtol=0, atol=1e-14)
 
 
+def test_no_step_along_a_cylinder_is_shortened(touching):
+    """Before, with contacts as stiff in the merit as in the model, this one did not converge in 100 iterations."""
+    there = rj.solve(among_obstacles(NOMINAL.at[5].set(-0.02)), segments=48, guess=touching)
+    assert there.converged
+    assert int(there.evaluations) == int(there.iterations) + 1
+    assert int(there.iterations) <= 6  # 5 seen
+
+
 def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):
     """A gap or a pressure is zero at each node that no support holds; the box is not touched. Of what pushes in the
     middle of an element both of its nodes have half.

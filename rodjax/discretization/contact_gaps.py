@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.form import Linearization
 from rodjax.discretization.inner_contacts import SAG, THINNER, Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
@@ -27,14 +26,10 @@ CONTACT_COMPLIANCE = 1e-5
 # And at least this times the rounding unit [L^3/EI] where elements are touched: elimination goes from one node
 # of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
 LEAST_COMPLIANCE = 5e4
-# Of contacts between elements [L^3/EI], whose gaps are far from linear where the rod slides along itself: a small one
-# would refuse all but short steps. Pressures are multipliers, so that it does not stay in the result.
-FAR_COMPLIANCE = 1e-6
-# Near an equilibrium, below this residual [EI/L^2], it is smaller, by HARDEST at most, if gaps change pressures by less
-# than GAP_SHARE of the largest then: two contacts beside one another share their force in few steps.
-NEAR_BALANCE = 1e-3
-GAP_SHARE = 0.3
-HARDEST = 1e-3
+# Of contacts between elements [L^3/EI]: less than the compliance of a piece between two contacts beside one another, that
+# share their force by it, a tenth of an element in plectonemes. With 1e-10 too many digits are lost. Pressures are
+# multipliers, so that it does not stay in the result.
+FAR_COMPLIANCE = 1e-9
 
 
 def friction_coefficient(obstacle: Obstacle) -> Any:
@@ -163,15 +158,3 @@ def model_compliance(form: PositionForm) -> Float[Array, ""]:
 def far_unit(form: PositionForm) -> Float[Array, ""]:
     """The unit of pressures between elements in which all contacts have the same compliance."""
     return jnp.sqrt(model_compliance(form) / FAR_COMPLIANCE)
-
-
-def hardness(form: PositionForm, here: Linearization, pressures: Float[Array, "n+1"]) -> Float[Array, ""]:
-    """How much harder contacts between elements may be in the next step from here, with these pressures between
-    elements in units of `far_unit`.
-    """
-    assert here.gaps is not None
-    gaps, compliance = here.gaps[-1], model_compliance(form)
-    by_gaps = jnp.max(jnp.where((pressures > 0) | (gaps < 0), jnp.abs(gaps), 0.0)) / compliance
-    largest = jnp.maximum(jnp.max(pressures), by_gaps)
-    part = by_gaps / (GAP_SHARE * jnp.where(largest > 0, largest, 1.0))
-    return jnp.where(here.residual < NEAR_BALANCE, jax.lax.rsqrt(jnp.clip(part, HARDEST, 1.0)), 1.0)

@@ -15,7 +15,6 @@ frames, the latter with loads that have no potential.
 import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +24,6 @@ from rodjax.discretization import potentials
 from rodjax.discretization.contact_gaps import (
     curve,
     gaps_and_normals,
-    hardness,
     has_inner_contacts,
     model_compliance,
     pressure_rows,
@@ -105,8 +103,6 @@ class NodalForm(PositionForm):
             rough = np.array(rough_obstacles(self.scene))
             forces = tangential(nodal.friction.forces, here.system.contacts.normals[rough])
             nodal = dataclasses.replace(nodal, friction=dataclasses.replace(nodal.friction, forces=forces))
-        if nodal.hardness is not None:
-            nodal = dataclasses.replace(nodal, hardness=hardness(self, here, nodal.pressures[-1]))
         return dataclasses.replace(point, nodal=nodal)
 
     @traced_once
@@ -142,8 +138,7 @@ class NodalForm(PositionForm):
         if self.scene.self_contact:
             far = contacts_with_itself(self, point, pressures[-1])
             gaps = jnp.concatenate([gaps, far.gaps[None]])
-        hard = jnp.ones((), nodes.dtype) if self.scene.self_contact else None
-        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=relaxation(self, gaps), hardness=hard)
+        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=relaxation(self, gaps))
         return dataclasses.replace(point, nodal=nodal)
 
     # --- fields along the elements -----------------------------------------------------------------------------------
@@ -221,19 +216,8 @@ class NodalForm(PositionForm):
             sticks = contacts.is_closed(trial)[k:]
             is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
         system = system.closed_where(is_closed)
-        if nodal.hardness is not None:
-            rows, row = system.contacts.far, pressure_rows(self.scene) - 1
-            assert rows is not None
-            gaps = contacts.gaps.at[row].multiply(nodal.hardness)
-            pressures = contacts.pressures.at[row].divide(nodal.hardness)
-            contacts = Unilateral(gaps, pressures, contacts.bounds)
-            system = eqx.tree_at(lambda system: system.contacts.far, system, rows.times(nodal.hardness))
         found = minimized(system, push + moments, c, contacts)
-        if nodal.hardness is None:
-            return found.is_minimum, found.x, found.y
-        first, pressures, displacements, forces = system.split(found.y)
-        parts = (first, pressures.at[row].multiply(nodal.hardness), displacements, forces)
-        return found.is_minimum, found.x, jnp.concatenate([part.reshape(-1) for part in parts])
+        return found.is_minimum, found.x, found.y
 
     def first_closed(self, is_closed: Bool[Array, "k n+1"], contacts: Unilateral) -> Bool[Array, "k n+1"]:
         """The first guess of the closed contacts: a node that lies on an obstacle without pressure counts as closed."""

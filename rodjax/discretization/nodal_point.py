@@ -25,15 +25,13 @@ class Friction(eqx.Module):
 
 class Nodal(eqx.Module):
     """The positions of the nodes, and the pressure of each obstacle at each node; `relaxed`: added to the gaps of each
-    obstacle in the next step; `friction`: `None` where no obstacle has any; `hardness`: by the square of it contacts of
-    the rod with itself are harder in the next step than `FAR_COMPLIANCE` says, `None` where there are none.
+    obstacle in the next step; `friction`: `None` where no obstacle has any.
     """
 
     positions: Float[Array, "n+1 3"]
     pressures: Float[Array, "k n+1"]
     relaxed: Float[Array, "k"]
     friction: Friction | None = None
-    hardness: Float[Array, ""] | None = None
 
     @property
     def contact_forces(self) -> Float[Array, "r n+1"]:

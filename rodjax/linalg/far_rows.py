@@ -64,11 +64,6 @@ class FarRows(eqx.Module):
         compliances = jnp.concatenate([jnp.where(here, contact_compliance, 1.0), jnp.repeat(jnp.asarray(SIGNS), p)])
         return by_point.reshape(len(by_point), 5 * p, points), by_position.reshape(5 * p, nodes, 3), compliances
 
-    def times(self, factor: Float[Array, ""]) -> "FarRows":
-        """The gaps in another unit."""
-        by_rotation, by_position = (part.at[0].multiply(factor) for part in (self.by_rotation, self.by_position))
-        return FarRows(by_rotation, by_position, self.nodes, self.elements, self.row)
-
     @property
     def positive(self) -> int:
         """The number of the columns whose compliance is positive."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.contact_gaps import FAR_COMPLIANCE, curve
+from rodjax.discretization.contact_gaps import curve
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.discretization.rod_pairs import (
@@ -34,6 +34,9 @@ from rodjax.solving.coupling import Coupling
 Members = tuple[tuple[int, ...], ...]
 # Of all contacts between rods of two groups, at most so many are sought in the model of a step.
 MOST_BETWEEN = 32
+# Compliance of contacts in the model of a step [L^3/EI]. Gaps are far from linear where rods slide along one another, and
+# the merit of a step has this compliance too: a small one would refuse all but short steps.
+CONTACT_COMPLIANCE = 1e-6
 
 
 class Pairs(NamedTuple):
@@ -96,11 +99,11 @@ class Between(NamedTuple):
 
     @property
     def contact_compliance(self) -> Float[Array, "c"]:
-        return jnp.full_like(self.gaps, FAR_COMPLIANCE)
+        return jnp.full_like(self.gaps, CONTACT_COMPLIANCE)
 
     def step(self, change: Float[Array, "c"], rates: Float[Array, "c"]) -> "BetweenStep":
         """That changes the pressures, and the gaps at these rates."""
-        pushing = self.pressures - self.gaps / FAR_COMPLIANCE
+        pushing = self.pressures - self.gaps / CONTACT_COMPLIANCE
         return BetweenStep(change, self.places, -jnp.sum(jnp.where(pushing > 0, pushing, 0.0) * rates))
 
     @property
@@ -202,8 +205,8 @@ def contacts_between(pairs: Pairs, curves: dict[int, Curve], pressures: Float[Ar
 def contact_energy(pairs: Pairs, curves: dict[int, Curve], here: Contacts) -> Float[Array, ""]:
     """As of `NodalForm.contact_energy`, where a step leads that begins here."""
     there = contacts_between(pairs, curves, here.pressures)
-    pressures = here.pressures - (there.gaps + here.relaxed) / FAR_COMPLIANCE
-    return FAR_COMPLIANCE / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+    pressures = here.pressures - (there.gaps + here.relaxed) / CONTACT_COMPLIANCE
+    return CONTACT_COMPLIANCE / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
 
 
 def passes(pairs: Pairs, before: Contacts, curves: dict[int, Curve]) -> Bool[Array, ""]:

@@ -23,7 +23,6 @@ from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.harness_result import solved_in
 from rodjax.solving.result import (
     DEFAULT_STRAIN_LIMIT,
-    Equilibrium,
     MeshWarning,
     NotConvergedWarning,
     OverstretchedWarning,

@@ -422,6 +422,7 @@ def test_a_floor_under_a_harness_lifts_all_its_rods():
         (row,) = (row for label, row in shown.items() if label.startswith(f"{name}: clearance, "))
         assert "pushed by" in row.text
         assert row.is_bad
+    assert shown["stability"].text == "stable"  # by the index, until the softest motion is known
     assert session.settle() == pytest.approx(float(rj.lowest_mode(session.result).stiffness))
     session.undo()
 

@@ -26,9 +26,9 @@ CONTACT_COMPLIANCE = 1e-5
 # And at least this times the rounding unit [L^3/EI] where elements are touched: elimination goes from one node
 # of such an element to the other, and rounds the stiffness of the rest of the rod by that of the contact.
 LEAST_COMPLIANCE = 5e4
-# Of contacts between elements [L^3/EI]: less than the compliance of a piece between two contacts beside one another, that
-# share their force by it, a tenth of an element in plectonemes. With 1e-10 too many digits are lost. Pressures are
-# multipliers, so that it does not stay in the result.
+# Of contacts between elements [L^3/EI]: two contacts a tenth of an element apart, as in plectonemes, share their force
+# by the compliance of the piece between them, which is larger than this. With 1e-10 too many digits are lost. Pressures
+# are multipliers, so that it does not stay in the result.
 FAR_COMPLIANCE = 1e-9
 
 

@@ -34,8 +34,8 @@ from rodjax.solving.coupling import Coupling
 Members = tuple[tuple[int, ...], ...]
 # Of all contacts between rods of two groups, at most so many are sought in the model of a step.
 MOST_BETWEEN = 32
-# Compliance of contacts in the model of a step [L^3/EI]. Gaps are far from linear where rods slide along one another, and
-# the merit of a step has this compliance too: a small one would refuse all but short steps.
+# Compliance of contacts in the model of a step [L^3/EI]. Gaps are far from linear where rods slide along one another,
+# and the merit of a step has this compliance too: a small one would refuse all but short steps.
 CONTACT_COMPLIANCE = 1e-6
 
 

@@ -1,6 +1,7 @@
 """The window in the browser: a session, a viser server that shows it, and one thread between the two."""
 
 import contextlib
+import functools
 import gc
 import io
 import logging
@@ -15,6 +16,8 @@ import numpy as np
 
 from rodjax.checks import whole_number
 from rodjax.filming import best_suffix, film_content
+from rodjax.model.harness import Harness
+from rodjax.programs.tasks import inherited
 from rodjax.routing.limits import Limits
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.window.controls import Pose, rods_of
@@ -68,6 +71,8 @@ class Window:
         self.scales: dict[str, Scale] = {}
         self.report = Report(session.readings, "", True, False, int(session.result.iterations), 0.0)
         self._mailbox, self._closed, self._ready = Mailbox(), threading.Event(), threading.Event()
+        self._stability_known = threading.Event()
+        self._compiling: threading.Thread | None = None
         self._has_fan = False
         self.on_drawn: Callable[[Report], None] = lambda report: None
         self._numbers_at = self._stability_due = self._slid_at = 0.0
@@ -101,6 +106,8 @@ class Window:
         self._mailbox.close()
         self._closed.set()
         self._thread.join()
+        if self._compiling is not None:
+            self._compiling.join()
         gc.unfreeze()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
@@ -193,11 +200,25 @@ class Window:
     def _warm_up(self) -> None:
         self.panel.say("compiling: a few seconds, once for this kind of scene")
         self.session.warm_up(lambda: not self._mailbox.is_closed)
+        if isinstance(self.session.scene, Harness) and self.session.can_settle:
+            # That takes up to a minute: until then the index of the last solve is shown.
+            entered = inherited()
+            prepare = functools.partial(self._prepare_stability, entered)
+            self._compiling = threading.Thread(target=self._do, args=(prepare,), daemon=True)
+            self._compiling.start()
+        else:
+            self._stability_known.set()
         self._settle()
         # A full collection would look at millions of objects of JAX, for a tenth of a second in the middle of a move.
         gc.collect()
         gc.freeze()
         self._ready.set()
+
+    def _prepare_stability(self, entered: Callable[[], contextlib.AbstractContextManager]) -> None:
+        with entered():
+            self.session.prepare_stability()
+        self._stability_known.set()
+        self._mailbox.command(self._settle)
 
     @property
     def is_ready(self) -> bool:
@@ -210,7 +231,8 @@ class Window:
 
     @property
     def _is_unsettled(self) -> bool:
-        return self._numbers_at == 0.0 or (self.session.softest is None and self.session.can_settle)
+        awaits = self.session.softest is None and self.session.can_settle and self._stability_known.is_set()
+        return self._numbers_at == 0.0 or awaits
 
     def _moved(self, moves: dict[str, Any]) -> None:
         frame = moves.pop("recorded", None)
@@ -237,6 +259,8 @@ class Window:
         self._show_numbers()
 
     def _look_at_stability(self) -> None:
+        if not self._stability_known.is_set():
+            return
         begin = time.monotonic()
         self.session.settle()
         now = time.monotonic()

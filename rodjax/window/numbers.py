@@ -44,7 +44,7 @@ def rows(session: Session, report: Report, limits: Limits | None = None) -> list
 
 
 def _stability_rows(session: Session, limits: Limits | None) -> list[Row]:
-    if session.softest is None and not session.can_settle and not isinstance(session.result, Equilibrium):
+    if session.softest is None and not isinstance(session.result, Equilibrium):
         is_stable = bool(session.result.stable)
         return [Row("stability", "stable" if is_stable else "not stable, or not known", not is_stable)]
     if session.softest is None:

@@ -165,11 +165,20 @@ class Session:
         self.__dict__.pop("figures", None)
 
     def warm_up(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
-        """Compiles what moves need, so that none of them waits for it, as long as it is wanted."""
+        """Compiles what moves need, so that none of them waits for it, as long as it is wanted; of a harness not its
+        softest motion, which takes long (`prepare_stability`).
+        """
         with compiled_only():
-            for prepare in (lambda: self._followed(self.now.controls), lambda: self.figures, self.settle):
+            for prepare in (lambda: self._followed(self.now.controls), lambda: self.figures):
                 if is_wanted():
                     prepare()
+            if is_wanted() and isinstance(self.scene, Scene):
+                self.settle()
+
+    def prepare_stability(self) -> None:
+        """Compiles what `settle` needs; moves may be made meanwhile."""
+        with compiled_only():
+            lowest_mode(self.result)
 
     # --- moves ---
 
@@ -278,7 +287,7 @@ class Session:
         """
         if self.softest is None:
             return False
-        rods = [scene.rod for scene in rods_of(scene_in(self.result)).values()]
+        rods = [scene.rod for scene in rods_of(solved_in(self.result)).values()]
         return self.softest < SOFT * min(float(rod.bending_scale) / float(rod.length) ** 2 for rod in rods)
 
     # --- undo, record ---

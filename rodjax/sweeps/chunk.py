@@ -92,9 +92,9 @@ def _values(result: Solution, manifest: Manifest) -> dict[str, np.ndarray]:
 
 def _rods_of(result: Solution) -> dict[str, Equilibrium]:
     """By what the names of their datasets begin with."""
-    if isinstance(result, Equilibrium):
-        return {"": result}
-    return {f"cables/{name}/": rod for name, rod in result.items()}
+    if isinstance(result, HarnessEquilibrium):
+        return {f"cables/{name}/": rod for name, rod in result.items()}
+    return {"": result}
 
 
 def _errors(rod: Equilibrium) -> dict[str, np.ndarray]:

@@ -94,32 +94,32 @@ def test_what_another_force_changes_is_that_of_the_lagrangian(kind):
 
 @pytest.mark.parametrize("EI", [1.0, (1.0, 1.3)], ids=["tangents", "frames"])
 def test_the_slope_of_a_step_in_contact_is_that_of_its_objective(EI):
-    """Under the new forces, in every motion of the rod; the objective is what steps are judged by."""
+    """Under the new forces and pressures, in every motion of the rod; the objective is what steps are judged by."""
     rod = Rod(1.0, EI, 0.7, 1e4, 100.0, radius=0.01)
     ends = Clamp((0, 0, 0.01), frame((1, 0, 0))), Free(force=(0, 0.3, 20.0))
     result = rj.solve(Scene(rod, *ends, (0, 0, -1.0), obstacles=[rj.Plane((0, 0, 0), (0, 0, 1))]), segments=8)
     random = np.random.default_rng(0)
 
     @by_numpy
-    def slopes(result, numbers, displacements, change):
+    def slopes(result, numbers, displacements, pressures, change):
         form, point = form_and_point(result)
         bases, here = form.bases_at(point), form.linearized(point)
         is_free = jnp.sum(bases**2, axis=0)  # by rotations that no support holds
         rotation = is_free * numbers[: is_free.size].reshape(is_free.shape)
-        step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
+        step = NodalChange(displacements, pressures)
         _, _, _, more = form.under_force(point, here, rotation, change, step)
 
         def objective(part):
-            others = jax.tree.map(lambda change: part * change, step)
-            there = form.retract(point, bases, part * rotation, change, others)
-            return form.objective(form.linearized(there), point)
+            there = form.retract(point, bases, part * rotation, change, form.scaled(step, part, 1.0))
+            return form.objective(form.linearized(there), point, step)
 
         return more + jnp.sum(rotation * here.gradient), (objective(1e-9) - objective(-1e-9)) / 2e-9
 
     assert float(jnp.max(result.contact_forces)) > 1.0
     displacements = jnp.asarray(random.normal(size=result.nodes.shape)).at[0].set(0.0)  # the clamped node
     change = jnp.asarray(random.normal(size=result.state.end_force.shape))
-    found, expected = slopes(result, jnp.asarray(random.normal(size=100)), displacements, change)
+    pressures = jnp.asarray(random.normal(size=result.state.pressures.shape))
+    found, expected = slopes(result, jnp.asarray(random.normal(size=100)), displacements, pressures, change)
     assert abs(expected) > 1.0
     # Roundings of 1e-14 of the energy over 1e-9: by more, middles of elements that lie on the floor would touch it.
     np.testing.assert_allclose(found, expected, rtol=1e-6)

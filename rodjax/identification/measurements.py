@@ -355,7 +355,7 @@ class Experiment(eqx.Module):
     - `name`: for the report.
     """
 
-    scene: Scene | Harness
+    scene: Any  # a `Scene` or `Harness`
     measured: tuple[Measurement, ...]
     guess: Guess | None
     cluster: str | None = eqx.field(static=True)

@@ -9,6 +9,7 @@ import math
 import socket
 import sys
 import threading
+import time
 import tomllib
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from rodjax.cli import main
 from rodjax.io.harness_file import read_scene
 from rodjax.window import origins, tube
 from rodjax.window.bounds import Asked, asked_of, why_not
-from rodjax.window.browser import started
+from rodjax.window.browser import Window, started
 from rodjax.window.controls import Pose, controls_of, handles_of, moved, scene_of, shared_obstacles, sliders_of
 from rodjax.window.files import path_file, scene_file
 from rodjax.window.mailbox import Mailbox
@@ -50,6 +51,13 @@ def turned(frame, angle: float) -> np.ndarray:
     """About its own tangent."""
     frame = np.asarray(frame)
     return Rotation.from_rotvec(angle * frame[:, 2]).as_matrix() @ frame
+
+
+def until(is_so, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +327,7 @@ def test_every_kind_of_scene_can_be_taken_in_the_hand(kind):
 
 
 @pytest.mark.slow
-def test_a_harness_is_taken_in_the_hand(tmp_path):
+def test_a_harness_is_taken_in_the_hand(tmp_path, monkeypatch):
     """An end and the support of a joint are dragged; both rods follow to where a solve of the harness finds them."""
     cable = rj.problems.cable()
     joints = {"y": rj.Body(support=rj.Spring(rj.Pin((0.8, 0.0, -0.1)), translation=50.0), mass=0.05)}
@@ -376,6 +384,22 @@ def test_a_harness_is_taken_in_the_hand(tmp_path):
     assert isinstance(harness, rj.Harness)
     assert jax.tree.structure(harness) == jax.tree.structure(session.result.harness)
     np.testing.assert_array_equal(jax_leaves(harness), jax_leaves(session.result.harness))
+    pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
+    prepared = threading.Event()
+    monkeypatch.setattr(session, "warm_up", lambda is_wanted: None)
+    monkeypatch.setattr(session, "prepare_stability", lambda: prepared.wait(60))
+    monkeypatch.setattr(session, "settle", lambda: setattr(session, "softest", 1.0))
+    session.show(session.now)
+    window = Window(session, port=0)
+    try:
+        # Moves do not wait for what the softest motion needs; once that is there, it is looked at.
+        until(lambda: window.is_ready)
+        assert session.softest is None
+        prepared.set()
+        until(lambda: session.softest == 1.0)
+    finally:
+        prepared.set()
+        window.close()
 
 
 def beside_a_floor() -> rj.Harness:

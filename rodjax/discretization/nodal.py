@@ -58,9 +58,9 @@ from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
 TOUCHES = 1e-2
-# Compliance of contacts in the merit of a step [L^3/EI]. A step goes along tangent planes, and a node that slides on a
-# surface leaves it by the square of its way: with the stiffness that contacts have in the model, the merit would refuse
-# all but short steps.
+# Compliance of contacts in the merit of a step [L^3/EI], of those between elements in their own unit. A step goes along
+# tangent planes, and a node that slides on a surface leaves it by the square of its way: with contacts as stiff as
+# those of the model, the merit would refuse all but short steps.
 MERIT_COMPLIANCE = 1e-4
 
 

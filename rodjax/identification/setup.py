@@ -19,7 +19,7 @@ from rodjax.identification.measurements import Centerline, CriticalValue, Experi
 from rodjax.identification.plausible import check_points
 from rodjax.identification.problem import Critical, Group, Problem, Ranges, Sought, Structure, values, with_unknowns
 from rodjax.identification.unknowns import Subject, Unknown, known_names, nominal, outside
-from rodjax.model.harness import Harness
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.scene import Scene, held_position
 from rodjax.paths.harness_path import are_harnesses, harness_batch, stack_harnesses, unstacked
 from rodjax.paths.path import stack_scenes
@@ -27,7 +27,7 @@ from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, checked_options, first_state
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness import clamped_rods
-from rodjax.solving.harness_result import Solution, rods_of
+from rodjax.solving.harness_result import Solution, results_of
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.solving.solve import solve
@@ -56,12 +56,7 @@ class Setup(NamedTuple):
     @property
     def length(self) -> float:
         """Of the rod of the first experiment, of a harness the longest [m]."""
-        return max(float(scene.rod.length) for scene in rod_scenes(self.experiments[0].scene))
-
-
-def rod_scenes(scene: Scene | Harness) -> tuple[Scene, ...]:
-    """Of all its rods."""
-    return scene.scenes if isinstance(scene, Harness) else (scene,)
+        return max(float(scene.rod.length) for scene in scenes_of(self.experiments[0].scene).values())
 
 
 def prepared(experiments: Any, unknowns: Any, *, needs_all: bool = True) -> Setup:
@@ -184,7 +179,8 @@ def stacked(setup: Setup) -> tuple[tuple[Group, ...], tuple[Guess | None, ...]]:
         each: Any = [one.scene for one in chosen]
         scenes = stack_harnesses(each) if are_harnesses(each) else stack_scenes(each)
         experiments = eqx.tree_at(lambda one: (one.scene, one.measured), bare, (scenes, _stack(measured)))
-        groups.append(Group(experiments, leaf(np.ones(len(chosen), rod_scenes(scenes)[0].rod.length.dtype))))
+        (rod, *_) = scenes_of(scenes).values()
+        groups.append(Group(experiments, leaf(np.ones(len(chosen), rod.rod.length.dtype))))
         guesses.append(_stack([_first_guess(one) for one in chosen]) if _tells_shape(chosen[0]) else None)
     return tuple(groups), tuple(guesses)
 
@@ -352,7 +348,7 @@ def beginnings(
     found = _beginnings(structure, problem, at, guesses)
     return tuple(
         # A harness has no first shape that is not solved for.
-        harness_batch(unstacked(one), segments=structure.segments, guess=guess, strain_limit=None, is_told=False)
+        harness_batch(list(unstacked(one)), segments=structure.segments, guess=guess, strain_limit=None, is_told=False)
         if isinstance(one, Harness)
         else one
         for one, guess in zip(found, guesses, strict=True)
@@ -395,7 +391,7 @@ def largest_error(results: tuple[Solution, ...], tolerance: float | None) -> flo
     errors = [
         np.max(np.linalg.norm(estimated_errors(rod).nodes, axis=-1), axis=-1)[np.asarray(rod.converged)]
         for result in results
-        for rod in rods_of(result).values()
+        for rod in results_of(result).values()
     ]
     return float(np.max(np.concatenate(errors), initial=0.0))
 

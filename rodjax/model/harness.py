@@ -462,6 +462,13 @@ def has_movable_ends(scene: Scene) -> bool:
     return isinstance(scene.start, Movable) or isinstance(scene.end, Movable)
 
 
+def scenes_of(scene: Scene | Harness, prefix: str = "{}") -> dict[str, Scene]:
+    """The scenes of all rods, by `prefix` with the name of each; by nothing where there is only one."""
+    if isinstance(scene, Scene):
+        return {"": scene}
+    return dict(zip(map(prefix.format, scene.names), scene.scenes, strict=True))
+
+
 def of_one_rod(scene: Scene) -> Harness:
     """A scene whose ends are a `Hinge`, `Slider` or `Spring`, as a harness with bodies that these support."""
     check_movable(scene, "scene")

@@ -103,7 +103,7 @@ def solve_batch(
     if isinstance(scenes, Harness):
         if scenes.scenes[0].rod.length.ndim != 1:
             raise ValueError("scenes must be several harnesses, a list or one with a leading axis, got a single one")
-        scenes = unstacked(scenes)
+        scenes = list(unstacked(scenes))
     if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
         if mesh is not None:
             raise ValueError("mesh must be None for harnesses, which are solved one after another")

@@ -1,6 +1,6 @@
 """Several harnesses of one structure: paths, each solved from the last, and batches, each from its own start."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -91,11 +91,11 @@ def stack_harnesses(harnesses: Sequence[Harness]) -> Harness:
     return jax.tree.map(lambda *leaves: leaf(xp.stack(leaves)), *harnesses)
 
 
-def unstacked(stack: Harness) -> list[Harness]:
-    """Harnesses whose leaves have a leading axis, one by one."""
-    xp = namespace(stack)
-    leaves, tree = jax.tree.flatten(jax.tree.map(xp.asarray, stack))
-    return [jax.tree.unflatten(tree, [leaf(x[k]) for x in leaves]) for k in range(len(leaves[0]))]
+def unstacked(stack: Any) -> Iterator[Any]:
+    """What is stacked along a leading axis, one after another."""
+    stack = jax.tree.map(namespace(stack).asarray, stack)
+    for k in range(len(jax.tree.leaves(stack)[0])):
+        yield jax.tree.map(lambda x, k=k: leaf(x[k]), stack)
 
 
 def _on_one_mesh(

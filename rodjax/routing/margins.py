@@ -16,11 +16,12 @@ from rodjax.checks import instance, sequence
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Value, value_at
+from rodjax.model.harness import scenes_of
 from rodjax.model.obstacles import Obstacle, checked_obstacles
 from rodjax.model.scene import Scene
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
-from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
 from rodjax.solving.result import Equilibrium, beside_nodes, over_leading_axes
 
 # What the name of a clearance is told by, before that of the obstacle.
@@ -138,7 +139,7 @@ def checked(
 ) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
     """The obstacles and their names, where the limits suit them and the rods of an equilibrium, or of a `Scene`."""
     instance(limits, "limits", Limits)
-    rods = {"": subject} if isinstance(subject, Scene) else {name: rod.scene for name, rod in rods_of(subject).items()}
+    rods = scenes_of(subject if isinstance(subject, Scene) else solved_in(subject), "{}: ")
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if obstacles:
         obstacles = checked_obstacles(obstacles)
@@ -181,7 +182,7 @@ def measured(
     of_rods = eqx.tree_at(lambda limits: limits.stability, limits, None, is_leaf=lambda x: x is None)
     found = [
         dataclasses.replace(each, name=f"{name}{each.name}")
-        for name, rod in rods_of(equilibrium).items()
+        for name, rod in results_of(equilibrium).items()
         for each in _measured_of_rod(rod, of_rods, obstacles, everywhere)
     ]
     if limits.stability is not None:

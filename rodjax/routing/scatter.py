@@ -26,7 +26,7 @@ from rodjax.programs.tasks import Workers, as_completed, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
 from rodjax.solving.harness import differentiable_by
-from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of, solved_in
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
 from rodjax.solving.result import Equilibrium, NotConvergedWarning
 from rodjax.warn import silenced
 
@@ -94,7 +94,7 @@ class Scattering(eqx.Module):
     @property
     def parts(self) -> list[Part]:
         """The rods."""
-        rods = rods_of(self.equilibrium)
+        rods = results_of(self.equilibrium)
         ends = np.cumsum([0, *(rod.s.shape[-1] for rod in rods.values())]).tolist()
         return [Part(prefix, slice(*ends[k : k + 2]), k) for k, prefix in enumerate(rods)]
 
@@ -113,7 +113,7 @@ class Scattering(eqx.Module):
         if self.limits is not None:
             values = jnp.concatenate([each.value for each in measured(equilibrium, self.limits, self.obstacles)])
         nodes, forces = [], []
-        pairs = zip(rods_of(equilibrium).values(), rods_of(self.equilibrium).values(), strict=True)
+        pairs = zip(results_of(equilibrium).values(), results_of(self.equilibrium).values(), strict=True)
         for rod, as_it_should_be in pairs:
             along = as_it_should_be.tangents
             scene = as_it_should_be.scene
@@ -162,7 +162,7 @@ def _solved_part(
         scenes, guess = scattering.scenes(zs), scattering.equilibrium
         if isinstance(scenes, Harness):
             assert isinstance(guess, HarnessEquilibrium)
-            rods: Any = harness_batch(unstacked(scenes), guess=guess, strain_limit=None, is_told=False, **options)
+            rods: Any = harness_batch(list(unstacked(scenes)), guess=guess, strain_limit=None, is_told=False, **options)
         else:
             assert isinstance(guess, Equilibrium)
             rods = solve_stack(scenes, guess=guess, strain_limit=None, **options)

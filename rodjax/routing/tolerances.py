@@ -26,7 +26,7 @@ from rodjax.programs.tasks import Workers, checked_executor, checked_threads
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.scatter import Moments, Quantities, Scattering, by_derivatives, by_few, by_samples
-from rodjax.solving.harness_result import HarnessEquilibrium, Solution, rods_of, solved_in
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
 
@@ -298,7 +298,7 @@ def _envelope(
     first = by_derivatives(slopes)
     values, p = slopes.here.values, len(owners)
     deviation = np.sqrt(first.values)
-    s = np.concatenate([np.asarray(rod.s) for rod in rods_of(scattering.equilibrium).values()])
+    s = np.concatenate([np.asarray(rod.s) for rod in results_of(scattering.equilibrium).values()])
     stiffness, stiffness_deviation = float(slopes.stiffness), float(np.linalg.norm(slopes.stiffness_by))
     flags, sampled, count = {}, None, 0
 

@@ -158,11 +158,11 @@ def solved_in(result: Solution) -> Scene | Harness:
     return result.scene if isinstance(result, Equilibrium) else result.harness
 
 
-def rods_of(result: Solution) -> dict[str, Equilibrium]:
-    """Its rods, by what the names of their quantities begin with: nothing where there is only one."""
-    if isinstance(result, Equilibrium):
-        return {"": result}
-    return {f"{name}: ": rod for name, rod in result.items()}
+def results_of(result: Solution, prefix: str = "{}: ") -> dict[str, Equilibrium]:
+    """Those of all rods, by `prefix` with the name of each; by nothing where there is only one."""
+    if isinstance(result, HarnessEquilibrium):
+        return {prefix.format(name): rod for name, rod in result.items()}
+    return {"": result}
 
 
 def _range(name: str, s: np.ndarray) -> str:

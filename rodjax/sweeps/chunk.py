@@ -13,7 +13,7 @@ from rodjax.io.files import FIELDS
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_batch
-from rodjax.solving.harness_result import HarnessEquilibrium, Solution
+from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of
 from rodjax.solving.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
 from rodjax.solving.result import (
     Equilibrium,
@@ -24,7 +24,7 @@ from rodjax.solving.result import (
     positions_at,
 )
 from rodjax.sweeps.cases import CaseScenes
-from rodjax.sweeps.manifest import Manifest
+from rodjax.sweeps.manifest import OF_CABLE, Manifest
 from rodjax.sweeps.quantities import QUANTITIES
 from rodjax.warn import silenced
 
@@ -79,7 +79,7 @@ def solved_chunk(chunk: Chunk) -> dict[str, np.ndarray]:
 
 def _values(result: Solution, manifest: Manifest) -> dict[str, np.ndarray]:
     arrays = {name: np.asarray(getattr(result, name)) for name in RESULTS}
-    rods = _rods_of(result)
+    rods = results_of(result, OF_CABLE)
     for prefix, rod in rods.items():
         arrays |= {f"{prefix}{name}": np.asarray(getattr(rod, name)) for name in OF_ROD}
         arrays |= {f"{prefix}{name}": np.asarray(QUANTITIES[name].of(rod)) for name in manifest.quantities}
@@ -88,13 +88,6 @@ def _values(result: Solution, manifest: Manifest) -> dict[str, np.ndarray]:
     # Of a harness those of the rod whose are largest.
     each = [_errors(rod) for rod in rods.values()]
     return arrays | {name: functools.reduce(np.maximum, [errors[name] for errors in each]) for name in ERRORS}
-
-
-def _rods_of(result: Solution) -> dict[str, Equilibrium]:
-    """By what the names of their datasets begin with."""
-    if isinstance(result, HarnessEquilibrium):
-        return {f"cables/{name}/": rod for name, rod in result.items()}
-    return {"": result}
 
 
 def _errors(rod: Equilibrium) -> dict[str, np.ndarray]:
@@ -117,7 +110,7 @@ def _refined(
     """With the cases whose estimated error is above `rtol` solved again, on finer meshes, each from the last one."""
     arrays = {name: values.copy() for name, values in arrays.items()}
     segments, rtol, finest = manifest.segments, manifest.rtol, SIZES[manifest.discretization][-1]
-    s = {prefix: np.asarray(rod.s) for prefix, rod in _rods_of(result).items()}
+    s = {prefix: np.asarray(rod.s) for prefix, rod in results_of(result, OF_CABLE).items()}
     cases = np.arange(len(arrays["segments"]))
     while True:
         error = error_by_rtol(arrays)[cases]
@@ -130,7 +123,7 @@ def _refined(
         settings = settings | {"segments": segments}
         result = solve_batch(scenes, guess=result, **settings)
         found = _values(result, manifest) | {
-            f"{prefix}nodes": _nodes_at(rod, s[prefix][cases]) for prefix, rod in _rods_of(result).items()
+            f"{prefix}nodes": _nodes_at(rod, s[prefix][cases]) for prefix, rod in results_of(result, OF_CABLE).items()
         }
         found["segments"] = np.full(len(cases), segments)
         # What does not converge on a finer mesh stays as it was, above `rtol`.

@@ -17,6 +17,8 @@ from rodjax.sweeps.cases import MAX_CASES, SweepError
 
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.
 FORMAT = 4
+# What the names of the datasets of a cable begin with.
+OF_CABLE = "cables/{}/"
 
 
 class Manifest(NamedTuple):
@@ -64,7 +66,7 @@ class Manifest(NamedTuple):
     @property
     def prefixes(self) -> list[str]:
         """What the names of the datasets of each rod begin with."""
-        return [f"cables/{name}/" for name in json.loads(self.cables)] or [""]
+        return [OF_CABLE.format(name) for name in json.loads(self.cables)] or [""]
 
     def names(self, of_whole: Sequence[str], of_rod: Sequence[str]) -> list[str]:
         """Of the datasets of the whole and of each rod."""

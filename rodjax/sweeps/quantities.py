@@ -8,7 +8,7 @@ import numpy as np
 from rodjax.analysis.clearance import clearance
 from rodjax.analysis.curvature import curvature_along
 from rodjax.checks import sequence, shown
-from rodjax.model.harness import Harness
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.scene import Scene
 from rodjax.solving.result import Equilibrium, over_leading_axes
 from rodjax.sweeps.cases import SweepError
@@ -63,7 +63,6 @@ QUANTITIES = {
 
 def checked_quantities(names: Any, scene: Scene | Harness) -> tuple[str, ...]:
     """The names, where there are such quantities of the scene, or of all cables. Raises `SweepError`."""
-    rods = {"": scene} if isinstance(scene, Scene) else dict(zip(scene.names, scene.scenes, strict=True))
     try:
         given: Sequence[Any] = sequence(names, "also", "names of quantities")
     except TypeError as error:
@@ -72,7 +71,7 @@ def checked_quantities(names: Any, scene: Scene | Harness) -> tuple[str, ...]:
         if not isinstance(name, str) or name not in QUANTITIES:
             raise SweepError(f"also must be some of {', '.join(QUANTITIES)}, got {shown(name)}")
         for need in QUANTITIES[name].needs:
-            for cable, own in rods.items():
+            for cable, own in scenes_of(scene).items():
                 value = getattr(own.rod if need.startswith("rod.") else own, need.removeprefix("rod."))
                 if value is None or (isinstance(value, tuple) and not value):
                     of_cable = f": the cable {cable!r}" if cable else ""

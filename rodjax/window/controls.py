@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rodjax.checks import leaf, namespace, number_array, rotation, vector
 from rodjax.model.along import Along
-from rodjax.model.harness import Harness
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Obstacle, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
@@ -129,7 +129,7 @@ def _pose_between(pose: Pose, other: Pose, fraction: float) -> Pose:
 
 def rods_of(scene: Scene | Harness) -> dict[str, Scene]:
     """The rods by what the names of their controls begin with: nothing where there is only one."""
-    return {"": scene} if isinstance(scene, Scene) else dict(zip(map("{}/".format, scene), scene.scenes, strict=True))
+    return scenes_of(scene, "{}/")
 
 
 def handles_of(scene: Scene | Harness) -> dict[str, Handle]:

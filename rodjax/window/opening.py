@@ -9,6 +9,7 @@ from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene
 from rodjax.notes import in_notebook
+from rodjax.paths.harness_path import unstacked
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import CLEARANCE
 from rodjax.routing.route import Route
@@ -16,7 +17,7 @@ from rodjax.routing.tolerances import Envelope
 from rodjax.solving.harness_result import HarnessEquilibrium, solved_in
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.window.browser import Window
-from rodjax.window.session import SEGMENTS, Session, rows_in
+from rodjax.window.session import SEGMENTS, Session
 
 # Rods of an envelope that are drawn at random and shown.
 DRAWN = 60
@@ -127,7 +128,7 @@ def session_of(shown: Shown, segments: int | None, strain_limit: float = DEFAULT
         segments = _mesh_of(last)
     session = Session(solved_in(last), segments=segments, guess=last, strain_limit=strain_limit)
     if axes:
-        session.add_recorded(rows_in(shown))
+        session.add_recorded(unstacked(shown))
     return session
 
 

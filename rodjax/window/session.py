@@ -12,11 +12,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from rodjax.checks import instance, leaf, whole_number
+from rodjax.checks import instance, whole_number
 from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, has_potential
 from rodjax.model.supports import Directed
+from rodjax.paths.harness_path import unstacked
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import compiled_only
 from rodjax.solving.equilibrium import MAX_SEGMENTS
@@ -332,7 +333,7 @@ class Session:
         """The equilibria of stacked scenes, each from the last one of a path, else all from the guess; without those
         that have none.
         """
-        for scene in rows_in(scenes):
+        for scene in unstacked(scenes):
             found = self.solved(movable(scene), guess)
             if bool(found.converged):
                 guess = found if is_path else guess
@@ -343,13 +344,6 @@ class Session:
         if not self.recorded:
             raise ValueError("nothing is recorded yet")
         return jax.tree.map(lambda *leaves: np.stack(leaves), *(moment.result for moment in self.recorded))
-
-
-def rows_in(stack: Any) -> Iterator[Any]:
-    """What is stacked along a leading axis, one after another."""
-    stack = jax.tree.map(np.asarray, stack)
-    for k in range(len(jax.tree.leaves(stack)[0])):
-        yield jax.tree.map(lambda x, k=k: leaf(x[k]), stack)
 
 
 def movable(scene: Any) -> Any:

@@ -84,8 +84,10 @@ def test_a_shape_that_fits_is_left_as_it_is():
     np.testing.assert_allclose(results[0].nodes, results[1].nodes, atol=1e-9)
 
 
-# Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the
-# others within boxes. Ends, tangents in the plane, weight, capsule (start, end, radius), box (center, size), cylinder.
+# Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the next
+# two within boxes. The rods of two more are tight around pipes, whose curvature they have, so that the nearest place of an
+# element is anywhere: four sets of contacts came in turn. The first shape of the last is pushed against a pipe with 1e6
+# EI/L^2, for which no shift of rotations was enough. Ends, tangents in the plane, weight, capsule (start, end, radius), box (center, size), cylinder.
 SCENES = {
     "too long": (
         (0.60637743, (0.85658923, -0.51599892), (0.89873231, -0.4384977), 1.09834266),
@@ -104,6 +106,24 @@ SCENES = {
         ((0.3101, -0.9816, -0.1179), (-0.0714, 0.9816, -0.1179), 0.0789),
         ((0.4934, 0.0, -0.4263), 0.1694),
         ((0.2546, -0.4984, -0.2627), (0.3352, 0.4984, -0.2627), 0.0658),
+    ),
+    "tight around a capsule": (
+        (0.41363542, (0.99749019, -0.0708048), (0.86453938, -0.50256508), 25.28689465),
+        ((0.267, -0.9877, -0.3666), (-0.0463, 0.9877, -0.3666), 0.0387),
+        ((0.1421, 0.0, -10.3126), 0.1482),
+        ((0.2108, -0.496, -10.4225), (0.3364, 0.496, -10.4225), 0.0821),
+    ),
+    "tight around a cylinder": (
+        (0.57370977, (0.99839223, -0.05668301), (0.87819615, -0.47830066), 3.64277486),
+        ((0.2588, -0.9913, -0.0735), (0.5213, 0.9913, -0.0735), 0.0695),
+        ((0.3936, 0.0, -0.0067), 0.1838),
+        ((0.3274, -0.4964, -0.2957), (0.4471, 0.4964, -0.2957), 0.0355),
+    ),
+    "pushed hard": (
+        (0.62709998, (0.83574484, 0.54911798), (0.99943664, -0.03356195), 52.8620741),
+        ((0.0398, -0.9684, 0.0107), (0.5389, 0.9684, 0.0107), 0.079),
+        ((0.1386, 0.0, -0.3259), 0.1072),
+        ((0.352, -0.4861, -0.4748), (0.5858, 0.4861, -0.4748), 0.0344),
     ),
 }
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rodjax.discretization.inner_contacts import SAG, THINNER, Elements, Places
+from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, THINNER, Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve
@@ -123,11 +123,11 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     s, obstacles = form.field.s, touched_within(form.scene)
     free = jnp.where(form.is_held, 0.0, 1.0).astype(s.dtype)
     positions, gravity = point.nodal.positions, form.scene.gravity
-    sag: Array | float = 0.0
+    h, radius = jnp.diff(s), form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
+    parting = PARTING * SAME_CURVATURE * h**2
     if gravity is not None:
-        radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
-        sag = SAG * root(jnp.sum(gravity**2)) * jnp.diff(s) ** 4 / radius
-    elements = Elements.of(positions, point.tangents[:, ::2], form.node_axes(point), free, s, sag)
+        parting += SAG * root(jnp.sum(gravity**2)) * h**4
+    elements = Elements.of(positions, point.tangents[:, ::2], form.node_axes(point), free, s, parting / radius)
     if not obstacles:
         return elements, None, jnp.zeros((0, len(s)), s.dtype)
     distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in obstacles])

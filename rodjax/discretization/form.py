@@ -257,6 +257,10 @@ class Form(eqx.Module):
         a step; the change of L, and the change of its rate.
         """
 
+    def shifted(self, system: Any, shift: Float[Array, ""]) -> Any:
+        """The system of a step that a shift makes shorter."""
+        return system.shifted(shift)
+
     @abstractmethod
     def regular(self, system: AnySystem) -> Any:
         """The system of a linearisation, shifted so that neutral modes are regular."""

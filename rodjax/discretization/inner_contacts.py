@@ -30,16 +30,22 @@ from rodjax.model.obstacles import Obstacle
 
 # Within elements the rod counts as thinner by these parts, in their middle and more at their nodes. Where it lies along
 # an obstacle, nodes and places between them would say the same, and who bears it would be undetermined: so nodes do;
-# and the place is in the middle then. On coarse meshes more, as much as the rod sags between nodes, but no more than
-# `MOST_AT_NODES`: else the place would go from one end of an element to the other with what a step changes.
+# and the place is in the middle then. On coarse meshes more, as much as the rod leaves the obstacle between nodes, but no
+# more than `MOST_AT_NODES`: else the place would go from one end of an element to the other with what a step changes.
 THINNER = 1e-5
 AT_NODES = 8e-5
 MOST_AT_NODES = 0.02
 # A heavy beam held level at both ends sags by w h^4/EI times this.
 SAG = 1 / 384
-# Places of an element among which the nearest one is, and steps of the search from there.
+# Between nodes on an obstacle, whose curvature differs from that of the rod by c, the two part by c h^2 times this; a
+# rod that is pulled tight around a pipe has the curvature of that but for some `SAME_CURVATURE` [1/L].
+PARTING = 1 / 8
+SAME_CURVATURE = 0.1
+# Places of an element among which the nearest one is, and steps of the search from there at most; what moves by less
+# than `NEAR` has been found, as Newton's steps square their errors.
 SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
 STEPS = 8
+NEAR = 1e-9
 # An obstacle of more numbers, as a mesh, is touched in the middle of elements: its distances take too much time.
 MOST_NUMBERS = 1000
 
@@ -64,15 +70,15 @@ class Elements(NamedTuple):
         axes: Float[Array, "3 b n+1"],
         free: Float[Array, "n+1"],
         s: Float[Array, "n+1"],
-        sag: Float[Array, "n"] | float = 0.0,
+        parting: Float[Array, "n"] | float = 0.0,
     ) -> "Elements":
-        """`sag`: between nodes, as a part of the radius."""
+        """`parting`: how far the rod leaves an obstacle between nodes, as a part of the radius."""
 
         def at_ends(of_nodes: Float[Array, "*c n+1"], axis: int) -> Float[Array, "*d n"]:
             return jnp.stack([of_nodes[..., :-1], of_nodes[..., 1:]], axis=axis)
 
         nodes = at_ends(positions.T, 1), at_ends(tangents, 1), at_ends(axes, 1), at_ends(free, 0)
-        return Elements(*nodes, s, jnp.clip(jnp.broadcast_to(sag, s[1:].shape), AT_NODES, MOST_AT_NODES))
+        return Elements(*nodes, s, jnp.clip(jnp.broadcast_to(parting, s[1:].shape), AT_NODES, MOST_AT_NODES))
 
     @property
     def difference(self) -> Float[Array, "3 n"]:
@@ -232,16 +238,22 @@ def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value)
     seen -= seen_radius[None]
     first = samples[jnp.argmin(seen, axis=1)]
 
-    def nearer(_: Any, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        t, low, high, _ = state
+    def goes_on(state: tuple[Array, ...]) -> Bool[Array, ""]:
+        *_, change, steps = state
+        return (steps < STEPS) & jnp.any(change > NEAR)
+
+    def nearer(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        t, low, high, _, _, steps = state
         there = _seen(elements, obstacles, radius, t)
         low, high = jnp.where(there.slope < 0, t, low), jnp.where(there.slope > 0, t, high)
         further = t - there.slope / jnp.where(there.growth > 0, there.growth, 1.0)
         is_between = (there.growth > 0) & (low <= further) & (further <= high)
-        return jnp.where(is_between, further, (low + high) / 2), low, high, there.gaps
+        t_next = jnp.where(is_between, further, (low + high) / 2)
+        return t_next, low, high, there.gaps, jnp.abs(t_next - t), steps + 1
 
-    begin = first, jnp.maximum(first - spacing, 0.0), jnp.minimum(first + spacing, 1.0), seen[:, 0]
-    t, _, _, reached = jax.lax.fori_loop(0, STEPS, nearer, begin)
+    low, high = jnp.maximum(first - spacing, 0.0), jnp.minimum(first + spacing, 1.0)
+    begin = first, low, high, seen[:, 0], jnp.ones_like(first), jnp.zeros((), int)
+    t, _, _, reached, _, _ = jax.lax.while_loop(goes_on, nearer, begin)
     # Nearest at an end, to which halving comes near only.
     t = jnp.where(seen[:, 0] <= reached, 0.0, t)
     return jnp.where(seen[:, -1] <= jnp.minimum(reached, seen[:, 0]), 1.0, t)

@@ -31,7 +31,7 @@ from rodjax.discretization.contact_gaps import (
     smooth_obstacles,
     within_elements,
 )
-from rodjax.discretization.form import FLOOR_SAFETY, Linearization
+from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Linearization
 from rodjax.discretization.friction import tangential
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.node_contacts import (
@@ -173,6 +173,13 @@ class NodalForm(PositionForm):
 
     # --- the search --------------------------------------------------------------------------------------------------
 
+    def shifted(self, system: Any, shift: Float[Array, ""]) -> ChainSystem:
+        """Nodes are held back, too: pushed hard against what is round, a rod is unstable however stiff its rotations."""
+        system = system.shifted(shift)
+        # What only makes neutral turns regular leaves the balance of nodes as it is.
+        held = jnp.where(shift > NEUTRAL, shift, 0.0) * jnp.eye(3, dtype=shift.dtype)
+        return dataclasses.replace(system, stiffness=system.stiffness + held[None])
+
     def scaled(self, others: NodalChange, motion: Any, multipliers: Any) -> NodalChange:
         return NodalChange(motion * others.displacements, multipliers * others.pressures)
 
@@ -282,7 +289,7 @@ class NodalForm(PositionForm):
         """Only where no part of the rod goes through an obstacle, or through another part."""
         if self.scene.self_contact:
             is_better &= ~comes_through(curve(self, point), curve(self, trial))
-        return stays_outside(self, point, trial, is_better) if self.scene.obstacles else is_better
+        return stays_outside(self, point, trial, is_better)
 
     def coupled(self, point: Any, system: AnySystem) -> AnySystem:
         return with_friction(self, point, system)

@@ -308,6 +308,10 @@ class SlidingForm(Form):
     def regular(self, system: AnySystem) -> AnySystem:
         return system.shifted(jnp.asarray(NEUTRAL / system.diagonal.shape[-1], system.diagonal.dtype))
 
+    def shifted(self, system: Any, shift: Float[Array, ""]) -> Any:
+        assert isinstance(system, BorderedSystem)
+        return dataclasses.replace(system.shifted(shift), inner=self.first.shifted(system.inner, shift))
+
     def coupled(self, point: SlidingPoint, system: AnySystem) -> AnySystem:
         assert isinstance(system, BorderedSystem)
         return dataclasses.replace(system, inner=self.at(point.arclengths).coupled(point.inner, system.inner))

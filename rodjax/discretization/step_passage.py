@@ -2,7 +2,8 @@
 
 A step keeps each node on its side of the tangent plane of an obstacle, which of a convex one separates. One that is not
 convex, or thinner than nodes are apart, no tangent plane keeps out: so nodes and points between them are followed on
-their straight lines through the step (`stays_outside`).
+their straight lines through the step (`stays_outside`). Not of half spaces, which have no other side: as deep as a step may
+lead into one between nodes, the next leads out.
 """
 
 from typing import Any
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.geometry.interpolation import cubic
-from rodjax.model.obstacles import least
+from rodjax.model.obstacles import has_other_side, least
 
 # A step takes no point deeper than this, in parts of the radius, into an obstacle; one that is there already so much
 # deeper. Into one that is less thick than the rod none nearer than a part of the radius, else short steps would lead
@@ -30,6 +31,9 @@ MOST_LOOKS = 24
 
 def stays_outside(form: PositionForm, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
     """Whether a step that is better also leads nodes, and points between them, nowhere too deep into an obstacle."""
+    obstacles = [obstacle for obstacle in form.scene.obstacles if has_other_side(obstacle)]
+    if not obstacles:
+        return is_better
     before, after = _looked_at(form, point), _looked_at(form, trial)
     displacements = after - before
     distance = jnp.sqrt(jnp.sum(displacements**2, axis=1))
@@ -37,7 +41,7 @@ def stays_outside(form: PositionForm, point: Any, trial: Any, is_better: Bool[Ar
     rim = jnp.concatenate([radius, *[least(radius[:-1], radius[1:])] * len(LOOKED_AT)])
 
     def distances(positions: Float[Array, "k 3"]) -> Float[Array, "k"]:
-        return least(*(jax.vmap(obstacle.at)(positions) for obstacle in form.scene.obstacles))
+        return least(*(jax.vmap(obstacle.at)(positions) for obstacle in obstacles))
 
     first = distances(before)
     bound = least(DEEPEST * rim, first - DEEPER * rim)
@@ -48,7 +52,7 @@ def stays_outside(form: PositionForm, point: Any, trial: Any, is_better: Bool[Ar
 
         def is_thin(position: Float[Array, "3"], rim: Float[Array, ""]) -> Bool[Array, ""]:
             def nearest(position: Float[Array, "3"]) -> Float[Array, ""]:
-                return least(*(obstacle.at(position) for obstacle in form.scene.obstacles))
+                return least(*(obstacle.at(position) for obstacle in obstacles))
 
             depth, normal = jax.value_and_grad(nearest)(position)
             return nearest(position - (depth + rim) * normal) > -THIN * rim

@@ -19,6 +19,7 @@ from rodjax.identification.unknowns import Scale, inside, nominal, with_values
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.programs.compilation import compiled
+from rodjax.programs.parts import traced_once
 from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.harness_result import Solution
 from rodjax.solving.newton import Newton
@@ -190,6 +191,7 @@ class Evaluation(eqx.Module):
         return jnp.concatenate([result.converged for result in self.results])
 
 
+@functools.partial(traced_once, static="structure")
 def evaluation(
     structure: Structure, problem: Problem, z: Coordinates, guesses: tuple[Solution, ...], is_used: Bool[Array, "e"]
 ) -> Evaluation:

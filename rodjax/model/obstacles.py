@@ -249,6 +249,11 @@ class InUnits(Obstacle):
         return self.obstacle.at(self.origin + self.length * point) / self.length
 
 
+def has_other_side(obstacle: Obstacle) -> bool:
+    """Whether a rod could come through it: not through half of all space."""
+    return not isinstance(obstacle.obstacle if isinstance(obstacle, InUnits) else obstacle, Plane)
+
+
 def rows(value: Any, name: str, least: int, shape: str) -> Float[Numbers, "... 3"]:
     """`value` as points, at least so many along its first axis; `shape` says in messages what is allowed."""
     try:

@@ -43,8 +43,8 @@ class _Part:
 
     count = 0
 
-    def __init__(self, function: Callable):
-        self.function = function
+    def __init__(self, function: Callable, static: str | tuple[str, ...]):
+        self.function, self.static = function, static
         self.inside: Any = None
 
     def __call__(self, *args: Any) -> Any:
@@ -65,15 +65,18 @@ class _Part:
             _Part.count += 1
             return self.function(*args)
 
-        return jax.jit(traced)
+        return jax.jit(traced, static_argnames=self.static)
 
 
 _parts: list[_Part] = []
 
 
-def traced_once(function: F) -> F:
-    """A function of arrays and structures of arrays as a part of programs; by itself it is called as it is."""
-    part = _Part(function)
+def traced_once(function: F, static: str | tuple[str, ...] = ()) -> F:
+    """A function of arrays and structures of arrays as a part of programs; by itself it is called as it is.
+
+    `static`: names of arguments that are none, and may be compared.
+    """
+    part = _Part(function, static)
     _parts.append(part)
 
     @functools.wraps(function)

@@ -1,7 +1,6 @@
 """A route as numbers: from design variables in 0 to 1 to what is least, what must not be negative, and their rates."""
 
-import functools
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clip, Held, Support
 from rodjax.programs.compilation import compiled
+from rodjax.programs.parts import traced_once
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Measured, measured
 from rodjax.routing.objective import Objective
@@ -21,6 +21,8 @@ from rodjax.routing.variables import Variable, leaf_names, with_numbers
 from rodjax.solving.equilibrium import Solver
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium
+
+T = TypeVar("T")
 
 
 class Problem(eqx.Module):
@@ -127,6 +129,7 @@ def _kept(problem: Problem, result: Equilibrium) -> list[Measured]:
     return measured(result, problem.limits, problem.obstacles, everywhere=True)
 
 
+@traced_once
 def _values(
     problem: Problem, scene: Scene, result: Equilibrium
 ) -> tuple[Float[Array, ""], Float[Array, "m"], Float[Array, "spans"], list[Measured]]:
@@ -136,6 +139,7 @@ def _values(
     return problem.objective.of(result), jnp.concatenate([spare, *(each.slack for each in kept)]), spare, kept
 
 
+@traced_once
 def _evaluated(problem: Problem, design: Float[Array, "n"], result: Equilibrium) -> Evaluation:
     def outputs(u: Float[Array, "n"]) -> tuple[Float[Array, "r"], Any]:
         scene = problem.scene_at(u)
@@ -203,8 +207,8 @@ def valued(
 
 def group_starts(problem: Problem, guesses: Equilibrium) -> tuple[int, ...]:
     """The number of the first slack of each span, and of each thing that is limited."""
-    one = jax.eval_shape(lambda stack: jax.tree.map(lambda leaf: leaf[0], stack), guesses)
-    _, _, spare, kept = jax.eval_shape(lambda found: _values(problem, found.scene, found), one)
+    one = _kind_of_one(guesses)
+    _, _, spare, kept = jax.eval_shape(_values, problem, one.scene, one)
     count = spare.shape[0]
     sizes = [each.slack.shape[0] for each in kept]
     return (*range(count), *(count + sum(sizes[:k]) for k in range(len(sizes))))
@@ -212,8 +216,13 @@ def group_starts(problem: Problem, guesses: Equilibrium) -> tuple[int, ...]:
 
 def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium) -> Evaluation:
     """What comes before the first evaluation."""
-    found = jax.eval_shape(jax.vmap(functools.partial(_evaluated, problem)), designs, guesses)
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), found)
+    found = jax.eval_shape(_evaluated, problem, *_kind_of_one((designs, guesses)))
+    return jax.tree.map(lambda leaf: jnp.zeros((len(designs), *leaf.shape), leaf.dtype), found)
+
+
+def _kind_of_one(stack: T) -> T:
+    """Shapes and types of an entry."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), stack)
 
 
 @compiled

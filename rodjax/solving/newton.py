@@ -191,7 +191,7 @@ def _advanced(
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
-    system, aside = here.system.shifted(h * shift), push * components(here.bases, pattern)
+    system, aside = form.shifted(here.system, h * shift), push * components(here.bases, pattern)
     is_definite, rotation, multipliers = form.sought(here, point, system, aside)
     others = form.others(multipliers)
     is_finite = jnp.isfinite(here.residual + here.energy)

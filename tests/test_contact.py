@@ -222,6 +222,23 @@ def test_a_thin_pipe_between_nodes_carries_a_heavy_cable():
     assert len(result.s) - 1 <= 64
 
 
+def test_the_estimate_knows_the_kink_of_moments_between_nodes():
+    """A pipe that lifts a clamped beam between two nodes: what its moment there has beyond that at both nodes."""
+    pipe = rj.Capsule((0.5, -1, -0.022), (0.5, 1, -0.022), 0.02)  # lifts by 0.003
+    ends = (Clamp((x, 0, 0), LEVEL) for x in (0.0, 1.0))
+    above = rj.Guess([(0, 0, 0), (0.5, 0, 0.01), (1, 0, 0)])
+    rod = Rod(1.0, 1.0, 0.8, 1e4, 0.0, radius=RADIUS)
+    result = rj.solve(Scene(rod, *ends, obstacles=[pipe]), segments=33, guess=above)
+    assert result.converged
+    # 192 EI w/L^3, but for the tension of so small a deflection.
+    assert float(jnp.sum(result.obstacle_forces, axis=(0, 1))[2]) == pytest.approx(192 * 0.003, rel=0.01)
+    curvature = np.asarray(result.curvature)
+    # In a straight line from both nodes before the pipe; in units of the least moment that counts, 0.1 EI/L. To 2 %, by
+    # which tension bends that line.
+    kink = (curvature[16] - curvature[15]) / 2
+    assert float(result.moment_error) == pytest.approx(kink / 0.1, rel=0.02)
+
+
 def test_contact_points_within_elements_have_exact_derivatives():
     """Second ones too, beside those that JAX finds of the same gaps as their places move. Of two elements the first
     touches a capsule within, the second is nearest to it at their common node.

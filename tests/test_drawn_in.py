@@ -84,6 +84,18 @@ def test_a_shape_that_fits_is_left_as_it_is():
     np.testing.assert_allclose(results[0].nodes, results[1].nodes, atol=1e-9)
 
 
+def test_a_thin_rod_comes_out_of_a_floor_in_whole_steps():
+    """Half spaces do not shorten steps that lead deeper into them between nodes than the rod is thick: 100 did not do."""
+    floor = rj.Plane((0, 0, -0.2), (0, 0, 1))
+    ends = (rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, 0.6))
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=3e-4)
+    result = rj.solve(rj.Scene(rod, *ends, (0, 0, -1.0), obstacles=[floor]), segments=64)
+    assert result.converged
+    assert int(result.iterations) <= 30
+    # To rounding.
+    assert np.min(floor.distance(result.nodes)) > 3e-4 - 1e-12
+
+
 # Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the next
 # two within boxes. The rods of two more are tight around pipes, whose curvature they have, so that the nearest place of an
 # element is anywhere: four sets of contacts came in turn. The first shape of the last is pushed against a pipe with 1e6

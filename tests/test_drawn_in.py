@@ -85,7 +85,7 @@ def test_a_shape_that_fits_is_left_as_it_is():
 
 
 def test_a_thin_rod_comes_out_of_a_floor_in_whole_steps():
-    """Half spaces do not shorten steps that lead deeper into them between nodes than the rod is thick: 100 did not do."""
+    """Half spaces shorten no steps that lead deeper into them between nodes than the rod is thick: 100 did not do."""
     floor = rj.Plane((0, 0, -0.2), (0, 0, 1))
     ends = (rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, 0.6))
     rod = rj.Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=3e-4)
@@ -96,10 +96,11 @@ def test_a_thin_rod_comes_out_of_a_floor_in_whole_steps():
     assert np.min(floor.distance(result.nodes)) > 3e-4 - 1e-12
 
 
-# Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the next
-# two within boxes. The rods of two more are tight around pipes, whose curvature they have, so that the nearest place of an
-# element is anywhere: four sets of contacts came in turn. The first shape of the last is pushed against a pipe with 1e6
-# EI/L^2, for which no shift of rotations was enough. Ends, tangents in the plane, weight, capsule (start, end, radius), box (center, size), cylinder.
+# Of `random_scene` of `experiments/contact.py`: the first begins a fifth too long below a pipe and beside a box, the
+# next two within boxes. The rods of two more are tight around pipes, whose curvature they have, so that the nearest
+# place of an element is anywhere: four sets of contacts came in turn. The first shape of the last is pushed against a
+# pipe with 1e6 EI/L^2, for which no shift of rotations was enough. Ends, tangents in the plane, weight, capsule (start,
+# end, radius), box (center, size), cylinder.
 SCENES = {
     "too long": (
         (0.60637743, (0.85658923, -0.51599892), (0.89873231, -0.4384977), 1.09834266),

@@ -30,8 +30,9 @@ from rodjax.model.obstacles import Obstacle
 
 # Within elements the rod counts as thinner by these parts, in their middle and more at their nodes. Where it lies along
 # an obstacle, nodes and places between them would say the same, and who bears it would be undetermined: so nodes do;
-# and the place is in the middle then. On coarse meshes more, as much as the rod leaves the obstacle between nodes, but no
-# more than `MOST_AT_NODES`: else the place would go from one end of an element to the other with what a step changes.
+# and the place is in the middle then. On coarse meshes more, as much as the rod leaves the obstacle between nodes, but
+# no more than `MOST_AT_NODES`: else the place would go from one end of an element to the other with what a step
+# changes.
 THINNER = 1e-5
 AT_NODES = 8e-5
 MOST_AT_NODES = 0.02

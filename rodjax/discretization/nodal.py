@@ -174,7 +174,7 @@ class NodalForm(PositionForm):
     # --- the search --------------------------------------------------------------------------------------------------
 
     def shifted(self, system: Any, shift: Float[Array, ""]) -> ChainSystem:
-        """Nodes are held back, too: pushed hard against what is round, a rod is unstable however stiff its rotations."""
+        """Nodes are held back, too: pushed hard against what is round, they are unstable, however stiff rotations."""
         system = system.shifted(shift)
         # What only makes neutral turns regular leaves the balance of nodes as it is.
         held = jnp.where(shift > NEUTRAL, shift, 0.0) * jnp.eye(3, dtype=shift.dtype)

@@ -2,8 +2,8 @@
 
 A step keeps each node on its side of the tangent plane of an obstacle, which of a convex one separates. One that is not
 convex, or thinner than nodes are apart, no tangent plane keeps out: so nodes and points between them are followed on
-their straight lines through the step (`stays_outside`). Not of half spaces, which have no other side: as deep as a step may
-lead into one between nodes, the next leads out.
+their straight lines through the step (`stays_outside`). Not of half spaces, which have no other side: however deep a
+step leads into one between nodes, the next leads out.
 """
 
 from typing import Any

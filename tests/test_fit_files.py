@@ -141,14 +141,129 @@ def test_a_table_in_space_without_arclengths_and_with_keys():
     )
     a, b = table.experiments
     assert (table.axes, table.keys) == ("xyz", ["rod.length", "end.position"])
-    np.testing.assert_allclose(a.points, [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]])
-    assert a.s is None
+    (rod,) = a.rods.values()
+    np.testing.assert_allclose(rod.points, [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]])
+    assert rod.s is None
     assert a.cluster is None
-    assert a.loads == {"end_moment_x": pytest.approx(1e-3), "end_moment_y": 2.0, "end_moment_z": 3.0}
+    assert rod.loads == {"end_moment_x": pytest.approx(1e-3), "end_moment_y": 2.0, "end_moment_z": 3.0}
     assert a.values["rod.length"] == pytest.approx(1.1)
     np.testing.assert_allclose(a.values["end.position"], [0.8, 0, 0])
-    assert b.points.shape == (0, 3)
-    assert (b.loads, b.values) == ({"end_moment_z": 4.0}, {})
+    (rod,) = b.rods.values()
+    assert rod.points.shape == (0, 3)
+    assert (rod.loads, b.values) == ({"end_moment_z": 4.0}, {})
+
+
+HARNESS = """
+[cables.trunk]
+rod = { length = "0.5 m", EI = "5e-3 N m^2", GJ = "4e-3 N m^2", EA = "800 N", mass_per_length = "0.1 kg/m" }
+start = { support = "clamp", position = "[0, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }
+end = { support = "joint", joint = "y", tangent = [1, 0, 0], d2 = [0, 1, 0] }
+
+[cables.left]
+rod = { length = "0.5 m", EI = "3e-3 N m^2", GJ = "2e-3 N m^2", EA = "800 N", mass_per_length = "0.1 kg/m" }
+start = { support = "joint", joint = "y", tangent = [1, 0, 0], d2 = [0, 1, 0] }
+end = { support = "clamp", position = "[0.8, 0, 0] m", tangent = [1, 0, 0], d2 = [0, 1, 0] }
+
+[joints.y]
+mass = "20 g"
+
+[loads]
+gravity = "[0, 0, -9.81] m/s^2"
+"""
+OF_HARNESS = """
+scene = "harness.toml"
+[[unknown]]
+name = "cables.trunk.rod.EI"
+[[unknown]]
+name = "joints.y.mass"
+[measured]
+sd = "0.1 mm"
+force_sd = "1 mN"
+[fit]
+segments = 4
+[experiments]
+gap = "cables.left.end.position.0"
+"""
+TABLE = """experiment,cable,gap [mm],s [mm],x [mm],y [mm],z [mm],end_force_z [N],start_force_z [N]
+near,trunk,750,250,200,0,-80,,0.5
+near,left,,250,500,0,-90,0.45,
+far,left,800,250,520,0,-70,0.46,
+"""
+
+
+def write_harness(table=TABLE):
+    for name, text in (("harness.toml", HARNESS), ("fit.toml", OF_HARNESS), ("data.csv", table)):
+        Path(name).write_text(text)
+
+
+def test_rows_of_a_harness_name_their_cables(files):
+    write_harness()
+    near, far = read_fit_files("fit.toml", "data.csv").experiments
+    assert [float(one.scene["left"].end.position[0]) for one in (near, far)] == [0.75, 0.8]
+    assert [(type(one).__name__, one.cable) for one in near.measured] == [
+        ("Centerline", "trunk"),
+        ("EndForce", "trunk"),
+        ("Centerline", "left"),
+        ("EndForce", "left"),
+    ]
+    np.testing.assert_allclose(near.measured[2].points, [[0.5, 0, -0.09]])
+    assert [(one.end, float(one.value[0])) for one in near.measured[1::2]] == [("start", 0.5), ("end", 0.45)]
+    assert [one.cable for one in far.measured] == ["left", "left"]
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("data.csv", "far,left", "far,right", "experiment 'far': cable must be one of trunk, left of harness.toml"),
+        ("data.csv", "far,left", "far,", "line 4, column cable: is empty; it must be a name"),
+        ("data.csv", "far,left,800,250", "far,left,800,750", "experiment 'far': s must lie in 0 to 0.5 m"),
+        ("data.csv", "near,left,,", "near,left,760,", "line 3, column gap [mm]: must be the same in all rows of exp"),
+        ("fit.toml", '"cables.trunk.rod.EI"', '"rod.EI"', "unknown[0]: there is no number 'rod.EI'"),
+        ("fit.toml", "left.end", "right.end", "cables.right"),
+        ("fit.toml", "segments = 4", "segments = 4\nplanar = true", "planar must be False for a harness, in space"),
+    ],
+)
+def test_a_mistake_about_cables_is_one_line(name, old, new, said, files, capsys, monkeypatch):
+    write_harness()
+    changed(name, old, new)
+    monkeypatch.undo()
+    monkeypatch.chdir(files)
+    line = refused(capsys)
+    assert said in line, line
+
+
+def test_rows_are_of_cables_where_the_scene_has_these(files, capsys):
+    changed("data.csv", "experiment,cluster", "experiment,cable")
+    assert "data.csv: column cable is not allowed: scene.toml has one rod, and no cables" in refused(capsys)
+    write_harness("experiment,gap [mm],end_force_z [N]\nnear,750,0.45\n")
+    said = "data.csv: column cable is missing, the cable that a row is of: harness.toml has the cables trunk, left"
+    assert said in refused(capsys)
+
+
+@pytest.mark.slow
+def test_the_command_fits_a_harness(tmp_path, monkeypatch, capsys):
+    """What the measurements were made with, which are exact but for the digits of the table."""
+    monkeypatch.chdir(tmp_path)
+    write_harness()
+    harness = rj.read_scene("harness.toml")
+    true = rj.solve(harness, segments=4)
+    rows = ["experiment,cable,s,x,y,z,start_force_x,start_force_z"]
+    for cable in harness:
+        for k, s in enumerate((0.1, 0.3, 0.4)):
+            x, y, z = (float(number) for number in true[cable].position_at([s])[0])
+            force = -np.asarray(true[cable].start_force) if k == 0 and cable == "trunk" else ("", "", "")
+            rows.append(f"only,{cable},{s},{x:.9f},{y:.9f},{z:.9f},{force[0]},{force[2]}")
+    Path("data.csv").write_text("\n".join(rows))
+    changed("fit.toml", '[experiments]\ngap = "cables.left.end.position.0"\n', "")
+    changed("harness.toml", '"5e-3 N m^2"', '"6e-3 N m^2"')
+    changed("harness.toml", '"20 g"', '"25 g"')
+    assert main(["fit", "fit.toml", "data.csv"]) == 0
+    found = json.loads(Path("rodjax-fit/report.json").read_text())["estimate"]
+    # Places to 1e-9 m of 0.1 m and tight enough solves.
+    assert found["cables.trunk.rod.EI"] == pytest.approx(5e-3, rel=1e-5)
+    assert found["joints.y.mass"] == pytest.approx(0.02, rel=1e-5)
+    assert imread("rodjax-fit/shapes.png").ndim == 3
+    assert "cables.trunk.rod.EI [N m^2]" in capsys.readouterr().out
 
 
 def test_a_vector_is_one_measurement_and_the_nominal_scene_stays_where_nothing_is_said(files):
@@ -207,7 +322,7 @@ IN_THE_FIT = [
     ('gap = "end.position.0"', 'gap = "end.place"', "experiments: end.place cannot vary", "end.position.2"),
 ]
 IN_THE_TABLE = [
-    ("experiment,", "test,", "column test is not allowed", "experiment, cluster, s, x, y, z"),
+    ("experiment,", "test,", "column test is not allowed", "experiment, cluster, cable, s, x, y, z"),
     ("experiment,cluster", "cluster,rod.GJ", "column experiment is missing", "name"),
     ("z [mm]", "cluster", "column cluster is given twice", ""),
     ("x [mm],z [mm]", "x [mm],x [m]", "column x [m] is given twice, first as x [mm]", ""),

@@ -28,6 +28,9 @@ A complete example of the first; quantities are as in scene files, a number and 
     [experiments]                  # optional: columns of the table under names of their own, and the keys they hold
     gap = "end.position.0"
 
+The scene may be a harness (`rodjax.io.harness_file`): names and keys begin with "cables.NAME" or "joints.NAME" then,
+"cables.trunk.rod.EI", "joints.y.mass", and the table has a column `cable`.
+
 Names of unknowns are those of `rodjax.Unknown`: "rod.EI.0" of a pair, "end.position.2", "gravity.1",
 "point_forces.0.at", a clamp's turn from the nominal frame "start.frame.1", a rig's scale "measured.0.scale"; there and
 in `rodjax.fit` is what scales, priors and losses mean. Without standard deviations all measurements must be of one
@@ -38,6 +41,7 @@ The table has a header and one row for each measured point. Columns are, with a 
 
 - `experiment`: name of the experiment that a row belongs to. `cluster`: that of the repeat, day or specimen, whose
   measurements go astray together; optional, without it each experiment is a cluster of its own.
+- `cable`: of a harness the name of the rod on which the point, or the force of the row, was measured.
 - `x [m]`, `y [m]`, `z [m]`: the point. One of the three may be missing: the rod is then seen along that axis, and
   nothing is known of where it is along it.
 - `s [m]`: its arclength; without it, or with all cells of an experiment empty, what counts is its distance from the
@@ -47,8 +51,8 @@ The table has a header and one row for each measured point. Columns are, with a 
 - keys of the scene file, `end.position.0 [mm]`, `rod.length`, or their names in `[experiments]`: replace what the scene
   has, in that experiment. Cells as in the tables of `rodjax.sweeps`; where they are empty the scene's value stays.
 
-All but points and arclengths have one value in an experiment: in one of its rows, or the same in several. Rows without
-a point have empty cells there. Beside the example above:
+All but points and arclengths have one value in an experiment, forces and moments one for each cable: in one of its
+rows, or the same in several. Rows without a point have empty cells there. Beside the example above:
 
     experiment, cluster, gap [mm], s [mm], x [mm], z [mm], end_force_x [N], end_force_z [N]
     near 1,     Monday,  700,      0,      0.3,    -0.2,   -0.213,          0.441
@@ -58,6 +62,7 @@ a point have empty cells there. Beside the example above:
 """
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -67,11 +72,12 @@ from jaxtyping import Float
 
 from rodjax.checks import file_path, shown, whole_number
 from rodjax.identification.loss import Loss
-from rodjax.identification.measured_table import AXES, MeasuredRows, MeasuredTable, read_table
+from rodjax.identification.measured_table import AXES, LABELS, MeasuredRod, MeasuredRows, MeasuredTable, read_table
 from rodjax.identification.measured_table import UNITS as MEASURED
 from rodjax.identification.measurements import Centerline, EndForce, EndMoment, Experiment, Measurement, orthographic
 from rodjax.identification.unknowns import Per, Scale, Unknown, known_names, target
 from rodjax.io.clocking import check_clocked
+from rodjax.io.harness_file import HarnessFile
 from rodjax.io.quantities import SceneFileError, check_keys, choice, flag, in_file, si_value, table_list
 from rodjax.io.scene_file import SceneFile, read_text, toml_tables
 from rodjax.io.scene_keys import SceneVariations
@@ -113,7 +119,7 @@ def read_fit_files(fit: str | os.PathLike[str], data: str | os.PathLike[str]) ->
         _check_deviations(deviations, table)
     experiments, file = _experiments(table, scene, data, deviations)
     with in_file(fit):
-        _check_names(tables, experiments, file.unclocked)
+        _check_names(tables, experiments, file.unclocked if isinstance(file, SceneFile) else ())
         unknowns = [_unknown(one, where) for where, one in tables.items()]
     if "rtol" not in settings and "segments" not in settings:
         settings |= {"rtol": file.rtol, "segments": file.segments}
@@ -247,9 +253,9 @@ def _positive(value: Any, key: str, unit: str) -> float:
 def _check_deviations(deviations: Mapping[str, float], table: MeasuredTable) -> None:
     """What is compared with each other needs a scale, unless it is all of one kind."""
     is_measured = {
-        "sd": any(len(one.points) for one in table.experiments),
-        "force_sd": any("force" in name for one in table.experiments for name in one.loads),
-        "moment_sd": any("moment" in name for one in table.experiments for name in one.loads),
+        "sd": any(len(rod.points) for rod in table.rods),
+        "force_sd": any("force" in name for rod in table.rods for name in rod.loads),
+        "moment_sd": any("moment" in name for rod in table.rods for name in rod.loads),
     }
     needed = [key for key, is_in in is_measured.items() if is_in]
     if len(needed) == 1 and needed[0] not in deviations:
@@ -269,7 +275,7 @@ def _column_names(table: Any) -> dict[str, str]:
     if not isinstance(table, dict) or not all(isinstance(key, str) for key in table.values()):
         raise SceneFileError(f'experiments must be a table such as gap = "end.position.0", got {shown(table)}')
     for name in table:
-        if name in ("experiment", "cluster", *MEASURED):
+        if name in (*LABELS, *MEASURED):
             raise SceneFileError(f"experiments.{name} must have another name: columns {name} are of what was measured")
     if table:
         try:
@@ -284,35 +290,52 @@ def _column_names(table: Any) -> dict[str, str]:
 
 def _experiments(
     table: MeasuredTable, path: Path, data: Path, deviations: Mapping[str, float]
-) -> tuple[list[Experiment], SceneFile]:
+) -> tuple[list[Experiment], SceneFile | HarnessFile]:
     """The experiments, and the scene file of the first."""
     with in_file(path):
         content = toml_tables(read_text(path))
         if "path" in content:
             raise SceneFileError("path is not allowed in a fit, which is of single scenes; leave [[path]] out")
-        if "cables" in content:
-            raise SceneFileError("cables are not allowed in a fit from files; in Python rodjax.fit takes a Harness")
         variations = SceneVariations(content, table.keys)
     first = _scene(variations, table.experiments[0], path, data)
+    with in_file(data):
+        _check_cables(table, first, path)
     variations.in_si()
     experiments = []
     for one in table.experiments:
         scene = _scene(variations, one, path, data).scenes[0]
         try:
-            experiments.append(
-                Experiment(scene, _measured(one, table.axes, deviations), cluster=one.cluster, name=one.name)
-            )
+            measured = [
+                each for cable, rod in one.rods.items() for each in _measured(rod, cable, table.axes, deviations)
+            ]
+            experiments.append(Experiment(scene, measured, cluster=one.cluster, name=one.name))
         except ValueError as error:
-            said = str(error).removeprefix("measured[0].")
+            said = re.sub(r"^measured\[\d+\]\.", "", str(error))
             raise SceneFileError(f"{data}: experiment {shown(one.name)}: {said}") from None
     return experiments, first
 
 
-def _scene(variations: SceneVariations, one: MeasuredRows, path: Path, data: Path) -> SceneFile:
+def _check_cables(table: MeasuredTable, file: SceneFile | HarnessFile, path: Path) -> None:
+    """Rows are of cables where the scene file has these."""
+    names = {cable for one in table.experiments for cable in one.rods}
+    if isinstance(file, SceneFile):
+        if names != {None}:
+            raise SceneFileError(f"column cable is not allowed: {path} has one rod, and no cables")
+        return
+    cables = tuple(file.harness)
+    allowed = ", ".join(cables)
+    if None in names:
+        raise SceneFileError(f"column cable is missing, the cable that a row is of: {path} has the cables {allowed}")
+    for one in table.experiments:
+        for cable in one.rods:
+            if cable not in cables:
+                of = f"experiment {shown(one.name)}"
+                raise SceneFileError(f"{of}: cable must be one of {allowed} of {path}, got {shown(cable)}")
+
+
+def _scene(variations: SceneVariations, one: MeasuredRows, path: Path, data: Path) -> SceneFile | HarnessFile:
     try:
-        file = variations.read(one.values)
-        assert isinstance(file, SceneFile), "harnesses are refused before"
-        return file
+        return variations.read(one.values)
     except SceneFileError as mistake:
         if not one.values:
             raise SceneFileError(f"{path}: {mistake}") from None
@@ -320,20 +343,23 @@ def _scene(variations: SceneVariations, one: MeasuredRows, path: Path, data: Pat
         raise SceneFileError(f"{data}: experiment {name}: {mistake} (in {path} with these values)") from None
 
 
-def _measured(one: MeasuredRows, axes: str, deviations: Mapping[str, float]) -> list[Measurement]:
+def _measured(rod: MeasuredRod, cable: str | None, axes: str, deviations: Mapping[str, float]) -> list[Measurement]:
     found: list[Measurement] = []
-    if len(one.points):
+    if len(rod.points):
         camera = None if len(axes) == 3 else orthographic(*(_along(axis) for axis in axes))
-        found.append(Centerline(one.points, one.s, deviations.get("sd"), camera=camera))
+        found.append(Centerline(rod.points, rod.s, deviations.get("sd"), camera=camera, cable=cable))
     kinds: dict[str, Callable[..., Measurement]] = {"force": EndForce, "moment": EndMoment}
     for end in ("start", "end"):
         for kind, measurement in kinds.items():
             sd = deviations.get(f"{kind}_sd")
-            known = {axis: value for axis in AXES if (value := one.loads.get(f"{end}_{kind}_{axis}")) is not None}
+            known = {axis: value for axis in AXES if (value := rod.loads.get(f"{end}_{kind}_{axis}")) is not None}
             if len(known) == 3:
-                found.append(measurement(list(known.values()), sd, end=end))
+                found.append(measurement(list(known.values()), sd, end=end, cable=cable))
             else:
-                found += [measurement(value, sd, end=end, direction=_along(axis)) for axis, value in known.items()]
+                found += [
+                    measurement(value, sd, end=end, direction=_along(axis), cable=cable)
+                    for axis, value in known.items()
+                ]
     return found
 
 

@@ -26,18 +26,28 @@ UNITS = {"s": "m", **dict.fromkeys(AXES, "m"), **LOADS}
 TITLE = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?", re.S)
 
 
-class MeasuredRows(NamedTuple):
-    """What a table says of one experiment.
+# Of which experiment a row is, of which repeat, and of which rod of a harness.
+LABELS = ("experiment", "cluster", "cable")
 
-    `points` (m, d) [m], d = 2 or 3, m = 0 where there are none; `s` (m,) [m] or `None`; `loads`: by the names of their
-    columns [N, N m]; `values`: of keys of the scene, in SI units.
+
+class MeasuredRod(NamedTuple):
+    """What was measured of a rod: `points` (m, d) [m], d = 2 or 3, m = 0 where there are none; `s` (m,) [m] or `None`;
+    `loads`: by the names of their columns [N, N m].
+    """
+
+    points: Float[np.ndarray, "m d"]
+    s: Float[np.ndarray, "m"] | None
+    loads: dict[str, float]
+
+
+class MeasuredRows(NamedTuple):
+    """What a table says of one experiment. `rods`: by the names of the cables of a harness, `None` for the only rod;
+    `values`: of keys of the scene, in SI units.
     """
 
     name: str
     cluster: str | None
-    points: Float[np.ndarray, "m d"]
-    s: Float[np.ndarray, "m"] | None
-    loads: dict[str, float]
+    rods: dict[str | None, MeasuredRod]
     values: dict[str, Float[np.ndarray, "..."]]
 
 
@@ -47,6 +57,10 @@ class MeasuredTable(NamedTuple):
     experiments: list[MeasuredRows]
     axes: str
     keys: list[str]
+
+    @property
+    def rods(self) -> list[MeasuredRod]:
+        return [rod for one in self.experiments for rod in one.rods.values()]
 
 
 class _Column(NamedTuple):
@@ -72,7 +86,7 @@ def read_table(text: str, names: Mapping[str, str]) -> MeasuredTable:
     header, rows = _header_and_rows(text)
     columns = _columns(header, names)
     axes = "".join(axis for axis in AXES if axis in columns)
-    keys = [name for name in columns if name not in ("experiment", "cluster", *UNITS)]
+    keys = [name for name in columns if name not in (*LABELS, *UNITS)]
     groups: dict[str, list[_Row]] = {}
     for row in rows:
         name = row.cells[columns["experiment"].place]
@@ -112,7 +126,7 @@ def _columns(header: Sequence[str], names: Mapping[str, str]) -> dict[str, _Colu
             first = columns[column.name].title
             raise SceneFileError(f"column {line(title)} is given twice, first as {line(first)}")
         columns[column.name] = column
-    keys = [name for name in columns if name not in ("experiment", "cluster", *UNITS)]
+    keys = [name for name in columns if name not in (*LABELS, *UNITS)]
     if keys:
         check_keys(keys)
     for name, key in names.items():
@@ -137,7 +151,7 @@ def _column(place: int, title: str, names: Mapping[str, str]) -> _Column:
     match = TITLE.fullmatch(title)
     name, unit = (match["name"], match["unit"] or "") if match else (title, "")
     name = names.get(name, name)
-    if name in ("experiment", "cluster"):
+    if name in LABELS:
         return _Column(place, title, name, "", 1.0)
     if name in UNITS:
         return _Column(place, title, name, unit, _factor(title, unit, UNITS[name]))
@@ -145,7 +159,7 @@ def _column(place: int, title: str, names: Mapping[str, str]) -> _Column:
         check_keys([name])
     except SceneFileError:
         raise SceneFileError(
-            f"column {line(title) or shown(title)} is not allowed; allowed are experiment, cluster, "
+            f"column {line(title) or shown(title)} is not allowed; allowed are {', '.join(LABELS)}, "
             f"{', '.join(UNITS)}, keys of the scene such as end.position.0, and names in [experiments] of the fit file"
         ) from None
     return _Column(place, title, name, unit, 1.0)
@@ -165,39 +179,48 @@ def _experiment(
     name: str, rows: Sequence[_Row], columns: Mapping[str, _Column], axes: str, keys: Sequence[str]
 ) -> MeasuredRows:
     def constant(column: str, read: Callable[[_Column, _Row], Any]) -> Any:
-        return _constant(name, columns[column], rows, read) if column in columns else None
+        return _constant(f"experiment {shown(name)}", columns[column], rows, read) if column in columns else None
 
-    points, s = _points(name, rows, columns, axes)
-    loads = {load: constant(load, _number) for load in LOADS}
+    by_cable: dict[str | None, list[_Row]] = {}
+    for row in rows:
+        cable = _text(columns["cable"], row) if "cable" in columns else None
+        if cable == "":
+            raise SceneFileError(f"line {row.line}, column {columns['cable'].title}: is empty; it must be a name")
+        by_cable.setdefault(cable, []).append(row)
+    rods = {cable: _rod(name, cable, of_cable, columns, axes) for cable, of_cable in by_cable.items()}
     values = {key: constant(key, _scene_value) for key in keys}
-    found = MeasuredRows(
-        name,
-        constant("cluster", lambda column, row: row.cells[column.place]),
-        points,
-        s,
-        {load: number for load, number in loads.items() if number is not None},
-        {key: value for key, value in values.items() if value is not None},
-    )
-    if not len(points) and not found.loads:
+    if not any(len(rod.points) or rod.loads for rod in rods.values()):
         raise SceneFileError(f"line {rows[0].line}: experiment {shown(name)} has no measured point or force")
-    return found
+    given = {key: value for key, value in values.items() if value is not None}
+    return MeasuredRows(name, constant("cluster", _text), rods, given)
 
 
-def _constant(name: str, column: _Column, rows: Sequence[_Row], read: Callable[[_Column, _Row], Any]) -> Any:
-    """The one value of a column in an experiment; `None` where its cells are empty."""
+def _rod(name: str, cable: str | None, rows: Sequence[_Row], columns: Mapping[str, _Column], axes: str) -> MeasuredRod:
+    of = f"experiment {shown(name)}" + ("" if cable is None else f", cable {shown(cable)}")
+    points, s = _points(of, rows, columns, axes)
+    loads = {load: _constant(of, columns[load], rows, _number) for load in LOADS if load in columns}
+    return MeasuredRod(points, s, {load: number for load, number in loads.items() if number is not None})
+
+
+def _text(column: _Column, row: _Row) -> str:
+    return row.cells[column.place]
+
+
+def _constant(of: str, column: _Column, rows: Sequence[_Row], read: Callable[[_Column, _Row], Any]) -> Any:
+    """The one value of a column in rows of an experiment, or of a cable in it; `None` where its cells are empty."""
     given = [row for row in rows if row.cells[column.place]]
     values = [read(column, row) for row in given]
     for row, value in zip(given, values, strict=True):
         if not np.array_equal(value, values[0]):
             raise SceneFileError(
-                f"line {row.line}, column {column.title}: must be the same in all rows of experiment {shown(name)}, "
+                f"line {row.line}, column {column.title}: must be the same in all rows of {of}, "
                 f"got {shown(row.cells[column.place])} after {shown(given[0].cells[column.place])}"
             )
     return values[0] if values else None
 
 
 def _points(
-    name: str, rows: Sequence[_Row], columns: Mapping[str, _Column], axes: str
+    of: str, rows: Sequence[_Row], columns: Mapping[str, _Column], axes: str
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m"] | None]:
     coordinates = [columns[axis] for axis in axes]
     of_point = [*coordinates, *([columns["s"]] if "s" in columns else [])]
@@ -213,8 +236,8 @@ def _points(
     for row in used:
         if not row.cells[columns["s"].place]:
             raise SceneFileError(
-                f"line {row.line}, column {columns['s'].title}: is empty; other points of experiment "
-                f"{shown(name)} have an arclength, all or none must"
+                f"line {row.line}, column {columns['s'].title}: is empty; other points of {of} "
+                "have an arclength, all or none must"
             )
     return points, np.array([_number(columns["s"], row) for row in used])
 

@@ -232,7 +232,8 @@ def _advanced(
     status = jnp.where(has_saddle, Status.SADDLE, status)
     status = jnp.where(is_balanced & is_sought, balanced, status)
     # A zero-iteration solve ends before its step is known to be finite, or needed.
-    status = jnp.where(is_finite & (may_go_on | is_balanced), status, Status.NOT_FINITE)
+    status = jnp.where(may_go_on | is_balanced, status, Status.LINE_SEARCH_FAILED)
+    status = jnp.where(is_finite, status, Status.NOT_FINITE)
     is_lost = jnp.array(False)
     if form.carries_twist:
         # The search goes on where the total twist has lost a part of a turn on the way.

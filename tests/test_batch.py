@@ -120,7 +120,17 @@ def test_side_by_side_as_on_an_accelerator(monkeypatch):
     expected, by_cg = solve_batch(scenes, **OPTIONS), solve_batch(scenes, solver=rj.NonlinearCG(), **OPTIONS)
     monkeypatch.setattr(batch, "is_on_processor", is_on_processor)
     monkeypatch.setattr(batch, "ACCELERATOR_CHUNKS", ((16, math.inf),))
-    assert_same(solve_batch(scenes, threads=1, **OPTIONS), expected)
+    at_once, in_turn = [], batch.as_completed
+
+    def as_completed(solved, parts, threads):
+        at_once.append(threads)
+        return in_turn(solved, parts, threads=threads)
+
+    monkeypatch.setattr(batch, "as_completed", as_completed)
+    for threads in (1, 4):
+        assert_same(solve_batch(scenes, threads=threads, **OPTIONS), expected)
+    # Two chunks under way at most: it has no room for more.
+    assert at_once == [1, 2]
     assert not any(on)
     assert_same(solve_batch(scenes, threads=2, solver=rj.NonlinearCG(), **OPTIONS), by_cg)
     assert any(on)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, taut
@@ -52,6 +53,25 @@ def test_a_string_too_short_for_its_side_is_taut_there():
     needed, touched = taut(jnp.asarray(string), (PIPE,), jnp.asarray(RADIUS))
     assert float(needed) == pytest.approx(around_the_pipe(0.1 + RADIUS), abs=2e-4)
     assert bool(touched[0])
+
+
+def test_a_string_across_the_middle_of_a_box_is_led_to_one_side():
+    """The distance leads one half of it forwards, the other backwards; out of its top it is nearest, however all of it
+    is turned in space.
+    """
+    size, center = np.array([0.2, 0.4, 0.6]), np.array([0.3, 0.0, -0.25])
+    begin = parabola(0.6, -0.05)
+    strings = []
+    for turn in (np.eye(3), Rotation.from_rotvec([0.5, -1.1, 2.3]).as_matrix()):
+        box = rj.Box(turn @ center, size, turn)
+        string, is_needed = drawn(begin @ turn.T, 1.0, (box,))
+        assert is_needed
+        np.testing.assert_array_less(RADIUS, np.asarray(box.distance(string[1:-1])))
+        strings.append(string @ turn)
+    over = strings[0][(strings[0][:, 0] > 0.2) & (strings[0][:, 0] < 0.4)]
+    assert len(over) > 5
+    assert np.min(over[:, 2]) > 0.05
+    np.testing.assert_allclose(strings[1], strings[0], atol=1e-9)
 
 
 def test_what_lies_within_is_led_out_with_the_tangents_of_supports():

@@ -30,6 +30,12 @@ SPREADS = 3
 LONGER = 0.02
 NEARER = 0.01
 BESIDE = 0.1
+# Across the middle of an obstacle its normals have another side: a cosine below this, and not that of a corner. In so
+# many directions about the way across an obstacle it is looked at how far it is to get out, in so many steps, each
+# as long as the distance.
+OPPOSITE = -0.1
+DIRECTIONS = 8
+MOST_STEPS = 24
 
 
 def _distance(obstacles: tuple[Obstacle, ...]) -> Callable[[Float[Array, "3"]], Float[Array, ""]]:
@@ -110,11 +116,53 @@ def drawn_in(
         pulled = jnp.where((size > length) | (count < LEAST_ROUNDS), pulled, _outside(string, obstacles, radius))
         return pulled, _length(pulled), size, count + 1
 
+    begin = _led_to_one_side(begin, obstacles, radius)
     start = begin, _length(begin), _length(begin), jnp.zeros((), int)
     string = jax.lax.while_loop(goes_on, closer, start)[0]
     for _ in range(SPREADS):
         string = _outside(_spread(string), obstacles, radius)
     return string, is_needed
+
+
+def _led_to_one_side(
+    string: Float[Array, "q 3"], obstacles: tuple[Obstacle, ...], radius: Float[Array, ""]
+) -> Float[Array, "q 3"]:
+    """Out of obstacles that it crosses in their middle, whose distance would lead one half of it forwards and the other
+    backwards: in the direction across, of several, in which all of it is out soonest. Directions are counted from
+    where the string sags.
+    """
+    places, distance = string[1:-1], _distance(obstacles)
+    distances, normals = jax.vmap(jax.value_and_grad(distance))(places)
+    is_within = distances < radius
+    # The places of each way through obstacles have a number of their own, those outside of all 0.
+    begins = is_within & ~jnp.concatenate([jnp.zeros(1, bool), is_within[:-1]])
+    number, count, k = jnp.where(is_within, jnp.cumsum(begins), 0), len(places), jnp.arange(len(places))
+    # In the middle itself there may be no normal: of places on both sides of another.
+    is_opposite = jnp.sum(normals[2:] * normals[:-2], axis=1) < OPPOSITE
+    parts = jnp.pad(is_within[2:] & is_within[1:-1] & is_within[:-2] & is_opposite, 1)
+    is_parted = jax.ops.segment_max(parts.astype(int), number, count)[number] > 0
+    first = jax.ops.segment_min(k, number, count)[number]
+    last = jax.ops.segment_max(k, number, count)[number]
+    along = _unit(string[jnp.clip(last + 2, 0, count + 1)] - string[jnp.clip(first, 0, count + 1)])
+    sag = jnp.broadcast_to(jnp.mean(string, axis=0) - (string[0] + string[-1]) / 2, along.shape)
+    aside = _unit(sag - jnp.sum(sag * along, axis=1, keepdims=True) * along)
+    angles = jnp.arange(DIRECTIONS, dtype=string.dtype)[:, None, None] * (2 * jnp.pi / DIRECTIONS)
+    across = jnp.cos(angles) * aside[None] + jnp.sin(angles) * jnp.cross(along, aside)[None]
+
+    def further(_: int, ways: Float[Array, "d p"]) -> Float[Array, "d p"]:
+        there = jax.vmap(jax.vmap(distance))(places[None] + ways[..., None] * across)
+        return ways + jnp.maximum(radius - there, 0.0)
+
+    ways = jax.lax.fori_loop(0, MOST_STEPS, further, jnp.zeros(across.shape[:2], string.dtype))
+    farthest = jax.vmap(lambda way: jax.ops.segment_max(way, number, count))(ways)[:, number]
+    best = jnp.argmin(farthest, axis=0)
+    out = ways[best, k][:, None] * across[best, k]
+    return string.at[1:-1].add(jnp.where((is_parted & is_within)[:, None], out, 0.0))
+
+
+def _unit(vectors: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
+    sizes = jnp.sqrt(jnp.sum(vectors**2, axis=1, keepdims=True))
+    return jnp.where(sizes > 0, vectors / jnp.where(sizes > 0, sizes, 1.0), 0.0)
 
 
 def _spread(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:

@@ -1,4 +1,4 @@
-"""Contact: heavy cables let down on pegs, random cold scenes with one to three obstacles, and friction.
+"""Contact: heavy cables let down on pegs or in a floor, random cold scenes with one to three obstacles, and friction.
 
     python experiments/contact.py [scenes]
 
@@ -8,9 +8,11 @@ cable half around a cylinder beside exp(mu pi), and of one that is drawn a littl
 closed form.
 """
 
+import dataclasses
 import sys
 import time
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -93,17 +95,22 @@ def needed_length(scene: rj.Scene, points: np.ndarray) -> float:
     """What the rod needs at least on the side to which the search leads it out: of a taut string."""
     assert isinstance(scene.start, rj.Swivel)
     assert isinstance(scene.end, rj.Swivel)
-    tangents, radius = (scene.start.tangent, scene.end.tangent), jnp.asarray(RADIUS)
+    tangents, radius = (scene.start.tangent, scene.end.tangent), scene.rod.radius
     begin, _ = drawn_in(jnp.asarray(points), tangents, scene.obstacles, radius, scene.rod.length)
     return float(taut(begin, scene.obstacles, radius)[0])
 
 
-def cold(count: int, seed: int = 0, segments: int = 48) -> None:
-    """Some begin within obstacles, all with a shape that is up to a fifth too long."""
+def cold(count: int, seed: int = 0, segments: int = 48, has_guess: bool = True, **rod: Any) -> None:
+    """Some begin within obstacles, with a guess all with a shape that is up to a fifth too long. `rod`: its numbers,
+    where they are others.
+    """
     rng, found, others = np.random.default_rng(seed), [], []
     for k in range(count):
         scene, points = random_scene(rng)
-        result = rj.solve(scene, segments=segments, guess=rj.Guess(points), strain_limit=None)
+        plain = dict(length=1.0, EI=1.0, GJ=0.8, EA=1e6, mass_per_length=scene.rod.mass_per_length, radius=RADIUS)
+        scene = dataclasses.replace(scene, rod=rj.Rod(**plain | rod))
+        guess = rj.Guess(points) if has_guess else None
+        result = rj.solve(scene, segments=segments, guess=guess, strain_limit=None)
         is_short = not bool(result.converged) and needed_length(scene, points) > 1
         found.append((bool(result.converged), is_short, int(result.iterations)))
         if not (result.converged or is_short):
@@ -111,8 +118,9 @@ def cold(count: int, seed: int = 0, segments: int = 48) -> None:
     converged, short, iterations = np.array(found).T
     of_those = iterations[converged.astype(bool)]
     print(
-        f"cold, seed {seed}, {segments} elements: {converged.sum()} of {count} converged, iterations median "
-        f"{np.median(of_those):g}, 90 % {np.percentile(of_those, 90):g}; {short.sum()} too short; others: {others}"
+        f"cold, seed {seed}, {segments} elements, {'' if has_guess else 'no '}guess, {rod or 'plain'}: "
+        f"{converged.sum()} of {count} converged, iterations median {np.median(of_those):g}, 90 % "
+        f"{np.percentile(of_those, 90):g}; {short.sum()} too short; others: {others}"
     )
 
 
@@ -138,6 +146,19 @@ def capstan(friction: float = 0.3, segments: int = 160, stiffness: float = 1e-6)
         f"{np.max(out) - 1:.1e}, back over exp(-mu pi) - 1: {np.min(back) - 1:.1e} to {np.max(back) - 1:.1e}; "
         f"iterations median {np.median(iterations[1:]):g}, most {max(iterations[1:])}"
     )
+
+
+def out_of_a_floor(segments: int = 64) -> None:
+    """A heavy cable whose first shape lies in a floor, also a thin one."""
+    for radius in (RADIUS, 3e-4):
+        found = []
+        for depth in (0.05, 0.1, 0.2):
+            ends = (rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, 0.6))
+            floor, rod = rj.Plane((0, 0, -depth), (0, 0, 1)), rj.Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=radius)
+            scene = rj.Scene(rod, *ends, (0, 0, -1.0), obstacles=[floor])
+            result = rj.solve(scene, segments=segments, strain_limit=None)
+            found.append((bool(result.converged), int(result.iterations), int(result.evaluations)))
+        print(f"out of a floor, radius {radius:g}: converged, iterations, evaluations {found}")
 
 
 def dragged(friction: float = 0.3, segments: int = 64) -> None:
@@ -175,4 +196,10 @@ if __name__ == "__main__":
     dragged()
     let_down()
     warm()
-    cold(int(sys.argv[1]) if len(sys.argv) > 1 else 150)
+    out_of_a_floor()
+    scenes = int(sys.argv[1]) if len(sys.argv) > 1 else 150
+    cold(scenes)
+    cold(scenes, has_guess=False)
+    cold(scenes, radius=3e-4)
+    cold(scenes, EI=(1.0, 2.0))
+    cold(scenes, EI=(1.0, 2.0), rest_curvature=(1.0, 0.0))

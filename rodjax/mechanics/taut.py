@@ -153,7 +153,8 @@ def _led_to_one_side(
         there = jax.vmap(jax.vmap(distance))(places[None] + ways[..., None] * across)
         return ways + jnp.maximum(radius - there, 0.0)
 
-    ways = jax.lax.fori_loop(0, MOST_STEPS, further, jnp.zeros(across.shape[:2], string.dtype))
+    steps = jnp.where(jnp.any(is_parted), MOST_STEPS, 0)
+    ways = jax.lax.fori_loop(0, steps, further, jnp.zeros(across.shape[:2], string.dtype))
     farthest = jax.vmap(lambda way: jax.ops.segment_max(way, number, count))(ways)[:, number]
     best = jnp.argmin(farthest, axis=0)
     out = ways[best, k][:, None] * across[best, k]

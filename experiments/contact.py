@@ -95,7 +95,7 @@ def needed_length(scene: rj.Scene, points: np.ndarray) -> float:
     """What the rod needs at least on the side to which the search leads it out: of a taut string."""
     assert isinstance(scene.start, rj.Swivel)
     assert isinstance(scene.end, rj.Swivel)
-    tangents, radius = (scene.start.tangent, scene.end.tangent), scene.rod.radius
+    tangents, radius = (scene.start.tangent, scene.end.tangent), jnp.asarray(scene.rod.radius)
     begin, _ = drawn_in(jnp.asarray(points), tangents, scene.obstacles, radius, scene.rod.length)
     return float(taut(begin, scene.obstacles, radius)[0])
 
@@ -107,7 +107,9 @@ def cold(count: int, seed: int = 0, segments: int = 48, has_guess: bool = True, 
     rng, found, others = np.random.default_rng(seed), [], []
     for k in range(count):
         scene, points = random_scene(rng)
-        plain = dict(length=1.0, EI=1.0, GJ=0.8, EA=1e6, mass_per_length=scene.rod.mass_per_length, radius=RADIUS)
+        plain: dict[str, Any] = dict(
+            length=1.0, EI=1.0, GJ=0.8, EA=1e6, mass_per_length=scene.rod.mass_per_length, radius=RADIUS
+        )
         scene = dataclasses.replace(scene, rod=rj.Rod(**plain | rod))
         guess = rj.Guess(points) if has_guess else None
         result = rj.solve(scene, segments=segments, guess=guess, strain_limit=None)
@@ -153,9 +155,9 @@ def out_of_a_floor(segments: int = 64) -> None:
     for radius in (RADIUS, 3e-4):
         found = []
         for depth in (0.05, 0.1, 0.2):
-            ends = (rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, 0.6))
+            start, end = (rj.Clamp((x, 0, 0), rj.frame((1, 0, 0))) for x in (0.0, 0.6))
             floor, rod = rj.Plane((0, 0, -depth), (0, 0, 1)), rj.Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=radius)
-            scene = rj.Scene(rod, *ends, (0, 0, -1.0), obstacles=[floor])
+            scene = rj.Scene(rod, start, end, (0, 0, -1.0), obstacles=[floor])
             result = rj.solve(scene, segments=segments, strain_limit=None)
             found.append((bool(result.converged), int(result.iterations), int(result.evaluations)))
         print(f"out of a floor, radius {radius:g}: converged, iterations, evaluations {found}")

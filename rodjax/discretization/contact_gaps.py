@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, THINNER, Elements, Places
 from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.self_contact import Curve
+from rodjax.discretization.self_contact import Curve, wide_cells, with_wells
 from rodjax.geometry.vectors import root
 from rodjax.model.obstacles import InUnits, Obstacle
 from rodjax.model.scene import Scene
@@ -143,7 +143,11 @@ def curve(form: PositionForm, point: Any) -> Curve:
     radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
     assert isinstance(form.layout, CellForces)
     normal = form.layout.normal  # of the plane of the rod
-    return Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, normal)
+    found = Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, normal)
+    if not form.scene.self_contact:
+        return found
+    is_wide = point.nodal.is_wide
+    return with_wells(found, wide_cells(found, point.nodal.pressures[-1]) if is_wide is None else is_wide)
 
 
 def model_compliance(form: PositionForm) -> Float[Array, ""]:

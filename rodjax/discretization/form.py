@@ -209,6 +209,23 @@ class Form(eqx.Module):
         """The point from which the search goes on, updated by its linearisation."""
         return point
 
+    def searching(self, point: Any) -> Any:
+        """The point as a search begins from it."""
+        return point
+
+    @property
+    def refines(self) -> bool:
+        """Whether `refined` does something."""
+        return False
+
+    def refined(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
+        """A balanced point with what a search changes at its end alone, and whether it goes on from there."""
+        return point, jnp.array(False)
+
+    def ended(self, point: Any) -> Any:
+        """The point where a search ends."""
+        return point
+
     def objective(self, here: Linearization, point: Any, others: Any) -> Float[Array, ""]:
         """The merit that a step from `point` has to lower, with its `others`, at a linearisation along it."""
         return here.energy

@@ -47,7 +47,7 @@ from rodjax.discretization.node_contacts import (
 from rodjax.discretization.node_friction import with_friction
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.potentials import OnElements, PointForces
-from rodjax.discretization.self_contact import comes_through
+from rodjax.discretization.self_contact import comes_through, wide_cells
 from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
@@ -104,6 +104,26 @@ class NodalForm(PositionForm):
             forces = tangential(nodal.friction.forces, here.system.contacts.normals[rough])
             nodal = dataclasses.replace(nodal, friction=dataclasses.replace(nodal.friction, forces=forces))
         return dataclasses.replace(point, nodal=nodal)
+
+    def searching(self, point: Any) -> Any:
+        """With wide wells in all cells."""
+        if not self.scene.self_contact:
+            return point
+        return _with_wells(point, jnp.ones(len(self.field.s) - 1, bool))
+
+    @property
+    def refines(self) -> bool:
+        return self.scene.self_contact
+
+    def refined(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
+        """With narrow wells where they do; once wide again, none becomes narrow a second time."""
+        before, pressures = point.nodal.is_wide, point.nodal.pressures[-1]
+        is_wide = wide_cells(curve(self, point), pressures)
+        is_wide = jnp.where(jnp.all(before), is_wide, before | is_wide)
+        return _with_wells(point, is_wide), jnp.any((is_wide != before) & (pressures[:-1] > 0))
+
+    def ended(self, point: Any) -> Any:
+        return _with_wells(point, None) if self.scene.self_contact else point
 
     @traced_once
     def begun(
@@ -299,3 +319,7 @@ class NodalForm(PositionForm):
         if not has_contacts(self.scene):
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
+
+
+def _with_wells(point: Any, is_wide: Bool[Array, "n"] | None) -> Any:
+    return dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, is_wide=is_wide))

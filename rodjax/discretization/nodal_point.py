@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 class Friction(eqx.Module):
@@ -25,13 +25,15 @@ class Friction(eqx.Module):
 
 class Nodal(eqx.Module):
     """The positions of the nodes, and the pressure of each obstacle at each node; `relaxed`: added to the gaps of each
-    obstacle in the next step; `friction`: `None` where no obstacle has any.
+    obstacle in the next step; `friction`: `None` where no obstacle has any; `is_wide`: of a search with self-contact,
+    which elements have wide wells in it, otherwise `None`.
     """
 
     positions: Float[Array, "n+1 3"]
     pressures: Float[Array, "k n+1"]
     relaxed: Float[Array, "k"]
     friction: Friction | None = None
+    is_wide: Bool[Array, "n"] | None = None
 
     @property
     def contact_forces(self) -> Float[Array, "r n+1"]:

@@ -17,13 +17,14 @@ from rodjax.discretization.self_contact import (
     Nearest,
     gap_vectors,
     moving_gaps,
+    narrow_wells,
     nearest,
     on_elements,
 )
 
-# As `self_contact.EDGE`: of rods that cross, that times pi radii by the length of an element is the force along them by
-# that of the contact.
-EDGE_OF_PAIRS = 3e-6
+# As `self_contact.NARROW`, of all cells: of rods that cross, four times that times the radius by the length of an
+# element is the force along them by that of the contact, at most.
+NARROW_OF_PAIRS = 3e-6
 # Of the elements of a rod, those nearest to another one may touch it: at most so many.
 MOST_OF_PAIR = 16
 
@@ -34,16 +35,16 @@ def joined(first: Curve, second: Curve) -> Curve:
     offset = first.s[-1] + second.s[1] - second.s[0]
     begin, nothing = offset + second.s[0], jnp.full_like(second.s, jnp.inf)
     least = jnp.concatenate([jnp.full_like(first.s[1:], begin), nothing])
-    return Curve(
+    both = Curve(
         jnp.concatenate([first.s, offset + second.s]),
         jnp.concatenate([first.positions, second.positions]),
         jnp.concatenate([first.tangents, second.tangents], axis=1),
         jnp.concatenate([first.axes, second.axes], axis=2),
         jnp.concatenate([first.free, second.free]),
         jnp.concatenate([first.radius, first.radius[:1], second.radius]),
-        reach=(least, jnp.full_like(least, offset + second.s[-1])),
-        edge=EDGE_OF_PAIRS * jnp.concatenate([first.radius, first.radius[:1], second.radius]),
+        reach=(least, jnp.full_like(least, offset + second.s[-1]), first.s[-1]),
     )
+    return both._replace(wells=narrow_wells(both, NARROW_OF_PAIRS))
 
 
 class PairContacts(NamedTuple):

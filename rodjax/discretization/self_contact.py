@@ -1,15 +1,24 @@
 """Contact of a rod with itself: where each element comes nearest to the rod beyond it.
 
-The centerline is the cubic through the positions and tangents of the nodes. Of each element the contact point is that
-place s of it, and that place s' further along the rod, where
+The centerline is the cubic through the positions and tangents of the nodes. Each element has a cell, from its first
+node to the middle of the next element. Its contact point is that place s in the cell, and that place s' further along
+the rod, where
 
-    g = |x(s) - x(s')| + edge sin^2(pi (s - s_3/4)/h) - r(s) - r(s')
+    g = |x(s) - x(s')| + k (s - s_3/4)^2/2 - r(s) - r(s')
 
-is least; the gap g is a function of the four nodes beside these places. The small second term tells which place it is
-where two parts of the rod lie along one another: that at three quarters of the element. A contact by itself is drawn to
-one quarter, where the rod counts as thinnest. Neither is at a node, where a place goes from one element to the next;
-there the term is smooth. First derivatives of g are those at fixed places; the second ones count that the places move.
-Neighbours along the rod are no contact: less than half a turn around the rod's own radius away, or of the next element.
+is least; the gap g is a function of the four nodes beside these places. The second term, the well of the cell, keeps
+the place at three quarters of the element where two parts of the rod lie along one another, as without it the place
+would be undetermined. Where the place leaves a cell the next one has it already, with a smaller gap: there, at one
+quarter of an element, where the rod counts as thinnest, two cells may share one contact. At a node, where the curvature
+jumps, none does.
+
+A well is narrow where the distance alone tells the place, as where parts cross, and bends force and place by next to
+nothing. It is wide where the distance hardly grows along the rod: parts that wind around each other bend so that it
+even falls between the places where they press. In a search all are wide; at its end each is what it should be
+(`wide_cells`), and the search goes on from there.
+
+First derivatives of g are those at fixed places; the second ones count that the places move. Neighbours along the rod
+are no contact: less than half a turn around the rod's own radius away, or of the next element.
 """
 
 import functools
@@ -17,15 +26,25 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
 
-# By this part of its radius the rod counts as thinner at one quarter of an element than at three.
-EDGE = 3e-4
+# Depth of a narrow well half of an element from its middle, by the radius. Stiffness k of a wide one, by the inverse of
+# the radius; it is no deeper than the next number. A well is narrow where the second derivative of the distance along
+# the rod, as k is told, is more than the last ones: of a single contact, and of several, which may slide together.
+NARROW = 3e-4
+WIDE = 0.2
+DEEPEST_WELL = 0.1
+GROWS_ALONE = 0.1
+GROWS = 0.25
+# The middle of a well, as part of its element.
+MIDDLE = 0.75
 # Places in each element from which the nearest ones are sought, and steps of that search.
 SAMPLES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
+SAMPLES_AHEAD = 2  # of the next element, those in the cell
 STEPS = 12
 # Steps of a search by the squared distance, before these: by the distance itself Newton's steps lead beyond the nearest
 # place where that is further along the rod than the other part is away.
@@ -34,8 +53,6 @@ FAR_STEPS = 6
 MOST_CONTACTS = 48
 # A step leads no element nearer to what it is nearest to than this part of the distance at which they touch.
 DEEPEST = 0.5
-# Places of elements beside one another that are as near to their node as this part of an element are one.
-JUST_BEYOND = 0.05
 # Where two parts of the rod cross within this distance [L], they part at right angles to both.
 CROSSING = 1e-9
 # Gap of an element with nothing beyond it [L].
@@ -46,8 +63,7 @@ class Curve(NamedTuple):
     """A rod's centerline on a mesh, and what moves it: axes about which the tangents of the nodes turn, 0 in `free` at
     nodes whose place is given; its radius in the middle of elements. `normal`: of the plane in which it stays, `None`
     in space; `reach`: from where to where of each element the rod beyond it begins and ends, `None` where that is all
-    but neighbours; `edge`: of each element the length by which the rod counts as thinner at one quarter than at three,
-    `None` for `EDGE` of its radius.
+    but neighbours, and where cells end; `wells`: stiffness of the well of each element, `None` where all are narrow.
     """
 
     s: Float[Array, "n+1"]
@@ -57,15 +73,16 @@ class Curve(NamedTuple):
     free: Float[Array, "n+1"]
     radius: Float[Array, "n"]
     normal: Float[Array, "3"] | None = None
-    reach: tuple[Float[Array, "n"], Float[Array, "n"]] | None = None
-    edge: Float[Array, "n"] | None = None
+    reach: tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, ""]] | None = None
+    wells: Float[Array, "n"] | None = None
 
 
 class Nearest(NamedTuple):
-    """Places s of k elements and s' beyond them that are nearest to one another, the elements there; where s or s'
-    stays, at the end of what is allowed; and whether there is such a place.
+    """Places s of the cells of k elements and s' beyond them that are nearest to one another, the elements there; where
+    s or s' stays, at the end of what is allowed; and whether there is such a place.
     """
 
+    cell: Int[Array, "k"]
     s: Float[Array, "k"]
     element: Int[Array, "k"]
     beyond: Float[Array, "k"]
@@ -100,42 +117,41 @@ def nearest(curve: Curve) -> Nearest:
     """Of each element; without derivatives."""
     curve = jax.lax.stop_gradient(curve)
     s, n = curve.s, len(curve.s) - 1
-    h, element = jnp.diff(s), jnp.arange(n)
-    least, most = _range(curve)
-    begin, of_element = _samples(s)
-    differences = [c[:, None] - c[None] for c in side_at(curve, of_element, begin).x]
-    squares = functools.reduce(jnp.add, map(jnp.square, differences))
-    allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
+    cell = jnp.arange(n)
+    begin, end, least, most = _range(curve)
+    samples, of_element = _samples(s)
+    differences = [c[:, None] - c[None] for c in side_at(curve, of_element, samples).x]
+    squares = functools.reduce(jnp.add, map(jnp.square, differences)).reshape(n, len(SAMPLES), -1)
+    # Of a cell those of its element, and those of the next one within it.
+    here = samples.reshape(n, -1)
+    ahead = np.minimum(np.arange(n) + 1, n - 1)
+    squares = jnp.concatenate([squares, squares[ahead, :SAMPLES_AHEAD]], axis=1)
+    here = jnp.concatenate([here, here[ahead, :SAMPLES_AHEAD]], axis=1)
+    allowed = (samples[None] >= least[:, None]) & (samples[None] <= most[:, None])
+    allowed = allowed[:, None] & (here <= end[:, None])[..., None]
     squares = jnp.where(allowed, squares, jnp.inf).reshape(n, -1)
     best = jnp.argmin(squares, axis=1)
     exists = jnp.isfinite(jnp.min(squares, axis=1))
-    here, there = best // len(begin), best % len(begin)
-    first = begin.reshape(n, -1)[element, here], begin[there]
+    first = here[cell, best // len(samples)], samples[best % len(samples)]
+    h = jnp.diff(s)
 
     def nearer(k: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         a, b = pair
-        other = _element_at(s, b)
-        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, element, other, a, b, is_far=k < FAR_STEPS)
+        element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
+        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b, is_far=k < FAR_STEPS)
         bb = jnp.where(bb > 0, bb, 1.0)
         slope, growth = of_a - ab * of_b / bb, aa - ab**2 / bb
         step = jnp.where(growth > 0, -slope / jnp.where(growth > 0, growth, 1.0), -jnp.sign(slope) * h)
-        step = jnp.clip(a + jnp.clip(step, -h / 4, h / 4), s[:-1], s[1:]) - a
+        step = jnp.clip(a + jnp.clip(step, -h / 4, h / 4), begin, end) - a
         along = jnp.clip(-(of_b + ab * step) / bb, -h[other] / 2, h[other] / 2)
         return a + step, jnp.clip(b + along, least, most)
 
     a, b = jax.lax.fori_loop(0, FAR_STEPS + STEPS, nearer, first)
-    other = _element_at(s, b)
-    _, _, (aa, ab, bb) = seen_distance(curve, element, other, a, b)
+    element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
+    _, _, (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b)
     is_flat = aa * bb <= ab**2
-    at_begin, at_end = a <= s[:-1], a >= s[1:]
-    stays = jnp.stack([at_begin | at_end | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
-    # Where the element beside it is nearest just beyond its end, that one touches alone: two would share what is one
-    # contact, and in a model of soft contacts part from one another in many steps.
-    is_inside = exists & ~stays[0]
-    by_next = at_end[:-1] & (is_inside & (a - s[:-1] < JUST_BEYOND * h))[1:]
-    by_last = at_begin[1:] & (is_inside & (s[1:] - a < JUST_BEYOND * h))[:-1]
-    exists &= ~(jnp.append(by_next, False) | jnp.append(False, by_last))
-    return Nearest(a, element, b, other, stays, exists)
+    stays = jnp.stack([(a <= begin) | (a >= end) | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
+    return Nearest(cell, a, element, b, other, stays, exists)
 
 
 def self_contacts(curve: Curve, pressures: Float[Array, "n+1"], unit: Float[Array, ""], row: int) -> SelfContacts:
@@ -170,10 +186,10 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     distance, normal = direction(here, there)
     way = side_at(after, found.element, found.s).x - side_at(after, found.other, found.beyond).x
     along = dot(normal, way)
-    contact_distance = before.radius[found.element] + before.radius[found.other]
+    contact_distance = before.radius[found.cell] + before.radius[found.other]
     is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, contact_distance)))
     begin, of_element = _samples(before.s)
-    least, most = _range(before)
+    _, _, least, most = _range(before)
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
     reach = jnp.max(jnp.diff(before.s)) / len(SAMPLES)
     old, new = ([c[:, None] - c[None] for c in side_at(curve, of_element, begin).x] for curve in (before, after))
@@ -225,14 +241,14 @@ def moving_gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[
     a, b = found.s, found.beyond
     a_stays, b_stays = found.stays
     for _ in range(2):
-        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, found.element, found.other, a, b)
+        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, a, b)
         of_a, of_b = jnp.where(a_stays, 0.0, of_a), jnp.where(b_stays, 0.0, of_b)
         aa, bb = jnp.where(a_stays, 1.0, aa), jnp.where(b_stays, 1.0, bb)
         ab = jnp.where(a_stays | b_stays, 0.0, ab)
         determinant = aa * bb - ab**2
         a, b = a - (bb * of_a - ab * of_b) / determinant, b - (aa * of_b - ab * of_a) / determinant
-    distance, _, _ = seen_distance(curve, found.element, found.other, a, b)
-    return distance - curve.radius[found.element] - curve.radius[found.other], a, b
+    distance, _, _ = seen_distance(curve, found.cell, found.element, found.other, a, b)
+    return distance - curve.radius[found.cell] - curve.radius[found.other], a, b
 
 
 def gap_vectors(
@@ -261,7 +277,7 @@ def gap_vectors(
         by_rotation = jnp.einsum("cp,cbkp->bkp", v, turned) * on_tangents[derivative][None]
         return jnp.concatenate([by_rotation, v[:, None] * on_positions[derivative][None]])
 
-    _, _, (aa, ab, bb) = seen_distance(curve, found.element, found.other, a, b)
+    _, _, (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, a, b)
     is_own = jnp.array([1.0, 1.0, 0.0, 0.0], d.dtype)[None, :, None]
 
     def across(v: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
@@ -344,29 +360,48 @@ def direction(here: Side, there: Side) -> tuple[Float[Array, "k"], Float[Array, 
 
 def seen_distance(
     curve: Curve,
+    cell: Int[Array, "k"],
     element: Int[Array, "k"],
     other: Int[Array, "k"],
     a: Float[Array, "k"],
     b: Float[Array, "k"],
     is_far: Any = False,
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
-    """The distance and the term that keeps the place in the middle, and its derivatives by both places; `is_far`: the
+    """The distance and the well of the cell, and its derivatives by both places; `is_far`: the
     second ones as of half of the squared distance, by the distance.
     """
     here, there = side_at(curve, element, a), side_at(curve, other, b)
     d, normal = direction(here, there)
-    h = curve.s[element + 1] - curve.s[element]
-    edge = EDGE * curve.radius[element] if curve.edge is None else curve.edge[element]
-    rate = 2 * jnp.pi / h
-    aside = rate * (a - curve.s[element] - 0.75 * h)
+    h = curve.s[cell + 1] - curve.s[cell]
+    aside = a - curve.s[cell] - MIDDLE * h
+    rate = (narrow_wells(curve) if curve.wells is None else curve.wells)[cell]
     on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
     across = 1.0 - jnp.asarray(is_far, d.dtype)
-    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature)
-    aa += edge * rate**2 * jnp.cos(aside) / 2
+    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature) + rate
     bb = (dot(there.slope, there.slope) - across * on_there**2) / d - dot(normal, there.curvature)
     ab = -(dot(here.slope, there.slope) - across * on_here * on_there) / d
-    slope = on_here + edge * rate * jnp.sin(aside) / 2
-    return d + edge * (1 - jnp.cos(aside)) / 2, (slope, -on_there), (aa, ab, bb)
+    return d + rate * aside**2 / 2, (on_here + rate * aside, -on_there), (aa, ab, bb)
+
+
+def narrow_wells(curve: Curve, depth: float = NARROW) -> Float[Array, "n"]:
+    return 8 * depth * curve.radius / jnp.diff(curve.s) ** 2
+
+
+def with_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
+    wide = jnp.minimum(WIDE / curve.radius, narrow_wells(curve, DEEPEST_WELL))
+    return curve._replace(wells=jnp.where(is_wide, wide, narrow_wells(curve)))
+
+
+def wide_cells(curve: Curve, pressures: Float[Array, "n+1"]) -> Bool[Array, "n"]:
+    """Which cells are to have wide wells, at these pressures."""
+    curve = jax.lax.stop_gradient(with_wells(curve, jnp.ones_like(curve.radius, bool)))
+    found = nearest(curve)
+    _, _, (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, found.s, found.beyond)
+    assert curve.wells is not None
+    growth = aa - curve.wells - jnp.where(found.stays[1], 0.0, ab**2 / jnp.where(bb > 0, bb, 1.0))
+    pushes = pressures[:-1] > 0
+    first, last = jnp.argmax(pushes), len(pushes) - 1 - jnp.argmax(pushes[::-1])
+    return growth * curve.radius < jnp.where(last - first <= 1, GROWS_ALONE, GROWS)
 
 
 def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]]:
@@ -376,20 +411,23 @@ def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]
     return begin.reshape(-1), jnp.repeat(jnp.arange(len(s) - 1), len(SAMPLES))
 
 
-def _range(curve: Curve) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Between which arclengths the rod beyond an element is no neighbour of it.
+def _range(curve: Curve) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """From where to where each cell lies, and the rod beyond it that is no neighbour of it.
 
     What is nearer bends around its own radius at most; of a closed ring through its ends too.
     """
+    s, h = curve.s, jnp.diff(curve.s)
+    begin, end = s[:-1], s[1:] + h / 2
     if curve.reach is not None:
-        return curve.reach
-    s = curve.s
+        least, most, last = curve.reach
+        return begin, jnp.minimum(end, last), least, most
+    end = jnp.minimum(end, s[-1])
     apart = jnp.pi * jnp.max(curve.radius)
     ends = curve.positions[0] - curve.positions[-1]
     is_ring = jnp.sum(ends**2) < 4 * jnp.max(curve.radius) ** 2
-    least = jnp.maximum(s[1:] + apart, jnp.append(s[2:], jnp.inf))
-    most = jnp.minimum(1 + s[:-1] - jnp.maximum(apart, jnp.diff(s)), 1.0)
-    return least, jnp.where(is_ring, most, 1.0)
+    least = end + jnp.maximum(apart, h / 2)
+    most = jnp.minimum(1 + begin - jnp.maximum(apart, h), 1.0)
+    return begin, end, least, jnp.where(is_ring, most, 1.0)
 
 
 def _element_at(s: Float[Array, "n+1"], arclengths: Float[Array, "k"]) -> Int[Array, "k"]:

@@ -120,7 +120,7 @@ def is_running(state: NewtonState) -> Bool[Array, ""]:
 
 def ended(form: Form, state: NewtonState) -> NewtonEnd:
     return NewtonEnd(
-        point=state.point,
+        point=form.ended(state.point),
         outcome=Outcome(state.residual, state.iterations, state.evaluations, state.status),
         is_stable=state.is_stable & form.has_potential,
     )
@@ -240,6 +240,12 @@ def _advanced(
         twist = jax.lax.cond(is_balanced & ~again, lambda: form.allowed_twist(point), lambda: point.total_twist)
         is_lost = jnp.abs(twist - point.total_twist) > 0  # not where it is not a number
         point = eqx.tree_at(lambda point: point.total_twist, point, twist)
+    if form.refines:
+        # What a search changes at its end alone.
+        point, changes = jax.lax.cond(
+            is_balanced & ~again & ~is_lost, lambda: form.refined(point), lambda: (point, jnp.array(False))
+        )
+        is_lost |= changes
     again |= is_lost
     status = jnp.where(again, Status.RUNNING, status)
     is_blocked = form.is_blocked(point)
@@ -292,6 +298,7 @@ def _shortened(form: Form, state: NewtonState, find: Find) -> NewtonState:
 
 def begin(form: Form, point: Point) -> NewtonState:
     """Before the first turn, whose trial is the point itself."""
+    point = form.searching(point)
     dtype = point.tangents.dtype
     zero = jnp.zeros((), dtype)
     of_bases = jax.eval_shape(form.bases_at, point)

@@ -120,13 +120,14 @@ def _rod_contacts(
 
 
 class _Touch(NamedTuple):
-    """Of t contacts between rods of two groups: the place of both rods in their groups, and their elements there;
-    whether the place within an element stays; two directions across the force; whether it is there; and its number
-    among all pressures.
+    """Of t contacts between rods of two groups: the place of both rods in their groups, their elements there, and the
+    element of the first one whose contact it is; whether the place within the element stays; two directions across the
+    force; whether it is there; and its number among all pressures.
     """
 
     rods: Int[Array, "2 t"]
     elements: Int[Array, "2 t"]
+    cell: Int[Array, "t"]
     stays: Bool[Array, "2 t"]
     across: Float[Array, "2 3 t"]
     along: Float[Array, "3 t"]
@@ -185,22 +186,22 @@ class TouchingRods(eqx.Module):
         for pairs, touch, (forces, places), (before, begin) in parts:
             joined_pairs = [curves[number] for number in pairs.groups]
 
-            def of_contact(rods, elements, stays, across, force, place, begin, joined_pairs=joined_pairs):
+            def of_contact(rods, elements, cell, stays, across, force, place, begin, joined_pairs=joined_pairs):
                 first, second = (
                     jax.tree.map(lambda leaf, k=k: leaf[k], curve) for curve, k in zip(joined_pairs, rods, strict=True)
                 )
                 curve, count = joined(first, second), len(first.s)
                 here, there = elements[:1], count + elements[1:]
                 a, b = (first.s[-1] * place[:1]), curve.s[count] + second.s[-1] * place[1:]
-                distance, slopes, _ = seen_distance(curve, here, there, a, b)
+                distance, slopes, _ = seen_distance(curve, cell[None], here, there, a, b)
                 _, normal = direction(side_at(curve, here, a), side_at(curve, there, b))
                 force, normal = force / self.force, normal[:, 0]
-                gap = distance - curve.radius[here] - curve.radius[there]
+                gap = distance - curve.radius[cell[None]] - curve.radius[there]
                 slopes = jnp.where(stays, place - begin, jnp.concatenate(slopes))
                 return jnp.concatenate([gap, across @ (force - (force @ normal) * normal), slopes])
 
-            lacking = jax.vmap(of_contact, (1, 1, 1, 2, 1, 1, 1), 1)(
-                touch.rods, touch.elements, touch.stays, touch.across, forces, places, begin
+            lacking = jax.vmap(of_contact, (1, 1, 0, 1, 2, 1, 1, 1), 1)(
+                touch.rods, touch.elements, touch.cell, touch.stays, touch.across, forces, places, begin
             )
             change = jnp.concatenate([(forces - before) / self.force, places - begin])
             found.append(jnp.where(touch.exists[None], lacking, change).reshape(-1))
@@ -245,16 +246,16 @@ def touching_rods(
         found, a, b, normal = jax.vmap(of_pair)(both)
         pick = jnp.argsort(-pressures.reshape(-1))[:MOST_TOUCHING]
         force = jnp.where(jnp.sum(pressures > 0) > MOST_TOUCHING, jnp.nan, force)
-        pair, element = pick // elements, pick % elements
+        pair, cell = pick // elements, pick % elements
         rods = jnp.stack([jnp.asarray(each.first)[pair], jnp.asarray(each.second)[pair]])
-        normal = normal[pair, :, element].T
+        normal = normal[pair, :, cell].T
         side = jnp.cross(normal, jnp.eye(3, dtype=normal.dtype)[jnp.argmin(jnp.abs(normal), axis=0)].T, axis=0)
         side /= jnp.linalg.norm(side, axis=0)[None]
         across = jnp.stack([side, jnp.cross(normal, side, axis=0)])
-        there = found.other[pair, element] - elements - 1
-        stays, pushing = found.stays[pair, :, element].T, pressures[pair, element]
-        touches.append(_Touch(rods, jnp.stack([element, there]), stays, across, normal, pushing > 0, first + pick))
-        each_place = jnp.stack([a[pair, element], b[pair, element]])
+        both_elements = jnp.stack([found.element[pair, cell], found.other[pair, cell] - elements - 1])
+        stays, pushing = found.stays[pair, :, cell].T, pressures[pair, cell]
+        touches.append(_Touch(rods, both_elements, cell, stays, across, normal, pushing > 0, first + pick))
+        each_place = jnp.stack([a[pair, cell], b[pair, cell]])
         values.append(jnp.concatenate([pushing[None] * normal / force, each_place]).reshape(-1))
         first += pressures.size
     meshes = tuple(group.s / group.s[:, -1:] for group in groups)

@@ -144,7 +144,8 @@ class SelfContacts(eqx.Module):
     """Where each of n elements of a rod is nearest to the rod beyond it, and what one part applies to the other there.
 
     - `s`, `beyond` [..., n] arclengths of both places, m
-    - `gaps` [..., n] m between the surfaces there, infinite where an element has nothing beyond it but neighbours
+    - `gaps` [..., n] m between the surfaces there as contact counts them (`Scene`, `self_contact`), infinite where an
+      element has nothing beyond it but neighbours
     - `forces` [..., n, 3] N: on the rod at `s`, and their reverse at `beyond`; zero where the parts do not touch
     """
 

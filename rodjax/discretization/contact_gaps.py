@@ -17,7 +17,7 @@ from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve, wide_cells, with_wells
 from rodjax.geometry.vectors import root
 from rodjax.model.obstacles import InUnits, Obstacle
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, slides
 from rodjax.programs.parts import traced_once
 
 # Compliance of a contact in the model of a step, as a part of an element's own, h^3/EI. So much of a pressure's change,
@@ -136,6 +136,13 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     return elements, places, jnp.pad(places.gaps, ((0, 0), (0, 1)), constant_values=1.0)
 
 
+def has_wells(scene: Scene) -> bool:
+    """Whether self-contact has wide wells. They belong to the mesh, which goes along with sliding clips: then the
+    energy would change as it does.
+    """
+    return scene.self_contact and not slides(scene)
+
+
 def curve(form: PositionForm, point: Any) -> Curve:
     """What self-contact needs of the rod at a point."""
     s = form.field.s
@@ -144,7 +151,7 @@ def curve(form: PositionForm, point: Any) -> Curve:
     assert isinstance(form.layout, CellForces)
     normal = form.layout.normal  # of the plane of the rod
     found = Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, normal)
-    if not form.scene.self_contact:
+    if not has_wells(form.scene):
         return found
     is_wide = point.nodal.is_wide
     return with_wells(found, wide_cells(found, point.nodal.pressures[-1]) if is_wide is None else is_wide)

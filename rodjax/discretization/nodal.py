@@ -25,6 +25,7 @@ from rodjax.discretization.contact_gaps import (
     curve,
     gaps_and_normals,
     has_inner_contacts,
+    has_wells,
     model_compliance,
     pressure_rows,
     rough_obstacles,
@@ -107,13 +108,13 @@ class NodalForm(PositionForm):
 
     def searching(self, point: Any) -> Any:
         """With wide wells in all cells."""
-        if not self.scene.self_contact:
+        if not has_wells(self.scene):
             return point
         return _with_wells(point, jnp.ones(len(self.field.s) - 1, bool))
 
     @property
     def refines(self) -> bool:
-        return self.scene.self_contact
+        return has_wells(self.scene)
 
     def refined(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
         """With narrow wells where they do; once wide again, none becomes narrow a second time."""
@@ -123,7 +124,7 @@ class NodalForm(PositionForm):
         return _with_wells(point, is_wide), jnp.any((is_wide != before) & (pressures[:-1] > 0))
 
     def ended(self, point: Any) -> Any:
-        return _with_wells(point, None) if self.scene.self_contact else point
+        return _with_wells(point, None) if has_wells(self.scene) else point
 
     @traced_once
     def begun(

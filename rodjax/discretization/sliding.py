@@ -252,20 +252,6 @@ class SlidingForm(Form):
         inner = self.at(point.arclengths).accepted(point.inner, here.at_arclengths)
         return SlidingPoint(inner, point.arclengths, here.slides, here.excess)
 
-    def searching(self, point: SlidingPoint) -> SlidingPoint:
-        return dataclasses.replace(point, inner=self.first.searching(point.inner))
-
-    @property
-    def refines(self) -> bool:
-        return self.first.refines
-
-    def refined(self, point: SlidingPoint) -> tuple[SlidingPoint, Bool[Array, ""]]:
-        inner, changes = self.at(point.arclengths).refined(point.inner)
-        return dataclasses.replace(point, inner=inner), changes
-
-    def ended(self, point: SlidingPoint) -> SlidingPoint:
-        return dataclasses.replace(point, inner=self.first.ended(point.inner))
-
     # --- derivatives -------------------------------------------------------------------------------------------------
 
     def _rows(self, inner: Any, arclengths: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:

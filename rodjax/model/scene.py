@@ -68,8 +68,8 @@ class Scene(eqx.Module):
     - `self_contact`: whether the rod, which has a radius, touches itself without friction, where each element is
         nearest to the rod beyond it: at places that follow the shape, at most 48 at a time. Parts that wind around one
         another ask for elements no longer than 1.5 radii; there, the rod counts as thinner between such places, by 6 %
-        of its radius at most (2 % with elements as long as a radius). Elements and double precision only. A step of the
-        search leads no part of the rod through another; a start whose parts overlap is led out. Where the rod stays
+        of its radius at most (2.5 % with elements as long as a radius). Elements and double precision only. A step of
+        the search leads no part of the rod through another; a start whose parts overlap is led out. Where the rod stays
         away from itself that only costs time.
 
     Raises `ValueError` where the supports and loads leave the rod without an equilibrium, where a point force lies

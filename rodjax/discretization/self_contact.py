@@ -32,9 +32,10 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
 
-# Depth of a narrow well half of an element from its middle, by the radius. Stiffness k of a wide one, by the inverse of
-# the radius; it is no deeper than the next number. A well is narrow where the second derivative of the distance along
-# the rod, as k is told, is more than the last ones: of a single contact, and of several, which may slide together.
+# NARROW: by how much the gap of a narrow well grows half of an element from its middle [radii]. WIDE: stiffness k of a
+# wide well [1/radius], whose gap grows there by DEEPEST_WELL at most [radii]. A well is narrow where the second
+# derivative of the distance along the rod [1/radius] is larger than GROWS_ALONE, if there is one contact, or than
+# GROWS, if there are several, which may slide together.
 NARROW = 3e-4
 WIDE = 0.2
 DEEPEST_WELL = 0.1
@@ -78,8 +79,8 @@ class Curve(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Places s of the cells of k elements and s' beyond them that are nearest to one another, the elements there; where
-    s or s' stays, at the end of what is allowed; and whether there is such a place.
+    """Of k cells, numbered as their elements: places s in them and s' beyond that are nearest to one another, the
+    elements there; where s or s' stays, at the end of what is allowed; and whether there is such a place.
     """
 
     cell: Int[Array, "k"]
@@ -374,20 +375,22 @@ def seen_distance(
     d, normal = direction(here, there)
     h = curve.s[cell + 1] - curve.s[cell]
     aside = a - curve.s[cell] - MIDDLE * h
-    rate = (narrow_wells(curve) if curve.wells is None else curve.wells)[cell]
+    well = (narrow_wells(curve) if curve.wells is None else curve.wells)[cell]
     on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
     across = 1.0 - jnp.asarray(is_far, d.dtype)
-    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature) + rate
+    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature) + well
     bb = (dot(there.slope, there.slope) - across * on_there**2) / d - dot(normal, there.curvature)
     ab = -(dot(here.slope, there.slope) - across * on_here * on_there) / d
-    return d + rate * aside**2 / 2, (on_here + rate * aside, -on_there), (aa, ab, bb)
+    return d + well * aside**2 / 2, (on_here + well * aside, -on_there), (aa, ab, bb)
 
 
 def narrow_wells(curve: Curve, depth: float = NARROW) -> Float[Array, "n"]:
+    """Stiffnesses of wells of this depth [radii], half of an element from their middles."""
     return 8 * depth * curve.radius / jnp.diff(curve.s) ** 2
 
 
 def with_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
+    """With wide wells in these cells and narrow ones in the others."""
     wide = jnp.minimum(WIDE / curve.radius, narrow_wells(curve, DEEPEST_WELL))
     return curve._replace(wells=jnp.where(is_wide, wide, narrow_wells(curve)))
 

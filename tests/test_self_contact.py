@@ -168,6 +168,8 @@ def test_a_contact_that_passes_from_element_to_element_is_one_contact():
         assert result.converged
         assert result.stable
         assert result.iterations <= 10
+    # Of the last one nothing is left to do.
+    assert rodjax.solve(results[-1].scene, segments=32, guess=results[-1]).iterations == 0
 
 
 def test_parts_that_cross_at_first_are_led_apart():

@@ -218,8 +218,10 @@ class Form(eqx.Module):
         """Whether `refined` does something."""
         return False
 
-    def refined(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
-        """A balanced point with what a search changes at its end alone, and whether it goes on from there."""
+    def refined(self, point: Any, is_balanced: Bool[Array, ""]) -> tuple[Any, Bool[Array, ""]]:
+        """A balanced point with what a search changes at its end alone, or one that is not balanced at its beginning
+        with what it changes there; and whether the search goes on from there.
+        """
         return point, jnp.array(False)
 
     def ended(self, point: Any) -> Any:

@@ -107,20 +107,23 @@ class NodalForm(PositionForm):
         return dataclasses.replace(point, nodal=nodal)
 
     def searching(self, point: Any) -> Any:
-        """With wide wells in all cells."""
+        """With the wells of an equilibrium, as which it may be balanced; of a start without contacts, all wide."""
         if not has_wells(self.scene):
             return point
-        return _with_wells(point, jnp.ones(len(self.field.s) - 1, bool))
+        point, pressures = _with_wells(point, jnp.ones(len(self.field.s) - 1, bool)), point.nodal.pressures[-1]
+        return _with_wells(point, wide_cells(curve(self, point), pressures) | ~jnp.any(pressures > 0))
 
     @property
     def refines(self) -> bool:
         return has_wells(self.scene)
 
-    def refined(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
-        """With narrow wells where they do; once wide again, none becomes narrow a second time."""
+    def refined(self, point: Any, is_balanced: Bool[Array, ""]) -> tuple[Any, Bool[Array, ""]]:
+        """A balanced point with narrow wells where they do; once wide again, none becomes narrow a second time. Another
+        one with wide wells in all cells.
+        """
         before, pressures = point.nodal.is_wide, point.nodal.pressures[-1]
         is_wide = wide_cells(curve(self, point), pressures)
-        is_wide = jnp.where(jnp.all(before), is_wide, before | is_wide)
+        is_wide = jnp.where(jnp.all(before), is_wide, before | is_wide) | ~is_balanced
         return _with_wells(point, is_wide), jnp.any((is_wide != before) & (pressures[:-1] > 0))
 
     def ended(self, point: Any) -> Any:

@@ -14,8 +14,8 @@ jumps, none does.
 
 A well is narrow where the distance alone tells the place, as where parts cross, and bends force and place by next to
 nothing. It is wide where the distance hardly grows along the rod: parts that wind around each other bend so that it
-even falls between the places where they press. In a search all are wide; at its end each is what it should be
-(`wide_cells`), and the search goes on from there.
+even falls between the places where they press. In a search all are wide, from a start that is not balanced with those
+that it should have (`wide_cells`); at its end each becomes what it should be, and the search goes on from there.
 
 First derivatives of g are those at fixed places; the second ones count that the places move. Neighbours along the rod
 are no contact: less than half a turn around the rod's own radius away, or of the next element.

@@ -241,9 +241,12 @@ def _advanced(
         is_lost = jnp.abs(twist - point.total_twist) > 0  # not where it is not a number
         point = eqx.tree_at(lambda point: point.total_twist, point, twist)
     if form.refines:
-        # What a search changes at its end alone.
+        # What a search changes at its beginning or end alone.
+        begins = (iterations == 0) & ~is_balanced
         point, changes = jax.lax.cond(
-            is_balanced & ~again & ~is_lost, lambda: form.refined(point), lambda: (point, jnp.array(False))
+            begins | (is_balanced & ~again & ~is_lost),
+            lambda: form.refined(point, is_balanced),
+            lambda: (point, jnp.array(False)),
         )
         is_lost |= changes
     again |= is_lost

@@ -99,8 +99,9 @@ def test_a_program_is_found_by_its_arguments(folder):
     x = jnp.arange(3.0)
     np.testing.assert_array_equal(program()(x)["scaled"], [0, 2, 4])
     assert len(files(folder)) == 1
-    # As if by another version of the source: what is kept under that name is taken.
-    np.testing.assert_array_equal(program(scale=5.0)(x)["scaled"], [0, 2, 4])
+    # As if by another version of the source: what is kept under that name is taken, for NumPy's numbers too.
+    for same in (x, np.asarray(x)):
+        np.testing.assert_array_equal(program(scale=5.0)(same)["scaled"], [0, 2, 4])
     for other in (jnp.arange(4.0), np.float32([1, 2]), 1.5, 2):
         result = program(scale=5.0)(other)["scaled"]
         np.testing.assert_array_equal(result, 5.0 * np.asarray(other))

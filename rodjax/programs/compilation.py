@@ -121,8 +121,14 @@ def _kind(leaf: Any) -> Any:
     except AttributeError:
         pass
     if isinstance(leaf, np.ndarray | np.generic):
-        return leaf.shape, leaf.dtype
+        return _aval(leaf.shape, leaf.dtype, jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
     return type(leaf).__name__ if type(leaf) in (bool, int, float) else None
+
+
+@functools.lru_cache(maxsize=4096)
+def _aval(shape: tuple[int, ...], dtype: np.dtype, is_double: bool) -> Any:
+    """That of an array of JAX's with the same numbers."""
+    return jax.typeof(np.broadcast_to(np.zeros((), dtype), shape))
 
 
 _compiled: list[_Programs] = []

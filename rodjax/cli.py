@@ -553,7 +553,7 @@ def _route(arguments: argparse.Namespace) -> int:
     if arguments.view and find_spec("viser") is None:
         raise CommandError("--view needs viser, got none: pip install 'rodjax[view]'")
     file = read_route_file(arguments.file, for_route=True)
-    (scene,) = file.cables.values()
+    scene = file.of_route
     starts = arguments.starts or file.starts
     options: dict[str, Any] = {} if starts is None else {"starts": starts}
     with warnings.catch_warnings():
@@ -582,7 +582,7 @@ def _route(arguments: argparse.Namespace) -> int:
         obstacles=file.obstacles,
         names=file.names,
         title=title,
-        source=_source(arguments.file, scene),
+        source=f"{arguments.file}, {route.segments} segments",
     )
     print(f"{route}\n\n{starts_table(route)}\n\n{report}", flush=True)
     written = [*report.save(arguments.out), *written_route(route, arguments.out)]

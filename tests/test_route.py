@@ -312,7 +312,7 @@ def test_arguments_are_checked():
     length = [rj.Between("rod.length", 0.2, 0.3)]
     with pytest.raises(ValueError, match=r"lower must be below upper for rod\.length, got 0\.3 and 0\.2"):
         rj.Between("rod.length", 0.3, 0.2)
-    with pytest.raises(TypeError, match="scene must be a Scene, got 3"):
+    with pytest.raises(TypeError, match="scene must be a Scene or Harness, got 3"):
         rj.route(3, length)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="limits must have a clearance where there are obstacles"):
         rj.route(corner(), length, obstacles=[AWAY])

@@ -15,7 +15,7 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Free, Pin, rotate
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.harness import differentiable_by, differentiable_harness
+from rodjax.solving.harness_derivatives import differentiable_by, differentiable_harness
 from rodjax.solving.harness_result import HarnessEquilibrium, Solution
 from rodjax.solving.implicit import differentiable
 from rodjax.solving.result import Equilibrium

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.checks import instance, is_known, sequence
+from rodjax.checks import instance, is_known, leaf, sequence
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.mixed import MixedForm
 from rodjax.model.harness import Harness
@@ -128,18 +128,23 @@ def solve_batch(
 
 
 def solve_stack(
-    stacked: Scene,
-    guess: Guess | Equilibrium | None = None,
+    stacked: Scene | Harness,
+    guess: Any = None,
     *,
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
     mesh: Mesh | None = None,
     threads: int | None = None,
     **settings: Any,
-) -> Equilibrium:
-    """The same of stacked scenes of which some may have supports that are too far apart, as in a search.
+) -> Any:
+    """The same of stacked scenes of which some may have supports that are too far apart, as in a search; or of stacked
+    harnesses, one after another, of which no warning tells what is wrong with them.
 
     `settings`: the other arguments of `solve_batch`.
     """
+    if isinstance(stacked, Harness):
+        return harness_batch(
+            list(unstacked(stacked)), guess=guess, strain_limit=strain_limit, is_told=False, **settings
+        )
     threads = checked_threads(threads)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -290,8 +295,16 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
     return jnp.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
 
 
-def solve_first(scenes: Scene, guesses: Equilibrium, count: int, options: Options) -> Equilibrium:
-    """The first `count` of stacked scenes, each from its guess, without derivatives; of the others nothing of use."""
+def solve_first(scenes: Scene | Harness, guesses: Any, count: int, options: Options) -> Any:
+    """The first `count` of stacked scenes or harnesses, each from its guess, without derivatives; of the others nothing
+    of use.
+    """
+    if isinstance(scenes, Harness):
+        first, begins = jax.tree.map(lambda x: np.asarray(x)[:count], (scenes, guesses))
+        numbers: dict[str, Any] = {"segments": options.segments, "solver": options.solver, "find": options.find}
+        found = solve_stack(first, begins, strain_limit=None, **numbers)
+        which = np.minimum(np.arange(len(guesses.energy)), count - 1)
+        return jax.tree.map(lambda x: leaf(np.asarray(x)[which]), found)
     return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None, lane_count())
 
 

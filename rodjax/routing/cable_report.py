@@ -46,10 +46,12 @@ class Gradients(NamedTuple):
     active: tuple[str, ...] = ()
 
     @staticmethod
-    def of(route: Route) -> "Gradients":
-        """Those of the best route that was found."""
-        margins = tuple(name for name in route.gradients if name != "objective")
-        rows = [np.asarray(route.gradients[name]) for name in margins]
+    def of(route: Route, cable: str | None = None) -> "Gradients":
+        """Those of the best route that was found; of a harness those of a cable, by its name."""
+        prefix = "" if cable is None else f"{cable}: "
+        names = [name for name in route.gradients if name != "objective" and name.startswith(prefix)]
+        margins = tuple(name.removeprefix(prefix) for name in names)
+        rows = [np.asarray(route.gradients[name]) for name in names]
         derivatives = np.reshape(rows, (len(rows), len(route.names)))
         ranges = np.stack([np.asarray(route.lower), np.asarray(route.upper)], axis=-1)
         ends = [

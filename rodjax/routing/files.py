@@ -5,7 +5,7 @@ A complete example; quantities are as in scene files, a number and any unit of t
     scene = "scene.toml"           # in a folder as seen from this file, without [[path]]; or the tables of a scene,
                                    # [rod], [start], [end] and others, in this file; or of several cables, for a report:
                                    # cables = { "brake line" = "brake.toml", "sensor" = "sensor.toml" }; for a report
-                                   # also the file of a harness, or its tables [cables.NAME] and others
+                                   # or a route also the file of a harness, or its tables [cables.NAME] and others
     title = "Brake line"           # optional
     starts = 8                     # optional, for `rodjax route`: from how many designs the search begins
 
@@ -42,7 +42,7 @@ What `rodjax route` varies, and a report of the scene as it is leaves aside:
 
     [[variables]]                  # one or more of these; names as in `rodjax.route`
     kind = "between"               # a number, or each component of a vector
-    key = "clips.0.at"
+    key = "clips.0.at"             # of a harness "cables.NAME.clips.0.at" and so on
     lower = "200 mm"
     upper = "300 mm"
 
@@ -125,11 +125,19 @@ class RouteFile(NamedTuple):
     objective: Objective | None
     starts: int | None
 
+    @property
+    def of_route(self) -> SceneFile | HarnessFile:
+        """The file of the one scene or harness of which a route is sought."""
+        if self.harness is not None:
+            return self.harness
+        (scene,) = self.cables.values()
+        return scene
+
 
 def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, for_route: bool = False) -> RouteFile:
     """What the TOML file says; see this module for the format. Without its scene where that is not needed.
 
-    `for_route`: it must have one scene, and variables.
+    `for_route`: it must have one scene, or a harness, and variables.
 
     Raises `SceneFileError` with one line that names the file and the key.
     """
@@ -146,13 +154,12 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, fo
     cables = _cables(content, path) if with_scene and harness is None else {}
     with in_file(path):
         variables = _variables(content.get("variables", []))
-        if for_route and harness is not None:
-            raise SceneFileError("a harness is not allowed where a route is sought, which is of one cable")
+        file = RouteFile(cables, harness, title, obstacles, names, limits, variables, objective, starts)
         if for_route:
-            _check_for_route(content, cables, variables)
-        if len(cables) == 1 and variables:
-            _check_variables(variables, next(iter(cables.values())))
-    return RouteFile(cables, harness, title, obstacles, names, limits, variables, objective, starts)
+            _check_for_route(content, file)
+        if variables and (harness is not None or len(cables) == 1):
+            _check_variables(variables, file.of_route)
+    return file
 
 
 def _title(content: dict[str, Any]) -> str | None:
@@ -306,12 +313,12 @@ def _number_or_list(value: Any, key: str, where: str, unit: str, example: str) -
             raise SceneFileError(f"{where}.{error}") from None
 
 
-def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], variables: tuple[Variable, ...]) -> None:
-    if "cables" in content:
+def _check_for_route(content: dict[str, Any], file: RouteFile) -> None:
+    if "cables" in content and file.harness is None:
         raise SceneFileError('cables is not allowed where a route is sought, which is of one: scene = "scene.toml"')
-    if not variables:
+    if not file.variables:
         raise SceneFileError("variables is missing: one or more tables [[variables]], which say what may vary")
-    (scene,) = cables.values()
+    scene = file.of_route
     if scene.rtol is not None or scene.discretization == "finite_difference":
         raise SceneFileError(
             "solve.rtol and finite differences are not allowed where a route is sought, which is on one mesh of "
@@ -323,9 +330,10 @@ def _check_for_route(content: dict[str, Any], cables: Mapping[str, SceneFile], v
         )
 
 
-def _check_variables(variables: tuple[Variable, ...], file: SceneFile) -> None:
+def _check_variables(variables: tuple[Variable, ...], file: SceneFile | HarnessFile) -> None:
     for k, variable in enumerate(variables):
-        check_clocked(variable.key, file.unclocked, f"variables[{k}]")
+        if isinstance(file, SceneFile):
+            check_clocked(variable.key, file.unclocked, f"variables[{k}]")
     try:
         checked_variables(variables, file.scenes[0])
     except (TypeError, ValueError) as error:

@@ -22,8 +22,8 @@ from rodjax.routing.problem import (
 )
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.search import KEPT, Asked, Numbers, Outcome, Search, Settings
-from rodjax.solving.equilibrium import checked_options
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.equilibrium import Options
+from rodjax.solving.harness_result import Solution
 
 # Starts of a group: as many as are computed side by side. Searches of several groups do not wait for one another.
 GROUP = 8
@@ -56,7 +56,7 @@ class Found(NamedTuple):
 def searched(
     problem: Problem,
     starts: Float[np.ndarray, "k n"],
-    guesses: Equilibrium,
+    guesses: Solution,
     reserves: Float[np.ndarray, "k m"],
     count: int,
     targets: Targets,
@@ -72,14 +72,12 @@ class Group:
         self,
         problem: Problem,
         starts: Float[np.ndarray, "k n"],
-        guesses: Equilibrium,
+        guesses: Solution,
         reserves: Float[np.ndarray, "k m"],
         targets: Targets,
     ):
         self.problem, self._reserves, self._targets = problem, reserves, targets
-        self._options = checked_options(problem.scene, problem.segments, None, "hermite", problem.solver, None, False)[
-            0
-        ]
+        self._options = Options(problem.segments, "hermite", problem.solver)
         self._starts, self._guesses = starts, jax.tree.map(jnp.asarray, guesses)
         self.last = self._best = nothing_evaluated(problem, jnp.asarray(starts), self._guesses)
         self._lacking, self._objective = np.full(len(starts), np.inf), np.full(len(starts), np.inf)

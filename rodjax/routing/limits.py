@@ -75,6 +75,12 @@ class Limits(eqx.Module):
         if all(value is None for value in given):
             raise ValueError("Limits must hold at least one limit, such as bend_radius=6, got none")
 
+    def without_clips(self) -> "Limits | None":
+        """Those of a cable without clips; `None` where there are no others."""
+        names = [name for name in self.__dataclass_fields__ if not name.startswith("clip_")]
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return Limits(**given) if given else None
+
 
 def _clearances(value: Any) -> Float[Array, ""] | Float[Array, "m"]:
     numbers = number_list(value, "clearance")

@@ -16,7 +16,7 @@ from rodjax.checks import instance, sequence
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Value, value_at
-from rodjax.model.harness import scenes_of
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.obstacles import Obstacle, checked_obstacles
 from rodjax.model.scene import Scene
 from rodjax.paths.modes import lowest_mode
@@ -135,11 +135,13 @@ def _label(each: Measured, names: tuple[str, ...]) -> str:
 
 
 def checked(
-    subject: Solution | Scene, limits: Limits, obstacles: Any, names: Any
+    subject: Solution | Scene | Harness, limits: Limits, obstacles: Any, names: Any
 ) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
-    """The obstacles and their names, where the limits suit them and the rods of an equilibrium, or of a `Scene`."""
+    """The obstacles and their names, where the limits suit them and the rods of an equilibrium, or of a scene or
+    harness.
+    """
     instance(limits, "limits", Limits)
-    rods = scenes_of(subject if isinstance(subject, Scene) else solved_in(subject), "{}: ")
+    rods = scenes_of(subject if isinstance(subject, Scene | Harness) else solved_in(subject), "{}: ")
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if obstacles:
         obstacles = checked_obstacles(obstacles)

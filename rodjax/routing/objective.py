@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, not_negative, positive
 from rodjax.geometry.vectors import dot, root
+from rodjax.solving.harness_result import Solution, results_of
 from rodjax.solving.result import Equilibrium
 
 # A clip counts half where it carries this part of the weight of the cable, where nothing else is said.
@@ -15,7 +16,8 @@ CLIP_SHARE = 0.05
 
 
 class Objective(eqx.Module):
-    """The cost of a route, a weighted sum of the terms below; `Limits` are its constraints.
+    """The cost of a route, a weighted sum of the terms below; `Limits` are its constraints. Of a harness the sum of
+    those of its cables.
 
     **Arguments:** weights, each per unit of its own.
 
@@ -55,7 +57,11 @@ class Objective(eqx.Module):
         if not any(float(weight) > 0 for weight in weights):
             raise ValueError("Objective must have at least one weight above 0, such as length=1")
 
-    def of(self, equilibrium: Equilibrium) -> Float[Array, ""]:
+    def of(self, equilibrium: Solution) -> Float[Array, ""]:
+        costs = [self._of_cable(rod) for rod in results_of(equilibrium).values()]
+        return sum(costs[1:], costs[0])
+
+    def _of_cable(self, equilibrium: Equilibrium) -> Float[Array, ""]:
         scene = equilibrium.scene
         mass = scene.rod.mean_mass_per_length * scene.rod.length
         ends = (equilibrium.start_force, equilibrium.end_force)

@@ -12,6 +12,7 @@ from rodjax.io.scene_writing import write_scene
 from rodjax.routing.records import plain
 from rodjax.routing.report_text import TOLD, table
 from rodjax.routing.route import Route
+from rodjax.solving.harness_result import results_of, solved_in
 
 # Starts with a row in the table; of more the best.
 MOST_ROWS = 20
@@ -77,7 +78,8 @@ def written_route(route: Route, folder: Path) -> list[Path]:
     written = [folder / "route.json", folder / "result.vtkhdf"]
     replace_file(written[0], f"{json.dumps(as_dict(route), indent=1, allow_nan=False)}\n".encode())
     save(route.verified, written[1])
-    if route.scene.rod.rest_centerline is None:
+    rods = results_of(route.verified).values()
+    if all(rod.scene.rod.rest_centerline is None for rod in rods):
         written.append(folder / "scene.toml")
-        write_scene(route.verified.scene, written[-1], route.verified.s.shape[-1] - 1)
+        write_scene(solved_in(route.verified), written[-1], route.segments)
     return written

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Along
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Clip, Held, Support
@@ -19,8 +20,8 @@ from rodjax.routing.margins import Measured, measured
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Variable, leaf_names, with_numbers
 from rodjax.solving.equilibrium import Solver
-from rodjax.solving.implicit import differentiable
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.harness_derivatives import jacobian
+from rodjax.solving.harness_result import Solution, solved_in
 
 T = TypeVar("T")
 
@@ -28,7 +29,7 @@ T = TypeVar("T")
 class Problem(eqx.Module):
     """What `route` was asked for."""
 
-    scene: Scene
+    scene: Scene | Harness
     variables: tuple[Variable, ...]
     limits: Limits | None
     obstacles: tuple[Obstacle, ...]
@@ -36,7 +37,7 @@ class Problem(eqx.Module):
     segments: int = eqx.field(static=True)
     solver: Solver = eqx.field(static=True)
 
-    def scene_at(self, u: Float[Array, "n"]) -> Scene:
+    def scene_at(self, u: Float[Array, "n"]) -> Any:
         return with_numbers(self.scene, self.variables, u)
 
 
@@ -54,24 +55,38 @@ class Evaluation(eqx.Module):
     spare: Float[Array, "... spans"]
     kept: list[Measured]
     rates: Float[Array, "... r n"]
-    result: Equilibrium
+    result: Solution
     is_valid: Bool[Array, "..."]
 
 
-def spans(problem: Problem, scene: Scene) -> Float[Array, "spans"]:
-    """By how much the rod between held places is longer than the straight way, as parts of the rod's length, and than
-    a rod is that is pulled as tight as the limits of force allow.
+def spans(problem: Problem, scene: Scene | Harness) -> list[Float[Array, "spans"]]:
+    """By how much a rod between held places is longer than the straight way, as parts of the rod's length, and than
+    a rod is that is pulled as tight as the limits of force allow; of each rod.
 
     Of a rod that may become shorter or move, else nothing: a rod that is given is as it is. Sliding clips hold no place
-    of the rod.
+    of the rod, nor do joints.
     """
     names = leaf_names(problem.scene, problem.variables)
+    tightening = [name for name in names if name.endswith((".length", ".at", ".position"))]
+    return [
+        _spans_of_rod(problem.limits, rod)
+        if any(name.startswith(path) for name in tightening)
+        else jnp.zeros(0, rod.rod.length.dtype)
+        for path, rod in scenes_of(scene, "cables.{}.").items()
+    ]
+
+
+def span_names(problem: Problem) -> tuple[str, ...]:
+    """Of all spans, as `spans` has them one after another."""
+    of_rods = zip(scenes_of(problem.scene, "{}: "), jax.eval_shape(lambda: spans(problem, problem.scene)), strict=True)
+    return tuple(f"{prefix}length of the rod in span {k}" for prefix, found in of_rods for k in range(len(found)))
+
+
+def _spans_of_rod(limits: Limits | None, scene: Scene) -> Float[Array, "spans"]:
     length = scene.rod.length
     supports: list[tuple[Float[Array, ""], Support | Clip, bool]] = [(jnp.zeros_like(length), scene.start, False)]
     supports += [(clip.at, clip, clip.sliding) for clip in scene.clips]
     supports += [(length, scene.end, False)]
-    if not any(name == "rod.length" or name.endswith((".at", ".position")) for name in names):
-        return jnp.zeros(0, length.dtype)
     found = []
     before = None
     for k, (s, support, is_sliding) in enumerate(supports):
@@ -83,7 +98,7 @@ def spans(problem: Problem, scene: Scene) -> Float[Array, "spans"]:
             if is_sliding:
                 before = before[0], support.position, way, before[3]
                 continue
-            strain = _most_strain(problem.limits, scene, min(before[3], len(supports) - 1 - k))
+            strain = _most_strain(limits, scene, min(before[3], len(supports) - 1 - k))
             found.append(((1 + strain) * (s - before[0]) - way) / length)
         before = s, support.position, jnp.zeros_like(length), k
     return jnp.stack(found) if found else jnp.zeros(0, length.dtype)
@@ -99,11 +114,18 @@ def _most_strain(limits: Limits | None, scene: Scene, clips: int) -> Float[Array
     return force.astype(most.dtype) / jnp.max(stiffness)
 
 
-def is_ordered(scene: Scene) -> Bool[Array, ""]:
-    """Whether clips follow one another along the rod, each further on by a hundredth of a part of it."""
-    length = scene.rod.length
-    s = jnp.stack([jnp.zeros_like(length), *(clip.at for clip in scene.clips), length])
-    return jnp.all(jnp.diff(s) > 0.01 * length / len(s))
+def is_ordered(scene: Scene | Harness) -> Bool[Array, ""]:
+    """Whether clips follow one another along each rod, each further on by a hundredth of a part of it."""
+    are_ordered = []
+    for rod in scenes_of(scene).values():
+        length = rod.rod.length
+        s = jnp.stack([jnp.zeros_like(length), *(clip.at for clip in rod.clips), length])
+        are_ordered.append(jnp.all(jnp.diff(s) > 0.01 * length / len(s)))
+    return jnp.all(jnp.stack(are_ordered))
+
+
+def _spare(problem: Problem, scene: Scene | Harness) -> Float[Array, "spans"]:
+    return jnp.concatenate(spans(problem, scene))
 
 
 @compiled
@@ -112,18 +134,19 @@ def spare_lengths(problem: Problem, designs: Float[Array, "k n"]) -> Float[Array
 
     def one(u: Float[Array, "n"]) -> Float[Array, ""]:
         scene = problem.scene_at(u)
-        least = jnp.min(spans(problem, scene), initial=jnp.inf)
+        least = jnp.min(_spare(problem, scene), initial=jnp.inf)
         return jnp.where(is_ordered(scene), least, -jnp.inf)
 
     return jax.vmap(one)(designs)
 
 
 @compiled
-def scenes_of(problem: Problem, designs: Float[Array, "k n"]) -> Scene:
+def scenes_at(problem: Problem, designs: Float[Array, "k n"]) -> Any:
+    """Along a leading axis."""
     return jax.vmap(problem.scene_at)(designs)
 
 
-def _kept(problem: Problem, result: Equilibrium) -> list[Measured]:
+def _kept(problem: Problem, result: Solution) -> list[Measured]:
     if problem.limits is None:
         return []
     return measured(result, problem.limits, problem.obstacles, everywhere=True)
@@ -131,25 +154,25 @@ def _kept(problem: Problem, result: Equilibrium) -> list[Measured]:
 
 @traced_once
 def _values(
-    problem: Problem, scene: Scene, result: Equilibrium
+    problem: Problem, scene: Scene | Harness, result: Solution
 ) -> tuple[Float[Array, ""], Float[Array, "m"], Float[Array, "spans"], list[Measured]]:
     """The objective, the slacks, which of them are of spans, and what they are of."""
-    spare = spans(problem, scene)
+    spare = _spare(problem, scene)
     kept = _kept(problem, result)
     return problem.objective.of(result), jnp.concatenate([spare, *(each.slack for each in kept)]), spare, kept
 
 
 @traced_once
-def _evaluated(problem: Problem, design: Float[Array, "n"], result: Equilibrium) -> Evaluation:
-    def outputs(u: Float[Array, "n"]) -> tuple[Float[Array, "r"], Any]:
-        scene = problem.scene_at(u)
-        objective, slacks, spare, kept = _values(problem, scene, differentiable(scene, result))
+def _evaluated(problem: Problem, design: Float[Array, "n"], result: Solution) -> Evaluation:
+    def outputs(scene: Scene | Harness, near: Solution) -> tuple[Float[Array, "r"], Any]:
+        objective, slacks, spare, kept = _values(problem, scene, near)
         worst = [jnp.argmin(jax.lax.stop_gradient(each.margin)) for each in kept]
         kept = [jax.tree.map(lambda x, k=k: x[k][None], each) for each, k in zip(kept, worst, strict=True)]
         margins = [each.margin for each in kept]
         return jnp.concatenate([objective[None], slacks, *margins]), (objective, slacks, spare, kept)
 
-    rates, (objective, slacks, spare, kept) = jax.jacfwd(outputs, has_aux=True)(design)
+    _, by, (objective, slacks, spare, kept) = jacobian(outputs, problem.scene_at, design, result)
+    rates = by.T
     numbers = jnp.concatenate([objective[None], slacks])
     is_valid = result.converged & is_ordered(problem.scene_at(design))
     is_valid &= jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.isfinite(rates[: len(numbers)]))
@@ -158,14 +181,14 @@ def _evaluated(problem: Problem, design: Float[Array, "n"], result: Equilibrium)
 
 @compiled
 def arranged(
-    problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium, order: Int[Array, "k"]
-) -> tuple[Float[Array, "k n"], Scene, Equilibrium]:
+    problem: Problem, designs: Float[Array, "k n"], guesses: Solution, order: Int[Array, "k"]
+) -> tuple[Float[Array, "k n"], Any, Solution]:
     """Designs and guesses in this order, and the scenes; where clips do not follow one another, that of the guess."""
 
-    def scene(design: Float[Array, "n"], guess: Equilibrium) -> Scene:
+    def scene(design: Float[Array, "n"], guess: Solution) -> Any:
         scene = problem.scene_at(design)
         is_possible = is_ordered(scene)
-        return jax.tree.map(lambda a, b: jnp.where(is_possible, a, b), scene, guess.scene)
+        return jax.tree.map(lambda a, b: jnp.where(is_possible, a, b), scene, solved_in(guess))
 
     designs, guesses = jax.tree.map(lambda leaf: leaf[order], (designs, guesses))
     return designs, jax.vmap(scene)(designs, guesses), guesses
@@ -175,7 +198,7 @@ def arranged(
 def evaluated(
     problem: Problem,
     designs: Float[Array, "k n"],
-    results: Equilibrium,
+    results: Solution,
     last: Evaluation,
     order: Int[Array, "k"],
     count: Int[Array, ""],
@@ -192,11 +215,11 @@ def evaluated(
 
 @compiled
 def valued(
-    problem: Problem, designs: Float[Array, "k n"], results: Equilibrium
+    problem: Problem, designs: Float[Array, "k n"], results: Solution
 ) -> tuple[Float[Array, "k"], Float[Array, "k m"], Bool[Array, "k"]]:
     """The same without rates: objectives, slacks, and whether designs have an equilibrium."""
 
-    def one(design: Float[Array, "n"], result: Equilibrium):
+    def one(design: Float[Array, "n"], result: Solution):
         scene = problem.scene_at(design)
         objective, slacks, _, _ = _values(problem, scene, result)
         is_valid = result.converged & is_ordered(scene) & jnp.all(jnp.isfinite(slacks)) & jnp.isfinite(objective)
@@ -205,16 +228,16 @@ def valued(
     return jax.lax.map(lambda entry: one(*entry), (designs, results))
 
 
-def group_starts(problem: Problem, guesses: Equilibrium) -> tuple[int, ...]:
+def group_starts(problem: Problem, guesses: Solution) -> tuple[int, ...]:
     """The number of the first slack of each span, and of each thing that is limited."""
     one = _kind_of_one(guesses)
-    _, _, spare, kept = jax.eval_shape(_values, problem, one.scene, one)
+    _, _, spare, kept = jax.eval_shape(_values, problem, solved_in(one), one)
     count = spare.shape[0]
     sizes = [each.slack.shape[0] for each in kept]
     return (*range(count), *(count + sum(sizes[:k]) for k in range(len(sizes))))
 
 
-def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Equilibrium) -> Evaluation:
+def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Solution) -> Evaluation:
     """What comes before the first evaluation."""
     found = jax.eval_shape(_evaluated, problem, *_kind_of_one((designs, guesses)))
     return jax.tree.map(lambda leaf: jnp.zeros((len(designs), *leaf.shape), leaf.dtype), found)

@@ -14,6 +14,7 @@ import numpy as np
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
+from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle, checked_obstacles
 from rodjax.notes import note
 from rodjax.programs.answers import one_answer
@@ -150,7 +151,8 @@ def report(
     - `equilibrium`: one `Equilibrium`, a list of them, or a dictionary of them by the names of the cables; or that of a
       harness, whose rods are the cables: whether they are stable is told of the whole; or a `Route`, whose limits,
       obstacles, their names and gradients are taken where none are given, and the bounds of its variables.
-    - `limits`: `Limits` of all cables, or a list of `Limits` or `None`, one for each cable; `None`: none.
+    - `limits`: `Limits` of all cables, those of clips of the cables that have any; or a list of `Limits` or `None`, one
+        for each cable; `None`: none.
     - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
     - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
@@ -170,6 +172,8 @@ def report(
             obstacles, names = route.obstacles, route.obstacle_names if names is None else names
     cables = _cables(equilibrium)
     each_limits = _each(limits, "limits", (Limits,), len(cables))
+    if isinstance(limits, Limits) and any(one.scene.clips for one in cables.values()):
+        each_limits = [limits if one.scene.clips else limits.without_clips() for one in cables.values()]
     each_gradients = _each(gradients, "gradients", (Gradients, Route), len(cables))
     obstacles = sequence(obstacles, "obstacles", "Obstacle")
     if obstacles:
@@ -184,8 +188,14 @@ def report(
         if text is not None:
             instance(text, name, str)
     note("checking limits, supports and stability")
+
+    def of_cable(name: str, gradients: Gradients | Route | None) -> Gradients | None:
+        if not isinstance(gradients, Route):
+            return gradients
+        return Gradients.of(gradients, name if isinstance(gradients.scene, Harness) else None)
+
     found = tuple(
-        cable(name, one, limit, obstacles, names, Gradients.of(gradient) if isinstance(gradient, Route) else gradient)
+        cable(name, one, limit, obstacles, names, of_cable(name, gradient))
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
     )
     return Report("Route" if title is None else title, found, obstacles, names, source)

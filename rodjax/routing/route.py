@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, leaf, positive, whole_number
+from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, check_without_friction
 from rodjax.paths.batch import solve_stack
@@ -28,18 +29,22 @@ from rodjax.routing.problem import (
     chosen,
     group_starts,
     nothing_evaluated,
-    scenes_of,
+    scenes_at,
+    span_names,
     spare_lengths,
 )
 from rodjax.routing.search import KEPT, REGION, Outcome
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
 from rodjax.solving.equilibrium import Solver, checked_options
+from rodjax.solving.harness import clamped_rods
+from rodjax.solving.harness_result import Solution, results_of, solved_in
 from rodjax.solving.newton import Newton
-from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.solving.result import NotConvergedWarning
 from rodjax.solving.solve import solve
 from rodjax.warn import silenced
 
 SEGMENTS = 48
+SEGMENTS_OF_CABLES = 16
 # Of each limit so much is kept in reserve, as a part of it, until the error of the mesh is known.
 RESERVE = 1e-3
 # The reserve is then that error, as a finer mesh has it, and this part of it for what that mesh lacks itself: elements
@@ -112,9 +117,9 @@ class Route(eqx.Module):
     limits: Limits | None
     obstacles: tuple[Obstacle, ...]
     obstacle_names: tuple[str, ...] = eqx.field(static=True)
-    scene: Scene
-    equilibrium: Equilibrium
-    verified: Equilibrium
+    scene: Scene | Harness
+    equilibrium: Solution
+    verified: Solution
     margins: Margins
     objective: float
     optimal: bool = eqx.field(static=True)
@@ -128,7 +133,7 @@ class Route(eqx.Module):
     values: dict[str, np.ndarray]
     gradients: dict[str, Float[np.ndarray, "n"]]
     starts: Starts
-    designs: Scene
+    designs: Scene | Harness
     solves: int = eqx.field(static=True)
     with_gradients: int = eqx.field(static=True)
     failed: int = eqx.field(static=True)
@@ -146,7 +151,7 @@ class Route(eqx.Module):
             return (
                 f"A route that keeps to all limits, with the objective {self.objective:.6g}: {kept} of {count} starts "
                 f"led to a feasible route. {self.optimality}{least} on a mesh of "
-                f"{self.verified.s.shape[-1] - 1} segments. It took {effort}."
+                f"{self.segments} segments. It took {effort}."
             )
         gap = self.starts.violated[int(np.argmin(self.starts.violation))]
         return (
@@ -154,6 +159,11 @@ class Route(eqx.Module):
             f"search. The one that violates them least fails in {gap or name}; on the finer mesh {name} has the margin "
             f"{100 * margin:.2g} %. It took {effort}."
         )
+
+    @property
+    def segments(self) -> int:
+        """Of the mesh on which the route is verified, of each cable."""
+        return max(rod.s.shape[-1] - 1 for rod in results_of(self.verified).values())
 
     @property
     def optimality(self) -> str:
@@ -168,7 +178,7 @@ class Route(eqx.Module):
 
 @one_answer
 def route(
-    scene: Scene,
+    scene: Scene | Harness,
     variables: Any,
     *,
     limits: Limits | None = None,
@@ -193,13 +203,14 @@ def route(
 
     **Arguments:**
 
-    - `scene`: `Scene`, which gives all that does not vary.
+    - `scene`: `Scene` or `Harness`, which gives all that does not vary. Of a harness the limits are of each cable, as
+        for `rodjax.margins`, and the objective is the sum over the cables.
     - `variables`: a list of `Between`, `OnLine`, `OnPatch`, `OnSurface` and `Turned`, of different numbers.
     - `limits`: `Limits`; `None` for none.
     - `objective`: `Objective`; `None`: the length where it varies, else the elastic energy.
     - `obstacles`, `names`: as for `rodjax.margins`.
     - `starts`: how many, and `seed` of the random ones.
-    - `segments`: of the mesh, Hermite elements; `None` for 48.
+    - `segments`: of the mesh, Hermite elements; `None` for 48, of each cable of a harness 16.
     - `solver`: a `Newton`; `None` for `Newton()`.
     - `tolerance`: an objective is optimal where it falls by no more than this part of that of the first start within a
         thousandth of the ranges; `iterations`: most of each search.
@@ -241,20 +252,23 @@ def route(
 def _problem(
     scene: Any, variables: Any, limits: Any, objective: Any, obstacles: Any, names: Any, segments: Any, solver: Any
 ) -> tuple[Problem, tuple[str, ...]]:
-    instance(scene, "scene", Scene)
-    check_without_friction(scene, "a route")
+    instance(scene, "scene", (Scene, Harness))
+    if isinstance(scene, Scene):  # rods of harnesses have none
+        check_without_friction(scene, "a route")
     variables = checked_variables(variables, scene)
     if limits is None and obstacles:
         raise ValueError("limits must have a clearance where there are obstacles, got None")
     obstacles, names = ((), ()) if limits is None else checked(scene, limits, obstacles, names)
     if objective is None:
-        varies = "rod.length" in leaf_names(scene, variables)
+        varies = any(name.endswith("rod.length") for name in leaf_names(scene, variables))
         objective = Objective(length=1.0) if varies else Objective(energy=1.0)
     instance(objective, "objective", Objective)
     solver = Newton() if solver is None else solver
     instance(solver, "solver", Newton)
-    segments = SEGMENTS if segments is None else segments
-    checked_options(scene, segments, None, "hermite", solver, None, False)
+    if segments is None:
+        segments = SEGMENTS if isinstance(scene, Scene) else SEGMENTS_OF_CABLES
+    for rod in [scene] if isinstance(scene, Scene) else clamped_rods(scene):
+        checked_options(rod, segments, None, "hermite", solver)
     return Problem(scene, variables, limits, obstacles, objective, segments, solver), names
 
 
@@ -276,7 +290,7 @@ class _Fleet:
         self.scale = self.tolerance = 1.0
         self._iterations = ITERATIONS
 
-    def _begin(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "k n"], Equilibrium]:
+    def _begin(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "k n"], Solution]:
         """Designs that have equilibria, with these; where there is none after all that of another start stands in."""
         nominal = first_numbers(self.problem.scene, self.problem.variables)
         designs = np.concatenate([nominal[None], self._drawn(count - 1, rng)])
@@ -311,9 +325,9 @@ class _Fleet:
         first = np.where(np.any(spare > 0, axis=1), np.argmax(spare > 0, axis=1), np.argmax(spare, axis=1))
         return designs[np.arange(count), first]
 
-    def _solved_cold(self, designs: Float[np.ndarray, "k n"]) -> Equilibrium:
+    def _solved_cold(self, designs: Float[np.ndarray, "k n"]) -> Solution:
         with silenced(NotConvergedWarning):
-            scenes = scenes_of(self.problem, jnp.asarray(designs))
+            scenes = scenes_at(self.problem, jnp.asarray(designs))
             options: dict[str, Any] = dict(segments=self.problem.segments, solver=self.problem.solver)
             return solve_stack(scenes, **options, strain_limit=None, threads=self._workers.threads)
 
@@ -363,14 +377,14 @@ class _Fleet:
             designs = before.designs + outcome.designs
             self.outcomes[k] = Outcome(before.iterations + outcome.iterations, outcome.message, designs)
 
-    def stood(self, k: int) -> Scene:
+    def stood(self, k: int) -> Any:
         """Where a search stood, one after another, and what is its best last: as stacked scenes."""
         best = self.best.design[k]
         designs = [design for design in self.outcomes[k].designs if not np.array_equal(design, best)]
         designs = np.stack([*designs, best])
         # So many at a time as there are starts, for which there is a program already.
         size, total = len(self._starts), len(designs)
-        parts = [scenes_of(self.problem, jnp.asarray(designs[rows_of(j, size, total)])) for j in range(0, total, size)]
+        parts = [scenes_at(self.problem, jnp.asarray(designs[rows_of(j, size, total)])) for j in range(0, total, size)]
         return jax.tree.map(lambda *leaves: leaf(np.concatenate(leaves)[:total]), *parts)
 
     def optimality(self, k: int) -> Optimality:
@@ -434,7 +448,7 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
         limits=problem.limits,
         obstacles=problem.obstacles,
         obstacle_names=names,
-        scene=at.result.scene,
+        scene=solved_in(at.result),
         equilibrium=at.result,
         verified=verified,
         margins=found,
@@ -447,7 +461,7 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
         numbers=offsets + scales * np.asarray(at.design),
         lower=np.minimum(offsets, offsets + scales),
         upper=np.maximum(offsets, offsets + scales),
-        values={variable.key: np.asarray(number_of(at.result.scene, variable)) for variable in variables},
+        values={variable.key: np.asarray(number_of(solved_in(at.result), variable)) for variable in variables},
         gradients=rows,
         starts=_starts(fleet, feasible, offsets, scales, found.names),
         designs=fleet.stood(best),
@@ -458,29 +472,29 @@ def _best(fleet: _Fleet, names: tuple[str, ...], *, is_finished: bool) -> Route:
     )
 
 
-def _finer(fleet: _Fleet, k: int) -> tuple[Equilibrium, Float[np.ndarray, "g"]]:
+def _finer(fleet: _Fleet, k: int) -> tuple[Solution, Float[np.ndarray, "g"]]:
     """The best design of a search on a mesh twice as fine, and the least slack of each limit there."""
     problem = fleet.problem
     here = _row(fleet.best.result, k)
     with silenced(NotConvergedWarning):  # what did not converge is not kept
-        finer = solve(here.scene, segments=2 * problem.segments, guess=here, solver=problem.solver)
+        finer: Any = solve(solved_in(here), segments=2 * problem.segments, guess=here, solver=problem.solver)
     if problem.limits is None:
         return finer, np.zeros(0)
     found = measured_margins(finer, problem.limits, problem.obstacles)
     return finer, np.array([float(each.slack[0]) for each in found])
 
 
-def _is_kept(finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> bool:
+def _is_kept(finer: tuple[Solution, Float[np.ndarray, "g"]]) -> bool:
     return bool(finer[0].converged) and float(np.min(finer[1], initial=0.0)) >= 0
 
 
-def _errors(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "g"]:
+def _errors(fleet: _Fleet, k: int, finer: tuple[Solution, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "g"]:
     """By how much the slack of each limit is too large on the mesh of the search."""
     spans = fleet.best.spare.shape[-1]
     return np.minimum.reduceat(np.asarray(fleet.best.slacks[k]), np.array(fleet.groups))[spans:] - finer[1]
 
 
-def _reserve(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "m"]:
+def _reserve(fleet: _Fleet, k: int, finer: tuple[Solution, Float[np.ndarray, "g"]]) -> Float[np.ndarray, "m"]:
     """For the error of the mesh, of what is limited within reach."""
     spans, m = fleet.best.spare.shape[-1], fleet.reserves.shape[1]
     error = _errors(fleet, k, finer)
@@ -491,7 +505,7 @@ def _reserve(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, 
     return np.concatenate([np.zeros(spans), np.repeat(each, np.diff([*fleet.groups[spans:], m]))])
 
 
-def _is_open(fleet: _Fleet, k: int, finer: tuple[Equilibrium, Float[np.ndarray, "g"]]) -> bool:
+def _is_open(fleet: _Fleet, k: int, finer: tuple[Solution, Float[np.ndarray, "g"]]) -> bool:
     """Whether a search has more in reserve than its mesh needs, or less."""
     if fleet.lacking[k] > 0 or not bool(finer[0].converged):
         return False
@@ -504,7 +518,7 @@ def _multipliers(
 ) -> dict[str, float]:
     """What holds the objective, by name, per whole limit; per range of the variables at their ends."""
     slacks, rates, spans = np.asarray(at.slacks), np.asarray(at.rates), at.spare.shape[-1]
-    m, found = len(slacks), {}
+    m, found, of_spans = len(slacks), {}, span_names(fleet.problem)
     bounds = [*fleet.groups, m]
     for g, (first, last) in enumerate(itertools.pairwise(bounds)):
         multiplier = float(np.sum(conditions.multipliers[first:last]))
@@ -512,7 +526,7 @@ def _multipliers(
             # Slacks are in units of their own: by how much for a margin, their derivatives tell.
             worst, row = first + int(np.argmin(slacks[first:last])), rates[1 + m + g - spans]
             multiplier *= float(rates[1 + worst] @ row) / max(float(row @ row), np.finfo(float).tiny)
-        found[names[g - spans] if g >= spans else f"length of the rod in span {g}"] = multiplier
+        found[names[g - spans] if g >= spans else of_spans[g]] = multiplier
     for values, end in ((conditions.lower, "lower"), (conditions.upper, "upper")):
         found |= {f"{label} at its {end} bound": float(value) for label, value in zip(labels, values, strict=True)}
     # What the program leaves of others is nothing.
@@ -524,9 +538,9 @@ def _offsets(problem: Problem) -> Float[np.ndarray, "n"]:
     return np.concatenate([variable.offsets() for variable in problem.variables])
 
 
-def _margins(equilibrium: Equilibrium, problem: Problem, names: tuple[str, ...]) -> Margins:
+def _margins(equilibrium: Solution, problem: Problem, names: tuple[str, ...]) -> Margins:
     if problem.limits is None:
-        nothing = jnp.zeros(0, equilibrium.s.dtype)
+        nothing = jnp.zeros(0, equilibrium.energy.dtype)
         return Margins((), (), (), nothing, nothing, nothing, nothing)
     return margins(equilibrium, problem.limits, problem.obstacles, names)
 
@@ -540,10 +554,8 @@ def _starts(
 ) -> Starts:
     best: Evaluation = fleet.best
     margin = [np.asarray(each.margin)[:, 0] for each in best.kept]
-    spare = np.asarray(best.spare)
-    count = spare.shape[-1]
-    table = np.concatenate([spare, *(each[:, None] for each in margin)], axis=1)
-    labels = (*(f"length of the rod in span {k}" for k in range(count)), *names)
+    table = np.concatenate([np.asarray(best.spare), *(each[:, None] for each in margin)], axis=1)
+    labels = (*span_names(fleet.problem), *names)
     violation = np.maximum(-np.min(table, axis=1, initial=np.inf), 0.0)
     worst = np.argmin(table, axis=1) if labels else np.zeros(len(table), int)
     usable = np.isfinite(fleet.lacking)

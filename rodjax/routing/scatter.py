@@ -13,21 +13,19 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import Numbers
 from rodjax.identification.unknowns import nominal, with_values
-from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import has_potential
 from rodjax.model.supports import Free
 from rodjax.notes import bar
 from rodjax.paths.batch import chunk_size, lane_count, solve_stack
-from rodjax.paths.harness_path import harness_batch, unstacked
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import Workers, as_completed, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
-from rodjax.solving.harness import differentiable_by
+from rodjax.solving.harness_derivatives import jacobian
 from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
-from rodjax.solving.result import Equilibrium, NotConvergedWarning
+from rodjax.solving.result import NotConvergedWarning
 from rodjax.warn import silenced
 
 # Of the three-point rule of Gauss & Hermite, in standard deviations.
@@ -159,13 +157,7 @@ def _solved_part(
 ) -> tuple[Quantities, Bool[np.ndarray, "k"]]:
     # How many did not converge is what the caller is told.
     with silenced(NotConvergedWarning):
-        scenes, guess = scattering.scenes(zs), scattering.equilibrium
-        if isinstance(scenes, Harness):
-            assert isinstance(guess, HarnessEquilibrium)
-            rods: Any = harness_batch(list(unstacked(scenes)), guess=guess, strain_limit=None, is_told=False, **options)
-        else:
-            assert isinstance(guess, Equilibrium)
-            rods = solve_stack(scenes, guess=guess, strain_limit=None, **options)
+        rods = solve_stack(scattering.scenes(zs), guess=scattering.equilibrium, strain_limit=None, **options)
     return jax.tree.map(np.asarray, (_quantities(scattering, rods), rods.converged))
 
 
@@ -177,14 +169,12 @@ def _slopes(scattering: Scattering) -> Slopes:
     else:
         is_examined = has_potential(result.scene)
 
-    def found(z: Float[Array, "p"]) -> tuple[Quantities, Float[Array, ""]]:
-        near = differentiable_by(scattering.scene(z), result)
+    def found(_: Any, near: Solution) -> tuple[tuple[Quantities, Float[Array, ""]], None]:
         stiffness = lowest_mode(near).stiffness if is_examined else jnp.full_like(near.energy, jnp.nan)
-        return scattering.quantities(near), stiffness
+        return (scattering.quantities(near), stiffness), None
 
     z = jnp.zeros(len(scattering.root), result.energy.dtype)
-    along = jax.vmap(lambda direction: jax.jvp(found, (z,), (direction,)), out_axes=(None, 0))
-    (here, stiffness), (by, stiffness_by) = along(jnp.eye(len(z), dtype=z.dtype))
+    (here, stiffness), (by, stiffness_by), _ = jacobian(found, scattering.scene, z, result)
     return Slopes(here, by, stiffness, stiffness_by)
 
 

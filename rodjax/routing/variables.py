@@ -1,4 +1,4 @@
-"""Design variables of a route: numbers of a scene, each as a function of numbers from 0 to 1."""
+"""Design variables of a route: numbers of a scene or harness, each as a function of numbers from 0 to 1."""
 
 import math
 import re
@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, leaf, number_array, positive, sequence, shown, vector
 from rodjax.geometry.vectors import dot
+from rodjax.identification.unknowns import unit_of
+from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.model.supports import rotate
 
@@ -23,7 +25,9 @@ GRID = 33
 
 
 class Variable(eqx.Module):
-    """A number or vector of a scene that may vary, by its dotted name, such as `"clips.0.at"`, `"end.position.2"`."""
+    """A number or vector of a scene that may vary, by its dotted name, such as `"clips.0.at"`, `"end.position.2"`; of a
+    harness `"cables.NAME.rod.length"`, of the scene of a cable, and `"joints.NAME.mass"`, of a `Body`.
+    """
 
     key: eqx.AbstractVar[str]
 
@@ -99,7 +103,7 @@ class Between(Variable):
         return (self.key,) if self.lower.ndim == 0 else tuple(f"{self.key}.{k}" for k in range(len(self.lower)))
 
     def units(self):
-        return (_unit(self.key),) * self.lower.size
+        return (unit_of(self.key),) * self.lower.size
 
     def check(self, nominal):
         if _is_turned(self.key):
@@ -291,7 +295,7 @@ def _across(direction: Float[Array, "3"]) -> Float[Array, "3 2"]:
 # --- several of them -------------------------------------------------------------------------------------------------
 
 
-def checked_variables(variables: Any, scene: Scene) -> tuple[Variable, ...]:
+def checked_variables(variables: Any, scene: Scene | Harness) -> tuple[Variable, ...]:
     """Where each has a number of the scene to vary, and none the same as another."""
     variables = sequence(variables, "variables", "variables such as rodjax.Between")
     if not variables:
@@ -309,7 +313,7 @@ def checked_variables(variables: Any, scene: Scene) -> tuple[Variable, ...]:
     return variables
 
 
-def with_numbers(scene: Scene, variables: Sequence[Variable], u: Float[Array, "n"]) -> Scene:
+def with_numbers(scene: Scene | Harness, variables: Sequence[Variable], u: Float[Array, "n"]) -> Any:
     """The scene with the numbers that the variables give it."""
     numbers = named_numbers(scene)
     changed: dict[str, Array] = {}
@@ -328,22 +332,22 @@ def with_numbers(scene: Scene, variables: Sequence[Variable], u: Float[Array, "n
     return eqx.tree_at(lambda scene: [named_numbers(scene)[name] for name in changed], scene, list(changed.values()))
 
 
-def first_numbers(scene: Scene, variables: Sequence[Variable]) -> Float[np.ndarray, "n"]:
+def first_numbers(scene: Scene | Harness, variables: Sequence[Variable]) -> Float[np.ndarray, "n"]:
     """Those next to the scene."""
     return np.concatenate([variable.start(np.asarray(number_of(scene, variable))) for variable in variables])
 
 
-def number_of(scene: Scene, variable: Variable) -> Float[Numbers, "..."]:
+def number_of(scene: Scene | Harness, variable: Variable) -> Float[Numbers, "..."]:
     name, component = _place(variable.key, scene)
     number = named_numbers(scene)[name]
     return number if component is None else number[component]
 
 
-def leaf_names(scene: Scene, variables: Sequence[Variable]) -> set[str]:
+def leaf_names(scene: Scene | Harness, variables: Sequence[Variable]) -> set[str]:
     return {_place(variable.key, scene)[0] for variable in variables}
 
 
-def _place(key: str, scene: Scene) -> tuple[str, int | None]:
+def _place(key: str, scene: Scene | Harness) -> tuple[str, int | None]:
     numbers = named_numbers(scene)
     if key in numbers:
         return key, None
@@ -351,7 +355,8 @@ def _place(key: str, scene: Scene) -> tuple[str, int | None]:
     is_component = name in numbers and numbers[name].ndim == 1 and not _is_turned(name)
     if is_component and re.fullmatch("[0-9]+", component) and int(component) < len(numbers[name]):
         return name, int(component)
-    raise ValueError(f"{shown(key)} is no number of this scene; there are {', '.join(numbers)}")
+    kind = "scene" if isinstance(scene, Scene) else "harness"
+    raise ValueError(f"{shown(key)} is no number of this {kind}; there are {', '.join(numbers)}")
 
 
 def _checked_key(key: Any) -> str:
@@ -371,23 +376,3 @@ def _is_turned(key: str) -> bool:
 
 def _kind(shape: tuple[int, ...]) -> str:
     return "a number" if shape == () else f"numbers of shape {shape}"
-
-
-UNITS = {
-    "length": "m",
-    "at": "m",
-    "position": "m",
-    "radius": "m",
-    "EI": "N m^2",
-    "GJ": "N m^2",
-    "EA": "N",
-    "GA": "N",
-    "mass_per_length": "kg/m",
-    "gravity": "m/s^2",
-    "force": "N",
-    "moment": "N m",
-}
-
-
-def _unit(key: str) -> str:
-    return next((UNITS[part] for part in reversed(key.split(".")) if part in UNITS), "")

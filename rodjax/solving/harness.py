@@ -19,17 +19,13 @@ from rodjax.model.harness import (
     Harness,
     clamp_at,
     clamped,
-    end_radii,
-    floating,
     joint_ends,
     of_one_rod,
-    rotated,
 )
 from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, nondimensional, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
-from rodjax.programs.linear import linear
 from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
 from rodjax.solving.equilibrium import (
     DEFAULT_RTOL,
@@ -48,8 +44,19 @@ from rodjax.solving.equilibrium import (
 )
 from rodjax.solving.first_poses import first_poses
 from rodjax.solving.guess import Guess
-from rodjax.solving.harness_result import HarnessEquilibrium, Solution
-from rodjax.solving.implicit import differentiable, not_differentiated, with_zeros
+from rodjax.solving.harness_derivatives import differentiable_harness
+from rodjax.solving.harness_forces import (
+    contact_forces,
+    ends_of,
+    energy_of,
+    no_pressures,
+    no_rod_pressures,
+    split_pressures,
+    split_rod_pressures,
+    stacked,
+)
+from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.newton import Newton
 from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
 from rodjax.solving.result import (
@@ -63,17 +70,9 @@ from rodjax.solving.result import (
     warn_if_coarse,
     warn_of_outcome,
 )
-from rodjax.solving.rod_contact import Members, Pairs, in_contact, pairs_of
-from rodjax.solving.rod_contact_results import touching_rods
+from rodjax.solving.rod_contact import Members, in_contact, pairs_of
 from rodjax.solving.status import Outcome, is_converged
 from rodjax.warn import warn
-
-# Motions of the bodies, what is unknown of contacts between rods, pressures of those of bodies with obstacles.
-Unknown = tuple[Float[Array, "k"], Float[Array, "t"], Float[Array, "c"]]
-
-# Of contacts of bodies, beside the stiffest motion of these, and how often what it gives way by is asked for again.
-ENDS_COMPLIANCE = 1e-4
-ENDS_HARDENINGS = 4
 
 
 def solve_harness(
@@ -250,10 +249,6 @@ def _members(structures: list[Scene], all_options: tuple[Options, ...]) -> Membe
     return tuple(map(tuple, found.values()))
 
 
-def _stack(parts: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-
-
 def _solved(
     harness: Harness,
     poses: Poses,
@@ -297,7 +292,7 @@ def _solved(
 
 @compiled
 def _stacked_starts(each: tuple[tuple[SolverState, FirstTwist], ...]) -> tuple[SolverState, FirstTwist]:
-    return _stack(list(each))
+    return stacked(list(each))
 
 
 def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[SolverState, FirstTwist] | None:
@@ -341,14 +336,14 @@ def _solve(
     of_groups = split_pressures(harness, members, end_pressures)
     for numbers, (states, firsts), option, pressures in zip(members, starts, options, of_groups, strict=True):
         elements = option.segments
-        stacked = _stack(
+        scenes = stacked(
             [_touchable(harness, k, clamped(harness.scenes[k], harness, *poses), elements) for k in numbers]
         )
 
         def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
             return Search.of(*in_units_of(scene, state), first, option)
 
-        searches = jax.vmap(begin)(stacked, states, firsts)
+        searches = jax.vmap(begin)(scenes, states, firsts)
         body, frame, offset = ends_of(harness, numbers)
         groups.append(Rods(searches.form, searches.shape, searches.units, body, frame, offset))
         points.append(searches.point)
@@ -379,7 +374,7 @@ def harness_equilibrium(
     is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
     for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_begun, strict=True)):
-        now = _stack([clamped(harness.scenes[k], harness, *end.poses) for k in numbers])
+        now = stacked([clamped(harness.scenes[k], harness, *end.poses) for k in numbers])
         if number in in_contact(pairs):
             now = under_contact(now, assembly.contact_loads(loads, number).times(assembly.force, assembly.energy))
         rods.append(_equilibria(now, rod, begun, end, number, is_stable, strain_limit))
@@ -400,7 +395,7 @@ def harness_equilibrium(
         groups=tuple(rods),
         positions=end.poses.positions,
         frames=end.poses.frames,
-        energy=_energy(rods, bodies, end.poses),
+        energy=energy_of(rods, bodies, end.poses),
         converged=is_converged(status),
         stable=is_stable,
         index=end.negative,
@@ -414,16 +409,6 @@ def harness_equilibrium(
         harness=harness,
         members=members,
     )
-
-
-def ends_of(harness: Harness, numbers: tuple[int, ...]) -> tuple[Array, Array, Array]:
-    """Of some rods the bodies, frames and offsets of both ends; the number of all bodies for none."""
-    count, dtype = len(harness.bodies), harness.scenes[0].rod.length.dtype
-    found = [joint_ends(harness.scenes[number], harness.joint_names) for number in numbers]
-    bodies = jnp.array([[count if j < 0 else j for j in body] for body, _, _ in found])
-    frames = jnp.stack([jnp.stack([jnp.asarray(frame, dtype) for frame in two]) for _, two, _ in found])
-    offsets = jnp.stack([jnp.stack([jnp.asarray(offset, dtype) for offset in two]) for _, _, two in found])
-    return bodies, frames, offsets
 
 
 def _equilibria(
@@ -456,84 +441,6 @@ def _equilibria(
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 
     return jax.vmap(one)(scenes, rods, *begun, end.points[group], end.residuals[group])
-
-
-def _energy(rods: list[Equilibrium], bodies: Bodies, poses: Poses) -> Float[Array, ""]:
-    energies = bodies.energies(*poses, jnp.zeros_like(poses.positions))
-    return jnp.sum(energies) + sum(jnp.sum(rod.energy) for rod in rods)
-
-
-# --- contacts of the bodies ------------------------------------------------------------------------------------------
-
-
-def _of_obstacles(harness: Harness, members: Members) -> list[int]:
-    """How many obstacles the rods of each group have."""
-    return [len(harness.scenes[numbers[0]].obstacles) for numbers in members]
-
-
-def no_pressures(harness: Harness, members: Members) -> Float[Array, "c"]:
-    counts = [2 * count * len(numbers) for count, numbers in zip(_of_obstacles(harness, members), members, strict=True)]
-    return leaf(np.zeros(sum(counts), harness.scenes[0].rod.length.dtype))
-
-
-def split_pressures(harness: Harness, members: Members, pressures: Float[Array, "c"]) -> list[Array | None]:
-    """Of each group (rods, obstacles, ends); `None` of rods that touch neither obstacles nor other rods."""
-    found, first, touched = [], 0, in_contact(pairs_of(harness.contact, members))
-    for group, (count, numbers) in enumerate(zip(_of_obstacles(harness, members), members, strict=True)):
-        size = 2 * count * len(numbers)
-        of_group = pressures[first : first + size].reshape(len(numbers), count, 2)
-        found.append(of_group if count or group in touched else None)
-        first += size
-    return found
-
-
-def no_rod_pressures(harness: Harness, members: Members, options: tuple[Options, ...]) -> Float[Array, "c"]:
-    """Of contacts between rods, of each kind of pairs by pair and element of its first rod."""
-    pairs = pairs_of(harness.contact, members)
-    count = sum(len(each.places) * options[each.groups[0]].segments for each in pairs)
-    return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype))
-
-
-def split_rod_pressures(
-    pairs: tuple[Pairs, ...], counts: Sequence[int], pressures: Float[Array, "c"]
-) -> tuple[Float[Array, "p n"], ...]:
-    """`counts`: of elements of the rods of each group."""
-    found, first = [], 0
-    for each in pairs:
-        shape = len(each.places), counts[each.groups[0]]
-        found.append(pressures[first : first + shape[0] * shape[1]].reshape(shape))
-        first += shape[0] * shape[1]
-    return tuple(found)
-
-
-def contact_forces(
-    harness: Harness, members: Members, poses: Poses, pressures: Float[Array, "c"]
-) -> tuple[Float[Array, "j 6"], Float[Array, "c"]]:
-    """Forces [N] of obstacles on the bodies where rods end in them, and moments about their positions [N m]; the gaps
-    there [m], none at ends that are in no body.
-    """
-    count, floats = len(harness.bodies), floating(harness)
-    total, gaps = jnp.zeros((count + 1, 6), poses.positions.dtype), []
-    for numbers, of_group in zip(members, split_pressures(harness, members, pressures), strict=True):
-        if of_group is None:
-            continue
-        for number, of_rod in zip(numbers, of_group, strict=True):
-            scene = harness.scenes[number]
-            bodies, _, offsets = joint_ends(scene, harness.joint_names)
-            radius = end_radii(scene)
-            for obstacle, of_ends in zip(scene.obstacles, of_rod, strict=True):
-                of_obstacle = []
-                for body, offset, thick, pressure in zip(bodies, offsets, radius, of_ends, strict=True):
-                    if body < 0 or not floats[body]:
-                        of_obstacle.append(jnp.ones_like(thick))
-                        continue
-                    arm = poses.frames[body] @ offset
-                    distance, normal = jax.value_and_grad(obstacle.at)(poses.positions[body] + arm)
-                    force = pressure * normal
-                    total = total.at[body].add(jnp.concatenate([force, jnp.cross(arm, force)]))
-                    of_obstacle.append(distance - thick)
-                gaps.append(jnp.stack(of_obstacle))
-    return total[:count], jnp.concatenate(gaps) if gaps else jnp.zeros_like(pressures)
 
 
 # --- the mesh --------------------------------------------------------------------------------------------------------
@@ -597,142 +504,3 @@ def finer_meshes(
             if max(SAFETY * error / rtol, penetration) > 1 and counts[number] < SIZES["hermite"][-1]:
                 counts[number] = next_size(counts[number], max(error, penetration * rtol / SAFETY), rtol, "hermite")
     return counts, worst, all_defects
-
-
-# --- derivatives -----------------------------------------------------------------------------------------------------
-
-
-def differentiable_harness(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
-    """What a search found, with the derivatives by the harness that the search for it has not."""
-    return result if is_known(harness) else _differentiable(harness, result)
-
-
-def differentiable_by(subject: Scene | Harness, result: Solution) -> Any:
-    """The same of a scene or a harness."""
-    if isinstance(subject, Harness):
-        assert isinstance(result, HarnessEquilibrium)
-        return differentiable_harness(subject, result)
-    assert isinstance(result, Equilibrium)
-    return differentiable(subject, result)
-
-
-@eqx.filter_custom_jvp
-def _differentiable(harness: Harness, result: HarnessEquilibrium) -> HarnessEquilibrium:
-    return result
-
-
-@_differentiable.def_jvp
-def _(primals, tangents):
-    harness, result = primals
-    change = with_zeros(tangents[0], harness)
-    value = _differentiable(harness, result)
-    return value, _change_of_result(*jax.lax.optimization_barrier((harness, value)), change)
-
-
-@linear
-def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harness) -> HarnessEquilibrium:
-    """By the implicit function theorem on the balance of the bodies, as functions of their poses; the rods between
-    clamps at these have derivatives of their own.
-    """
-    fixed = jax.lax.stop_gradient(harness)
-    others = Bodies.of(fixed)
-    count = len(harness.bodies)
-
-    def poses(harness: Harness, motions: Float[Array, "k"]) -> Poses:
-        bodies = Bodies.of(harness)
-        positions, frames = bodies.followed(others, result.positions, result.frames)
-        each = (bodies.motions @ motions).reshape(count, 6)
-        return Poses(positions + each[:, :3], rotated(frames, each[:, 3:]))
-
-    touching = touching_rods(*jax.lax.stop_gradient((harness, result.groups, result.rod_pressures)), result.members)
-
-    def rods_at(harness: Harness, motions: Float[Array, "k"], touches: Float[Array, "t"]) -> list[Equilibrium]:
-        there, found = poses(harness, motions), []
-        for number, (numbers, group) in enumerate(zip(result.members, result.groups, strict=True)):
-            scenes = _stack([clamped(harness.scenes[k], harness, *there) for k in numbers])
-            if touching is not None:
-                scenes = touching.loaded(scenes, number, touches)
-            found.append(differentiable(scenes, group))
-        return found
-
-    is_closed = jax.lax.stop_gradient(result.end_pressures > 0)
-
-    def out_of_balance(harness: Harness, unknown: Unknown) -> Float[Array, "k+t+c"]:
-        """Of the bodies, what contacts between rods lack, and the gaps of bodies that are closed, pressures where they
-        are open.
-        """
-        motions, touches, pressures = unknown
-        bodies, there = Bodies.of(harness), poses(harness, motions)
-        rods = rods_at(harness, motions, touches)
-        forces = body_forces(harness, rods, bodies, there, result.members)
-        pushes, gaps = contact_forces(harness, result.members, there, pressures)
-        balance = bodies.motions.T @ (forces + pushes).reshape(-1)
-        lacking = touches if touching is None else touching.lacking(rods, touches)
-        return jnp.concatenate([balance, lacking, jnp.where(is_closed, gaps, pressures)])
-
-    def whole(harness: Harness, unknown: Unknown) -> HarnessEquilibrium:
-        motions, touches, pressures = unknown
-        rods, there, bodies = rods_at(harness, motions, touches), poses(harness, motions), Bodies.of(harness)
-        rod_pressures = result.rod_pressures if touching is None else touching.pressures(result.rod_pressures, touches)
-        return dataclasses.replace(
-            result,
-            groups=tuple(rods),
-            positions=there.positions,
-            frames=there.frames,
-            energy=_energy(rods, bodies, there),
-            contact_forces=contact_forces(harness, result.members, there, pressures)[0][:, :3],
-            end_pressures=pressures,
-            rod_pressures=rod_pressures,
-            harness=harness,
-        )
-
-    touches = jnp.zeros(0, result.positions.dtype) if touching is None else touching.values
-    nowhere = jnp.zeros(len(others.columns), result.positions.dtype), touches, result.end_pressures
-    stiffness = jax.jacfwd(lambda unknown: out_of_balance(harness, unknown))(nowhere)
-    stiffness = jnp.concatenate(stiffness, axis=1)
-    _, lacking = jax.jvp(lambda harness: out_of_balance(harness, nowhere), (harness,), (change,))
-    sizes = np.cumsum([len(part) for part in nowhere])
-    unknown = tuple(jnp.split(_solved_with_contacts(stiffness, -lacking, *sizes[:2]), sizes[:2]))
-    _, found = jax.jvp(whole, (harness, nowhere), (change, unknown))
-    return jax.tree.map(lambda leaf: None if leaf.dtype == jax.dtypes.float0 else leaf, found)
-
-
-def _solved_with_contacts(
-    matrix: Float[Array, "k+t+c k+t+c"], right: Float[Array, "k+t+c"], bodies: int, count: int
-) -> Float[Array, "k+t+c"]:
-    """Where contacts of several rods with a body are one, who bears it is undetermined: softened, and what that gives
-    way by asked for again. `bodies`: how many unknowns are motions of these; `count`: how many are no pressures.
-    """
-    if len(right) == count:
-        return jnp.linalg.solve(matrix, right) if count else right
-    stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:bodies]))
-    is_pressure = np.arange(len(right)) >= count
-    soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_COMPLIANCE / stiffest, 0.0).astype(right.dtype))
-    found = jnp.linalg.solve(soft, right)
-    for _ in range(ENDS_HARDENINGS):
-        found += jnp.linalg.solve(soft, right - matrix @ found)
-    return found
-
-
-def body_forces(
-    harness: Harness, rods: list[Equilibrium], bodies: Bodies, poses: Poses, members: Members
-) -> Float[Array, "j 6"]:
-    """Forces [N] and moments about their positions [N m] on the bodies, of rods, springs and dead loads, global axes:
-    what supports hold against.
-    """
-    count = len(harness.bodies)
-    total = jnp.zeros((count + 1, 6), poses.positions.dtype)
-    frames = jnp.pad(poses.frames, ((0, 1), (0, 0), (0, 0)))
-    for numbers, group in zip(members, rods, strict=True):
-        body, _, offset = ends_of(harness, numbers)
-        of_ends = (group.start_force, group.start_moment), (group.end_force, group.end_moment)
-        for end, (sign, (force, moment)) in enumerate(zip((1, -1), of_ends, strict=True)):
-            arms = jnp.einsum("kij,kj->ki", frames[body[:, end]], offset[:, end])
-            about = moment + jnp.cross(arms, force)
-            total = total.at[body[:, end]].add(sign * jnp.concatenate([force, about], axis=1))
-
-    def energy(motions: Float[Array, "j 6"]) -> Float[Array, ""]:
-        there = poses.positions + motions[:, :3], rotated(poses.frames, motions[:, 3:])
-        return jnp.sum(bodies.energies(*there, motions[:, 3:]))
-
-    return total[:count] - jax.grad(energy)(jnp.zeros((count, 6), total.dtype))

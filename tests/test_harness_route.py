@@ -1,0 +1,104 @@
+"""route() of harnesses: an optimum in closed form, rates beside differences, files and reports."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import rodjax as rj
+from rodjax.programs.tasks import Workers
+from rodjax.routing.group import Group, Targets
+from rodjax.routing.outcome import written_route
+from rodjax.routing.route import _Fleet, _problem
+from rodjax.routing.search import Asked
+
+RADIUS = 0.005
+TIGHT = rj.Newton(tolerance=1e-12)
+LIMITS = rj.Limits(bend_radius=9.0)
+VARIABLES = [
+    rj.Between("cables.last.end.position.0", 0.05, 0.25),
+    rj.Between("cables.last.end.position.2", 0.05, 0.25),
+    rj.Between("cables.first.rod.length", 0.02, 0.3),
+]
+
+
+def corner() -> rj.Harness:
+    """A cable that turns by a right angle, from x to z, cut in two."""
+    rods = [rj.Rod(length, 0.02, 0.015, 2e4, 0.15, RADIUS) for length in (0.2, 0.1)]
+    start, end = (
+        rj.Clamp(place, rj.frame(tangent)) for place, tangent in (((0, 0, 0), (1, 0, 0)), ((0.2, 0, 0.2), (0, 0, 1)))
+    )
+    return rj.Harness(
+        {"first": rj.Scene(rods[0], start, rj.Joint("cut")), "last": rj.Scene(rods[1], rj.Joint("cut"), end)}
+    )
+
+
+@pytest.fixture(scope="module")
+def shortest() -> rj.Route:
+    return rj.route(corner(), VARIABLES, limits=LIMITS, starts=2, segments=12, solver=TIGHT)
+
+
+def test_the_shortest_turn_is_an_arc(shortest):
+    """Of all curves of a least radius of curvature that turn by a right angle, the shortest is the arc."""
+    radius = 9 * 2 * RADIUS + RADIUS
+    assert shortest.feasible
+    assert shortest.optimal
+    # As of a single cable: the limit is kept on meshes twice as fine, of fourth order.
+    assert shortest.objective == pytest.approx(np.pi / 2 * radius, rel=1e-5)
+    np.testing.assert_allclose(shortest.numbers[:2], radius, rtol=3e-3)
+    assert shortest.numbers[2] == pytest.approx(shortest.objective - 0.1, rel=1e-12)
+    # Each cable has its limit; both together what a single one has: 2 * 9 radii more by the whole limit.
+    assert set(shortest.multipliers) == {"first: bend radius", "last: bend radius"}
+    assert sum(shortest.multipliers.values()) == pytest.approx(np.pi / 2 * 18 * RADIUS, rel=1e-3)
+    assert shortest.margins.names == ("first: bend radius", "last: bend radius")
+    assert isinstance(shortest.verified, rj.HarnessEquilibrium)
+    assert shortest.verified.segments == [24, 24]
+    assert "on a mesh of 24 segments" in str(shortest)
+    assert shortest.gradients["last: bend radius"].shape == (3,)
+    np.testing.assert_allclose(shortest.gradients["objective"], [0, 0, 1], atol=1e-12)
+
+
+def test_the_designs_of_the_search_are_kept(shortest):
+    lengths = np.asarray(shortest.designs["first"].rod.length)
+    assert lengths[-1] == shortest.numbers[2]
+    assert 4 < len(lengths) <= 1 + int(np.max(shortest.starts.iterations))
+
+
+def test_rates_are_those_of_solves():
+    problem, _ = _problem(corner(), VARIABLES, LIMITS, None, (), None, 12, TIGHT)
+    fleet = _Fleet(problem, 2, np.random.default_rng(0), Workers(None, 1))
+    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0))
+
+    def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        numbers = group.evaluate({1: Asked(design, False)})[1]
+        assert numbers.is_valid
+        return np.append(numbers.objective, numbers.slacks), numbers.rates
+
+    design = np.array([0.6, 0.5, 0.5])
+    _, rates = found(design)
+    h = 1e-5
+    for k, unit in enumerate(np.eye(3)):
+        ahead, behind = found(design + h * unit)[0], found(design - h * unit)[0]
+        # Central differences of solves to 1e-12 EI/L^2.
+        np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+
+
+def test_a_report_has_what_a_route_found_of_each_cable(shortest, tmp_path):
+    report = rj.report(shortest)
+    first, last = report.cables
+    assert first.gradients is not None
+    assert last.gradients is not None
+    assert first.gradients.margins == last.gradients.margins == ("bend radius",)
+    np.testing.assert_array_equal(last.gradients.derivatives[0], shortest.gradients["last: bend radius"])
+    again = rj.read_scene(written_route(shortest, tmp_path)[-1])
+    assert isinstance(again, rj.Harness)
+    assert again["first"].rod.length == shortest.numbers[2]
+
+
+def test_what_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match=r"'rod\.length' is no number of this harness; there are cables\.first\.rod"):
+        rj.route(corner(), [rj.Between("rod.length", 0.1, 0.2)])
+    thin = [dataclasses.replace(scene, rod=rj.Rod(0.2, 0.02, 0.015, 2e4)) for scene in corner().scenes]
+    harness = rj.Harness(dict(zip(("first", "last"), thin, strict=True)))
+    with pytest.raises(ValueError, match=r"first: limits\.bend_radius must be None for a rod without a radius"):
+        rj.route(harness, VARIABLES, limits=LIMITS)

@@ -1,12 +1,13 @@
 """A harness: a trunk that branches three times to five connectors, under its weight, held by clips, on a tray and over
-the edge of a bracket; and its cost.
+the edge of a bracket; its cost, and where the clips of the trunk should be.
 
-    python experiments/harness.py --out DIR [--repeats N]
+    python experiments/harness.py --out DIR [--repeats N] [--starts 1]
 
 Draws all cables, prints one row for each with what obstacles do to it, writes a report, and times stars of cables of 32
 elements against one such cable, in turn: processor time of the first answer with all compiling, and the time of a solve
 from the last equilibrium as the ends of the cables move to and fro by 1 mm. Writes `harness.png`, `harness.csv` and the
-report as a page and a picture.
+report as a page and a picture. With `--starts` a route is sought from so many: clips and three branches such that all
+cables bend as little as possible, within the limits of the report.
 """
 
 import argparse
@@ -78,6 +79,19 @@ def branching() -> rj.Harness:
     return rj.Harness(cables, bodies)
 
 
+def routed(starts: int) -> rj.Route:
+    """The best places of the clips on the trunk and lengths of three branches."""
+    variables = [
+        rj.Between(
+            f"cables.trunk.clips.{k}.position", *([x + sign * 0.03, sign * 0.03, sign * 0.03] for sign in (-1, 1))
+        )
+        for k, x in enumerate((0.15, 0.28))
+    ]
+    branches = {"A": (0.28, 0.36), "B": (0.31, 0.4), "C": (0.28, 0.36)}
+    variables += [rj.Between(f"cables.{name}.rod.length", *ends) for name, ends in branches.items()]
+    return rj.route(branching(), variables, limits=LIMITS, objective=rj.Objective(energy=1.0), starts=starts)
+
+
 def star(count: int, moved: float) -> rj.Harness:
     """Cables from a hub, their far ends on a circle that moves."""
     cables = {}
@@ -123,6 +137,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--cables", type=int, nargs="*", default=[20])
     parser.add_argument("--rtol", type=float, default=1e-3)
+    parser.add_argument("--starts", type=int, default=0)
     arguments = parser.parse_args(argv)
     set_up()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -151,6 +166,11 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
     figure_of(plot_harness(result)).savefig(arguments.out / "harness.png", dpi=150)
     rj.report(result, limits=LIMITS, title="A harness on a tray").save(arguments.out)
     save_rows(rows, arguments.out / "harness.csv")
+    if arguments.starts:
+        route = routed(arguments.starts)
+        print(route)
+        for name, unit, found in zip(route.names, route.units, route.numbers, strict=True):
+            print(f"{name} = {found:.5g} {unit}")
     return result, rows
 
 

@@ -165,7 +165,8 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
         print(f"{name:7} {np.linalg.norm(body.contact_force):.3f} N of obstacles")
     figure_of(plot_harness(result)).savefig(arguments.out / "harness.png", dpi=150)
     rj.report(result, limits=LIMITS, title="A harness on a tray").save(arguments.out)
-    save_rows(rows, arguments.out / "harness.csv")
+    if rows:
+        save_rows(rows, arguments.out / "harness.csv")
     if arguments.starts:
         route = routed(arguments.starts)
         print(route)

@@ -26,7 +26,7 @@ from scipy.optimize import differential_evolution, minimize
 
 import rodjax as rj
 from rodjax.paths.batch import solve_first, solve_stack
-from rodjax.routing.problem import Problem, arranged, scenes_of, spare_lengths, valued
+from rodjax.routing.problem import Problem, arranged, scenes_at, spare_lengths, valued
 from rodjax.routing.route import RESERVE, SEGMENTS, TOLERANCE
 from rodjax.routing.variables import checked_variables
 from rodjax.solving.equilibrium import checked_options
@@ -96,6 +96,8 @@ def reported(route: rj.Route) -> rj.Report:
 
 def in_the_continuum(route: rj.Route) -> rj.Margins:
     """The margins of the same design without a mesh."""
+    assert isinstance(route.scene, rj.Scene)
+    assert isinstance(route.verified, rj.Equilibrium)
     exact = rj.solve_continuum(route.scene, guess=route.verified)
     if not exact.converged:
         raise RuntimeError(f"no equilibrium of the continuum: {rj.describe(exact)}")
@@ -168,7 +170,7 @@ class Model:
         padded = jnp.asarray(np.pad(designs, ((0, self.size - len(designs)), (0, 0)), mode="edge"))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rj.NotConvergedWarning)  # counted as not valid
-            results = solve_stack(scenes_of(self.problem, padded), segments=SEGMENTS, strain_limit=None)
+            results = solve_stack(scenes_at(self.problem, padded), segments=SEGMENTS, strain_limit=None)
         return self._values(padded, results, len(designs)), results
 
     def warm(self, design: np.ndarray, guess: Equilibrium) -> tuple[Values, Equilibrium]:
@@ -195,7 +197,7 @@ def kept_beyond(route: rj.Route, model: Model) -> tuple[int, int, int]:
     variables = model.problem.variables
     offsets = np.concatenate([variable.offsets() for variable in variables])
     scales = np.concatenate([variable.scales() for variable in variables])
-    scenes = scenes_of(model.problem, jnp.asarray((route.starts.designs - offsets) / scales))
+    scenes = scenes_at(model.problem, jnp.asarray((route.starts.designs - offsets) / scales))
     coarse = rj.solve_batch(scenes, segments=SEGMENTS)
     objective = coarse.elastic_energy + coarse.scene.rod.length
     same = np.abs(objective - route.starts.objective) < 1e-6 * route.starts.objective

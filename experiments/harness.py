@@ -1,13 +1,14 @@
 """A harness: a trunk that branches three times to five connectors, under its weight, held by clips, on a tray and over
 the edge of a bracket; its cost, and where the clips of the trunk should be.
 
-    python experiments/harness.py --out DIR [--repeats N] [--starts 1]
+    python experiments/harness.py --out DIR [--repeats N] [--starts 1] [--random 40]
 
 Draws all cables, prints one row for each with what obstacles do to it, writes a report, and times stars of cables of 32
 elements against one such cable, in turn: processor time of the first answer with all compiling, and the time of a solve
 from the last equilibrium as the ends of the cables move to and fro by 1 mm. Writes `harness.png`, `harness.csv` and the
 report as a page and a picture. With `--starts` a route is sought from so many: clips and three branches such that all
-cables bend as little as possible, within the limits of the report.
+cables bend as little as possible, within the limits of the report; with `--random` so many heavy harnesses, drawn at
+random over pipes, are solved cold.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from measuring import conditions, save_rows, set_up
 import rodjax as rj
 from rodjax.plot import figure_of, plot_harness
 from rodjax.programs import kept
+from rodjax.warn import silenced
 
 GRAVITY = (0.0, 0.0, -9.81)
 ALONG = rj.frame((1, 0, 0))
@@ -92,6 +94,27 @@ def routed(starts: int) -> rj.Route:
     return rj.route(branching(), variables, limits=LIMITS, objective=rj.Objective(energy=1.0), starts=starts)
 
 
+def over_pipes(seed: int) -> rj.Harness:
+    """A heavy harness of three cables, longer than the straight ways, drawn at random over two pipes and a floor."""
+    random = np.random.default_rng(seed)
+    height = (-0.1, -0.03)
+    pipes = [
+        rj.Capsule(*[(random.uniform(*x), y, random.uniform(*height)) for y in (-0.3, 0.3)], radius=radius)
+        for x, radius in (((0.1, 0.4), 0.02), ((0.4, 0.7), 0.015))
+    ]
+    around = {"gravity": GRAVITY, "obstacles": [rj.Plane((0, 0, -0.12), (0, 0, 1)), *pipes]}
+    middle, longer = np.array([0.4, 0.0, 0.0]), random.uniform(1.02, 1.25, 3)
+    soft = functools.partial(rj.Rod.circular, radius=6e-3, youngs_modulus=2e6, poisson_ratio=0.5, density=1500.0)
+    trunk = rj.Scene(soft(0.4 * longer[0]), rj.Clamp((0, 0, 0), ALONG), rj.Joint("y", ALONG), **around)
+    cables = {"trunk": trunk}
+    for name, side, more in (("A", 1, longer[1]), ("B", -1, longer[2])):
+        end = np.array([0.75, 0.2 * side, random.uniform(-0.05, 0.05)])
+        leaving = rj.frame((np.cos(0.5), side * np.sin(0.5), 0.0), (0, 0, 1))
+        clamp = rj.Clamp(end, rj.frame((1, 0.5 * side, 0), (0, 0, 1)))
+        cables[name] = rj.Scene(soft(more * np.linalg.norm(end - middle)), rj.Joint("y", leaving), clamp, **around)
+    return rj.Harness(cables, {"y": rj.Body(mass=0.01)})
+
+
 def star(count: int, moved: float) -> rj.Harness:
     """Cables from a hub, their far ends on a circle that moves."""
     cables = {}
@@ -138,6 +161,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
     parser.add_argument("--cables", type=int, nargs="*", default=[20])
     parser.add_argument("--rtol", type=float, default=1e-3)
     parser.add_argument("--starts", type=int, default=0)
+    parser.add_argument("--random", type=int, default=0)
     arguments = parser.parse_args(argv)
     set_up()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -167,6 +191,16 @@ def main(argv: Sequence[str] | None = None) -> tuple[rj.HarnessEquilibrium, list
     rj.report(result, limits=LIMITS, title="A harness on a tray").save(arguments.out)
     if rows:
         save_rows(rows, arguments.out / "harness.csv")
+    if arguments.random:
+        with silenced(rj.NotConvergedWarning):
+            found = [rj.solve(over_pipes(seed), segments=ELEMENTS) for seed in range(arguments.random)]
+        effort = [[int(each.iterations), int(each.evaluations)] for each in found]
+        print(
+            f"{sum(bool(each.converged) for each in found)} of {len(found)} heavy harnesses over pipes converge, "
+            "iterations and evaluations {:.0f} and {:.0f} in the median, {} and {} at most".format(
+                *np.median(effort, axis=0), *np.max(effort, axis=0)
+            )
+        )
     if arguments.starts:
         route = routed(arguments.starts)
         print(route)

@@ -1,8 +1,6 @@
 """Scene files of harnesses, and of ends that hinge, slide or give way."""
 
-import json
 import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -262,23 +260,3 @@ def test_the_command_reports_on_a_harness(written, tmp_path, capsys):
     assert told[2] == told[0]
     assert cli.main(["route", str(tmp_path / "both.toml"), "--out", str(tmp_path / "route")]) == 2
     assert "variables is missing" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_command_finds_a_route_of_a_harness(tmp_path, capsys):
-    file = Path(__file__).parents[1] / "experiments" / "routes" / "harness.toml"
-    assert cli.main(["route", str(file), "--starts", "1", "--out", str(tmp_path)]) == 0
-    told = capsys.readouterr().out
-    assert "It is optimal to first order" in told
-    assert "cables.trunk.clips.0.position along its line" in told
-    assert "harness.toml, 32 segments" in told
-    found = json.loads((tmp_path / "route.json").read_text())
-    margins = found["margins"]
-    # The pull at both ends of the trunk holds the objective; branches as short as it allows.
-    assert 0 <= margins["trunk: force of start"] < 1e-3
-    assert 0 <= margins["trunk: force of end"] < 1e-3
-    again = rodjax.read_scene(tmp_path / "scene.toml")
-    assert isinstance(again, rodjax.Harness)
-    lengths = [float(scene.rod.length) for scene in again.scenes]
-    assert sum(lengths) == pytest.approx(found["objective"], rel=1e-12)
-    assert lengths[1] == found["values"]["cables.left.rod.length"]

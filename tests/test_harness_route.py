@@ -1,14 +1,17 @@
 """route() of harnesses: an optimum in closed form, rates beside differences, files and reports."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rodjax as rj
+from rodjax import cli
 from rodjax.programs.tasks import Workers
+from rodjax.routing.files import read_route_file
 from rodjax.routing.group import Group, Targets
-from rodjax.routing.outcome import written_route
 from rodjax.routing.route import _Fleet, _problem
 from rodjax.routing.search import Asked
 
@@ -83,16 +86,62 @@ def test_rates_are_those_of_solves():
         np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
 
 
-def test_a_report_has_what_a_route_found_of_each_cable(shortest, tmp_path):
+def test_a_report_has_what_a_route_found_of_each_cable(shortest):
     report = rj.report(shortest)
     first, last = report.cables
     assert first.gradients is not None
     assert last.gradients is not None
     assert first.gradients.margins == last.gradients.margins == ("bend radius",)
     np.testing.assert_array_equal(last.gradients.derivatives[0], shortest.gradients["last: bend radius"])
-    again = rj.read_scene(written_route(shortest, tmp_path)[-1])
+
+
+FILE = """
+scene = "corner.toml"
+starts = 2
+
+[limits]
+bend_radius = 9
+
+[[variables]]
+kind = "between"
+key = "cables.last.end.position.0"
+lower = "50 mm"
+upper = "250 mm"
+
+[[variables]]
+kind = "between"
+key = "cables.last.end.position.2"
+lower = "50 mm"
+upper = "250 mm"
+
+[[variables]]
+kind = "between"
+key = "cables.first.rod.length"
+lower = "20 mm"
+upper = "300 mm"
+"""
+
+
+def test_the_command_finds_the_same(shortest, tmp_path, capsys):
+    rj.write_scene(corner(), tmp_path / "corner.toml", segments=12)
+    (tmp_path / "route.toml").write_text(FILE)
+    assert cli.main(["route", str(tmp_path / "route.toml"), "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    assert "It is optimal to first order" in told
+    assert "route.toml, 24 segments" in told
+    assert "--- first: kept" in told
+    found = json.loads((tmp_path / "out" / "route.json").read_text())
+    # To the tolerance of the search; this one is by the default solver.
+    assert found["objective"] == pytest.approx(shortest.objective, rel=1e-6)
+    again = rj.read_scene(tmp_path / "out" / "scene.toml")
     assert isinstance(again, rj.Harness)
-    assert again["first"].rod.length == shortest.numbers[2]
+    assert again["first"].rod.length == found["values"]["cables.first.rod.length"]
+
+
+def test_the_harness_of_the_experiments_is_one_to_route():
+    file = read_route_file(Path(__file__).parents[1] / "experiments" / "routes" / "harness.toml", for_route=True)
+    assert isinstance(file.of_route.scenes[0], rj.Harness)
+    assert [variable.key.split(".")[1] for variable in file.variables] == ["left", "right", "trunk"]
 
 
 def test_what_makes_no_sense_is_refused():

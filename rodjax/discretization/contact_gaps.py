@@ -131,7 +131,10 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     if not obstacles:
         return elements, None, jnp.zeros((0, len(s)), s.dtype)
     distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in obstacles])
-    is_held_within = form.is_at_support[None] & (distances < (1 - THINNER) * form.radius[None])
+    is_held = form.is_at_support
+    if form.pushed is not None:
+        is_held = is_held.at[jnp.array([0, -1])].set(is_held[jnp.array([0, -1])] & ~form.pushed)
+    is_held_within = is_held[None] & (distances < (1 - THINNER) * form.radius[None])
     places = Places.of(elements, obstacles, form.radius_along, is_held_within)
     return elements, places, jnp.pad(places.gaps, ((0, 0), (0, 1)), constant_values=1.0)
 

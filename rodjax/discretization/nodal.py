@@ -26,7 +26,6 @@ from rodjax.discretization.contact_gaps import (
     gaps_and_normals,
     has_inner_contacts,
     has_wells,
-    model_compliance,
     pressure_rows,
     rough_obstacles,
     smooth_obstacles,
@@ -198,11 +197,7 @@ class NodalForm(PositionForm):
     # --- the search --------------------------------------------------------------------------------------------------
 
     def shifted(self, system: Any, shift: Float[Array, ""]) -> ChainSystem:
-        """Nodes are held back, too: pushed hard against what is round, they are unstable, however stiff rotations."""
-        system = system.shifted(shift)
-        # What only makes neutral turns regular leaves the balance of nodes as it is.
-        held = jnp.where(shift > NEUTRAL, shift, 0.0) * jnp.eye(3, dtype=shift.dtype)
-        return dataclasses.replace(system, stiffness=system.stiffness + held[None])
+        return held_back(system, shift)
 
     def scaled(self, others: NodalChange, motion: Any, multipliers: Any) -> NodalChange:
         return NodalChange(motion * others.displacements, multipliers * others.pressures)
@@ -211,16 +206,18 @@ class NodalForm(PositionForm):
         """L with the energy of contacts as soft as `MERIT_COMPLIANCE`, with the pressures after the step."""
         assert here.gaps is not None
         model = contact_model(self, point, here.gaps, here.reference_displacements)
-        pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE
-        return here.energy + model.energy(pushing, jnp.asarray(MERIT_COMPLIANCE, pushing.dtype))
+        return here.energy + self._merit_of_contacts(model, others)
 
-    def contact_energy(self, there: Any, point: Any) -> Float[Array, ""]:
-        """The contact energy of the model of a step from `point` at a trial of it, with the pressures of `point`."""
+    def contact_energy(self, there: Any, point: Any, others: NodalChange) -> Float[Array, ""]:
+        """That in `objective`, at a trial of a step from `point`."""
         gaps, _ = gaps_and_normals(self, there.nodal.positions)
         if smooth_obstacles(self.scene):
             gaps = jnp.concatenate([gaps, within_elements(self, there)[2]])
-        contact_compliance, model = model_compliance(self), contact_model(self, point, gaps, None)
-        return model.energy(model.pressures - model.gaps / contact_compliance, contact_compliance)
+        return self._merit_of_contacts(contact_model(self, point, gaps, None), others)
+
+    def _merit_of_contacts(self, model: Unilateral, others: NodalChange) -> Float[Array, ""]:
+        pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE
+        return model.energy(pushing, jnp.asarray(MERIT_COMPLIANCE, pushing.dtype))
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -323,6 +320,14 @@ class NodalForm(PositionForm):
         if not has_contacts(self.scene):
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
+
+
+def held_back(system: ChainSystem, shift: Float[Array, ""]) -> ChainSystem:
+    """Shifted, with its nodes: pushed hard against what is round, they are unstable, however stiff rotations."""
+    system = system.shifted(shift)
+    # What only makes neutral turns regular leaves the balance of nodes as it is.
+    held = jnp.where(shift > NEUTRAL, shift, 0.0) * jnp.eye(3, dtype=shift.dtype)
+    return dataclasses.replace(system, stiffness=system.stiffness + held[None])
 
 
 def _with_wells(point: Any, is_wide: Bool[Array, "n"] | None) -> Any:

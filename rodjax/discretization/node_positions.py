@@ -35,10 +35,12 @@ BESIDE = 0.3
 
 class PositionForm(Form):
     """A nondimensional scene; the `end_force` of its points is (3, n): that through each element, and their `nodal` is
-    there. `ends_move`: of a linearisation in which clamped ends have no given position (`released`).
+    there. `ends_move`: of a linearisation in which clamped ends have no given position (`released`). `pushed`: which
+    ends are in bodies that obstacles push out, `None` where none is.
     """
 
     ends_move: bool = eqx.field(kw_only=True, static=True, default=False)
+    pushed: Bool[Array, "2"] | None = eqx.field(kw_only=True, default=None)
 
     def released(self, point: Any) -> Linearization:
         """The ends that clamps hold may turn and move; `residual` without these."""

@@ -122,7 +122,9 @@ class Rods(eqx.Module):
 
 
 class RodStep(NamedTuple):
-    """Where a rod is, and a step from there; `others`: as of `Form.others`; `at_ends`: contacts of its bodies."""
+    """Where a rod is, and a step from there; `others`: as of `Form.others`; `at_ends`: contacts of its bodies, and how
+    their pressures change.
+    """
 
     point: Any
     bases: Float[Array, "3 b m"]
@@ -130,21 +132,24 @@ class RodStep(NamedTuple):
     force_change: Float[Array, "3 parts"]
     others: Any = None
     at_ends: EndContacts | None = None
+    at_ends_change: Float[Array, "o 2"] | None = None
 
     def value(
         self, rod: RodInBodies, motions: Float[Array, "2 6"], part: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, "c"], Any]:
-        """L after a part of the rotations, under the new force, with its ends moved and with contacts as of the model;
-        what it lacks of its spans; the point there.
+        """L after a part of the rotations, under the new forces and pressures, with its ends moved and the energy of
+        contacts; what it lacks of its spans; the point there.
         """
         form = rod.form_at(motions)
-        others = jax.tree.map(lambda change: part * change, self.others)
+        others = form.scaled(self.others, part, 1.0)
         there = form.holding(form.retract(self.point, self.bases, part * self.rotation, self.force_change, others))
         value, constraint_residual = form.lagrangian(there)
         scene = form.scene
         if self.at_ends is not None:
             assert isinstance(form, NodalForm)
-            value += form.contact_energy(there, self.point) + end_contact_energy(rod, form, self.at_ends)
+            assert self.at_ends_change is not None
+            value += form.contact_energy(there, self.point, self.others)
+            value += end_contact_energy(rod, form, self.at_ends, self.at_ends_change)
         return value + dead_load_energy(total_force(scene), held_position(scene)), constraint_residual, there
 
 
@@ -430,17 +435,19 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     status = _status(state, balance, trial, steps, is_sought, solver)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
+    # Forces and pressures change as the merit has them.
+    pushed = jnp.where(goes, steps.part, 0.0)
     there = state.poses.retract(taken * steps.bodies, assembly.length), trial.points
     poses, points = jax.tree.map(
         lambda new, old: jnp.where(goes, new, old), there, (state.poses, tuple(here.points for here in all_here))
     )
     at_ends = state.at_ends
     if contacts is not None:
-        at_ends = _split(all_here, at_ends, contacts.at_ends, lambda pressures, change: pressures + taken * change)
+        at_ends = _split(all_here, at_ends, contacts.at_ends, lambda pressures, change: pressures + pushed * change)
     pairs = state.pairs
     if contacts is not None and contacts.between is not None:
         changes = contacts.between.changed(state.pairs)
-        pairs = tuple(pressures + taken * change for pressures, change in zip(pairs, changes, strict=True))
+        pairs = tuple(pressures + pushed * change for pressures, change in zip(pairs, changes, strict=True))
     return State(
         points=points,
         at_ends=at_ends,
@@ -709,6 +716,7 @@ def _steps(
     padded = jnp.pad(bodies.motions, ((0, 1), (0, 0)))
     steps, ends = [], []
     in_contact = iter(() if contacts is None else contacts.motions)
+    at_ends_changes = iter(() if contacts is None else contacts.at_ends)
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
         of_ends = padded[group.body]
         if found is None:
@@ -719,11 +727,20 @@ def _steps(
             multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
         change = jax.vmap(lambda form, y: form.layout.forces(form.force_components(y)))(group.form, multipliers)
         others = jax.vmap(lambda form, y: form.others(y))(group.form, multipliers)
-        steps.append(RodStep(here.points, here.linearization.bases, rotation, change, others, here.at_ends))
+        at_ends_change = None if here.at_ends is None else next(at_ends_changes)
+        bases = here.linearization.bases
+        steps.append(RodStep(here.points, bases, rotation, change, others, here.at_ends, at_ends_change))
         ends.append(of_ends)
         largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
     part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
-    steps = [step._replace(force_change=part * step.force_change) for step in steps]
+    steps = [
+        step._replace(
+            force_change=part * step.force_change,
+            others=jax.vmap(lambda form, others: form.scaled(others, 1.0, part))(group.form, step.others),
+            at_ends_change=None if step.at_ends_change is None else part * step.at_ends_change,
+        )
+        for group, step in zip(assembly.groups, steps, strict=True)
+    ]
     is_finite = jnp.isfinite(balance.residual) & jnp.isfinite(largest)
     return _Steps(steps, ends, bodies.motions, part, is_finite, None if contacts is None else contacts.between)
 
@@ -756,14 +773,16 @@ def _searched(
             lacking += jnp.sum(shares[:, None] * constraint_residual**2) / 2
             points.append(point)
         if touching:
+            assert steps.between is not None
             curves = curves_at(part, tuple(points))
-            for pairs, contacts in zip(assembly.pairs, touching, strict=True):
-                energy += contact_energy(pairs, curves, contacts)
+            changes = steps.between.changed(state.pairs)
+            for pairs, contacts, change in zip(assembly.pairs, touching, changes, strict=True):
+                energy += contact_energy(pairs, curves, contacts, steps.part * change)
         return energy + weight * lacking, tuple(points)
 
     slope, rate = _slopes(assembly, all_here, steps, balance.gradient)
     if steps.between is not None:
-        slope += steps.between.slope
+        slope += steps.between.slope(steps.part)
     weight = jnp.maximum(CLOSURE_WEIGHT, 2 * slope / jnp.where(rate < 0, -rate, jnp.inf))
     slope += weight * rate
 

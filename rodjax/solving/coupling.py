@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.contact_gaps import curvatures, distances_and_normals, model_compliance
+from rodjax.discretization.contact_gaps import curvatures, distances_and_normals
 from rodjax.discretization.form import EndTurn, Form, Linearization
 from rodjax.discretization.layout import SpanForces
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
@@ -59,7 +59,8 @@ class RodInBodies(NamedTuple):
                 support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
             ends.append(support)
         scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
-        return eqx.tree_at(lambda form: form.scene, self.form, scene)
+        form = eqx.tree_at(lambda form: form.scene, self.form, scene)
+        return dataclasses.replace(form, pushed=self.touches) if isinstance(form, NodalForm) else form
 
     def arm(self, end: int) -> Float[Array, "3"]:
         """From the body to the end of the rod, in the unit of length of the rod."""
@@ -124,11 +125,13 @@ def _places(form: NodalForm) -> Float[Array, "2 3"]:
     return jnp.stack([end.position if isinstance(end, Clamp) else nowhere for end in ends])
 
 
-def end_contact_energy(rod: RodInBodies, form: NodalForm, here: EndContacts) -> Float[Array, ""]:
-    """As `NodalForm.contact_energy`, from where a step begins."""
+def end_contact_energy(
+    rod: RodInBodies, form: NodalForm, here: EndContacts, change: Float[Array, "o 2"]
+) -> Float[Array, ""]:
+    """As `NodalForm.contact_energy`, from where a step begins that changes the pressures."""
     gaps, _ = end_gaps(rod, form)
-    pressures = here.pressures - (gaps + here.gaps - here.found) / model_compliance(form)
-    return model_compliance(form) / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+    pushing = here.pressures + change - (gaps + here.gaps - here.found) / MERIT_COMPLIANCE
+    return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 
 
 def end_contacts(

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.form import Linearization
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import NodalForm, held_back
 from rodjax.discretization.node_contacts import contact_model
 from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
@@ -157,7 +157,7 @@ def _eliminated(
         coupling, at_ends, m = rod.coupling, rod.at_ends, rod.f.shape[1]
         system = closed_softly(rod.system, is_closed, contact_compliance)
         f, c = with_pressures(system, rod.contacts, rod.f, rod.c)
-        factors = factor_chain(system.shifted(shift / m))
+        factors = factor_chain(held_back(system, shift / m))
         rates = jnp.where(is_closed[..., None], _of_gaps(system, coupling), 0.0)
         size = len(system.compliance)
         of_gradient, second = coupling.of_gradient, coupling.second
@@ -479,7 +479,8 @@ def _along_rod(
     rod: RodsInContact, shift: Float[Array, ""], here: tuple[Array, Array, Array], ahead: tuple[Array, Array, Array]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     coupling = rod.coupling
-    system = rod.system.closed_where(jnp.zeros(rod.contacts.gaps.shape, bool)).shifted(shift / rod.f.shape[1])
+    system = rod.system.closed_where(jnp.zeros(rod.contacts.gaps.shape, bool))
+    system = held_back(system, shift / rod.f.shape[1])
 
     def times(x: Array, y: Array, q: Array) -> tuple[Array, Array, Array]:
         moments, rows = system.times(x, y)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.contact_gaps import curve
-from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.discretization.rod_pairs import (
     found_between,
@@ -103,8 +103,7 @@ class Between(NamedTuple):
 
     def step(self, change: Float[Array, "c"], rates: Float[Array, "c"]) -> "BetweenStep":
         """That changes the pressures, and the gaps at these rates."""
-        pushing = self.pressures - self.gaps / CONTACT_COMPLIANCE
-        return BetweenStep(change, self.places, -jnp.sum(jnp.where(pushing > 0, pushing, 0.0) * rates))
+        return BetweenStep(change, self.places, self, rates)
 
     @property
     def signs(self) -> np.ndarray:
@@ -122,11 +121,17 @@ class Between(NamedTuple):
 
 
 class BetweenStep(NamedTuple):
-    """Of the contacts of a model: the change of their pressures, where they stand, and the rate of their energy."""
+    """Of the contacts of a model: the change of their pressures, where they stand, and the rates of their gaps."""
 
     change: Float[Array, "c"]
     places: tuple[Int[Array, "c"], ...]
-    slope: Float[Array, ""]
+    begin: Between
+    rates: Float[Array, "c"]
+
+    def slope(self, part: Float[Array, ""]) -> Float[Array, ""]:
+        """The rate of `contact_energy`, with this part of the change."""
+        pushing = self.begin.pressures + part * self.change - self.begin.gaps / MERIT_COMPLIANCE
+        return -jnp.sum(jnp.where(pushing > 0, pushing, 0.0) * self.rates)
 
     def changed(self, like: tuple[Float[Array, "p n"], ...]) -> list[Float[Array, "p n"]]:
         """The changes of the pressures of all pairs."""
@@ -202,11 +207,13 @@ def contacts_between(pairs: Pairs, curves: dict[int, Curve], pressures: Float[Ar
     return Contacts(both, found, gaps, pressures, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
 
 
-def contact_energy(pairs: Pairs, curves: dict[int, Curve], here: Contacts) -> Float[Array, ""]:
-    """As of `NodalForm.contact_energy`, where a step leads that begins here."""
+def contact_energy(
+    pairs: Pairs, curves: dict[int, Curve], here: Contacts, change: Float[Array, "p n"]
+) -> Float[Array, ""]:
+    """As of `NodalForm.contact_energy`, where a step leads that begins here and changes the pressures."""
     there = contacts_between(pairs, curves, here.pressures)
-    pressures = here.pressures - (there.gaps + here.relaxed) / CONTACT_COMPLIANCE
-    return CONTACT_COMPLIANCE / 2 * jnp.sum(jnp.where(pressures > 0, pressures, 0.0) ** 2)
+    pushing = here.pressures + change - (there.gaps + here.relaxed) / MERIT_COMPLIANCE
+    return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 
 
 def passes(pairs: Pairs, before: Contacts, curves: dict[int, Curve]) -> Bool[Array, ""]:

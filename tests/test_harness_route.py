@@ -4,16 +4,15 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from route_rates import assert_rates_are_those_of_solves
 
 import rodjax as rj
 from rodjax import cli
-from rodjax.programs.tasks import Workers
 from rodjax.routing.files import read_route_file
-from rodjax.routing.group import Group, Targets
-from rodjax.routing.route import _Fleet, _problem
-from rodjax.routing.search import Asked
+from rodjax.routing.route import _problem
 
 RADIUS = 0.005
 TIGHT = rj.Newton(tolerance=1e-12)
@@ -69,21 +68,7 @@ def test_the_designs_of_the_search_are_kept(shortest):
 
 def test_rates_are_those_of_solves():
     problem, _ = _problem(corner(), VARIABLES, LIMITS, None, (), None, 12, TIGHT)
-    fleet = _Fleet(problem, 2, np.random.default_rng(0), Workers(None, 1))
-    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0))
-
-    def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        numbers = group.evaluate({1: Asked(design, False)})[1]
-        assert numbers.is_valid
-        return np.append(numbers.objective, numbers.slacks), numbers.rates
-
-    design = np.array([0.6, 0.5, 0.5])
-    _, rates = found(design)
-    h = 1e-5
-    for k, unit in enumerate(np.eye(3)):
-        ahead, behind = found(design + h * unit)[0], found(design - h * unit)[0]
-        # Central differences of solves to 1e-12 EI/L^2.
-        np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+    assert_rates_are_those_of_solves(problem, 2, np.array([0.6, 0.5, 0.5]))
 
 
 def test_a_report_has_what_a_route_found_of_each_cable(shortest):
@@ -145,6 +130,9 @@ def test_the_harness_of_the_experiments_is_one_to_route():
 
 
 def test_what_makes_no_sense_is_refused():
+    stack = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), corner())
+    with pytest.raises(ValueError, match="scene must be a single one, got a stack"):
+        rj.route(stack, VARIABLES, limits=LIMITS)
     with pytest.raises(ValueError, match=r"'rod\.length' is no number of this harness; there are cables\.first\.rod"):
         rj.route(corner(), [rj.Between("rod.length", 0.1, 0.2)])
     thin = [dataclasses.replace(scene, rod=rj.Rod(0.2, 0.02, 0.015, 2e4)) for scene in corner().scenes]

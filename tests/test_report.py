@@ -218,6 +218,16 @@ def test_several_cables_are_told_one_by_one(report, equilibrium):
     assert rj.report([equilibrium, equilibrium], limits=[loose, None]).kept is True
 
 
+def test_limits_of_clips_are_of_cables_that_have_clips(equilibrium):
+    """Of all cables the others."""
+    scene = equilibrium.scene
+    bare = rj.solve(rj.Scene(scene.rod, scene.start, scene.end, GRAVITY), segments=12)
+    told = rj.report({"held": equilibrium, "bare": bare}, limits=rj.Limits(clip_force=20, length=0.7))
+    assert list(told.margins) == ["held: force of clip 0", "held: force of clip 1", "held: length", "bare: length"]
+    only = rj.report({"held": equilibrium, "bare": bare}, limits=rj.Limits(clip_force=20))
+    assert [cable.kept for cable in only.cables] == [True, None]
+
+
 def test_derivatives_are_told_by_the_units_of_engineers(report):
     lines = str(report).splitlines()
     rows = {

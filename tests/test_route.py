@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from route_rates import assert_rates_are_those_of_solves
 
 import rodjax as rj
 from rodjax.programs.tasks import Workers
-from rodjax.routing.group import Group, Targets
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.route import _Fleet, _problem
-from rodjax.routing.search import Asked, Numbers, Search, Settings
+from rodjax.routing.search import Numbers, Search, Settings
 from rodjax.routing.variables import with_numbers
 
 RADIUS = 0.005
@@ -89,21 +89,7 @@ def test_the_designs_of_the_search_are_kept(shortest):
 def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
-    fleet = _Fleet(problem, 4, np.random.default_rng(0), HERE)
-    group = Group(problem, fleet._starts, fleet._guesses, fleet.reserves, Targets(1.0, 1e-6, 10, 1.0))
-
-    def found(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        numbers = group.evaluate({1: Asked(design, False)})[1]
-        assert numbers.is_valid
-        return np.append(numbers.objective, numbers.slacks), numbers.rates
-
-    design = np.array([0.6, 0.5, 0.6])
-    _, rates = found(design)
-    h = 1e-5
-    for k, unit in enumerate(np.eye(3)):
-        ahead, behind = found(design + h * unit)[0], found(design - h * unit)[0]
-        # Central differences of solves to 1e-12 EI/L^2.
-        np.testing.assert_allclose(rates[:, k], (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-6)
+    assert_rates_are_those_of_solves(problem, 4, np.array([0.6, 0.5, 0.6]))
 
 
 def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):

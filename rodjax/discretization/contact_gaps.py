@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, THINNER, Elements, Places
@@ -133,7 +134,7 @@ def within_elements(form: PositionForm, point: Any) -> tuple[Elements, Places | 
     distances = jnp.stack([jax.vmap(obstacle.at)(positions) for obstacle in obstacles])
     is_held = form.is_at_support
     if form.pushed is not None:
-        is_held = is_held.at[jnp.array([0, -1])].set(is_held[jnp.array([0, -1])] & ~form.pushed)
+        is_held &= ~jnp.zeros_like(is_held).at[np.array([0, -1])].set(form.pushed)
     is_held_within = is_held[None] & (distances < (1 - THINNER) * form.radius[None])
     places = Places.of(elements, obstacles, form.radius_along, is_held_within)
     return elements, places, jnp.pad(places.gaps, ((0, 0), (0, 1)), constant_values=1.0)

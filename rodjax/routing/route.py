@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, leaf, positive, whole_number
-from rodjax.model.harness import Harness
+from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.obstacles import Obstacle
 from rodjax.model.scene import Scene, check_without_friction
 from rodjax.paths.batch import solve_stack
@@ -255,6 +255,8 @@ def _problem(
     instance(scene, "scene", (Scene, Harness))
     if isinstance(scene, Scene):  # rods of harnesses have none
         check_without_friction(scene, "a route")
+    if any(rod.rod.length.ndim for rod in scenes_of(scene).values()):
+        raise ValueError("scene must be a single one, got a stack: route takes one after another")
     variables = checked_variables(variables, scene)
     if limits is None and obstacles:
         raise ValueError("limits must have a clearance where there are obstacles, got None")

@@ -556,5 +556,5 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         q,
         end.memory.below,
         end.is_minimum & end.is_done,
-        None if between is None else between.step(of_pairs, model.rates(end.motion)[: len(of_pairs)]),
+        None if between is None else BetweenStep(between, of_pairs, model.rates(end.motion)[: len(of_pairs)]),
     )

@@ -101,10 +101,6 @@ class Between(NamedTuple):
     def contact_compliance(self) -> Float[Array, "c"]:
         return jnp.full_like(self.gaps, CONTACT_COMPLIANCE)
 
-    def step(self, change: Float[Array, "c"], rates: Float[Array, "c"]) -> "BetweenStep":
-        """That changes the pressures, and the gaps at these rates."""
-        return BetweenStep(change, self.places, self, rates)
-
     @property
     def signs(self) -> np.ndarray:
         """Compliances of the columns of curvature."""
@@ -121,11 +117,10 @@ class Between(NamedTuple):
 
 
 class BetweenStep(NamedTuple):
-    """Of the contacts of a model: the change of their pressures, where they stand, and the rates of their gaps."""
+    """From the contacts of a model: the change of their pressures, and the rates of their gaps."""
 
-    change: Float[Array, "c"]
-    places: tuple[Int[Array, "c"], ...]
     begin: Between
+    change: Float[Array, "c"]
     rates: Float[Array, "c"]
 
     def slope(self, part: Float[Array, ""]) -> Float[Array, ""]:
@@ -136,7 +131,7 @@ class BetweenStep(NamedTuple):
     def changed(self, like: tuple[Float[Array, "p n"], ...]) -> list[Float[Array, "p n"]]:
         """The changes of the pressures of all pairs."""
         found, first = [], 0
-        for pressures, places in zip(like, self.places, strict=True):
+        for pressures, places in zip(like, self.begin.places, strict=True):
             change = self.change[first : first + len(places)]
             first += len(places)
             found.append(jnp.zeros(pressures.size, change.dtype).at[places].set(change).reshape(pressures.shape))

@@ -17,15 +17,23 @@ bench: Any = importlib.import_module("cosseratbench")
 
 
 class RodjaxSolver:
-    """The equilibrium of one rod between ends that do not move: the first frame is the given shape, all others are it.
+    """The equilibrium between ends that do not move: the first frame is the given shape, all others are it.
 
     `scenario` and what `run` returns are a `Scenario` and a `Trajectory` of cosseratbench. Its runner reports as
-    unsupported what raises `NotImplementedError` here: dynamics, several rods, driven ends.
+    unsupported what raises `NotImplementedError` here: dynamics, driven ends, rods that nothing holds, friction, and
+    several rods that may touch themselves.
     """
 
     name = "rodjax"
     backend_version = rodjax.__version__
-    capabilities = frozenset({bench.Capability.STRETCH})
+    capabilities = frozenset(
+        {
+            bench.Capability.STRETCH,
+            bench.Capability.ROD_CONTACT,
+            bench.Capability.CYLINDER_CONTACT,
+            bench.Capability.PLANE_CONTACT,
+        }
+    )
 
     def __init__(self, time_step_scale: float = 1.0):
         # There is no time step; taken for a sweep over those of all solvers.
@@ -36,36 +44,66 @@ class RodjaxSolver:
 
     def run(self, scenario: Any, *, n_elements: int, n_frames: int) -> Any:
         with jax.enable_x64(True):
-            scene, rod = self.scene(scenario, n_elements), scenario.rods[0]
-            # The given shape is free of twist.
-            guess = rodjax.Guess(rod.nodes(n_elements))
-            result = rodjax.solve(scene, segments=n_elements, guess=guess, strain_limit=None)
+            result = self.equilibrium(scenario, n_elements)
         if not result.converged:
             raise bench.Diverged(f"rodjax: {rodjax.describe(result)}")
-        still = n_frames - 1
-        nodes = np.stack([rod.nodes(n_elements), *[np.asarray(result.nodes)] * still])
-        directions = np.stack([rod.directors(n_elements), *[directors(rod, result)] * still])
-        return bench.Trajectory(np.linspace(0.0, scenario.duration, n_frames), (nodes,), (directions,))
+        found = [result] if isinstance(result, rodjax.Equilibrium) else list(result.values())
+        still, nodes, directions = n_frames - 1, [], []
+        for rod, shape in zip(scenario.rods, found, strict=True):
+            nodes.append(np.stack([rod.nodes(n_elements), *[np.asarray(shape.nodes)] * still]))
+            directions.append(np.stack([rod.directors(n_elements), *[directors(rod, shape)] * still]))
+        return bench.Trajectory(np.linspace(0.0, scenario.duration, n_frames), tuple(nodes), tuple(directions))
 
-    def scene(self, scenario: Any, segments: int) -> rodjax.Scene:
+    def equilibrium(self, scenario: Any, segments: int) -> rodjax.Equilibrium | rodjax.HarnessEquilibrium:
+        """From the given shapes, which are free of twist."""
+        scene = self.scene(scenario, segments)
+        guesses = [rodjax.Guess(rod.nodes(segments)) for rod in scenario.rods]
+        if isinstance(scene, rodjax.Scene):
+            return rodjax.solve(scene, segments=segments, guess=guesses[0], strain_limit=None)
+        guess = dict(zip(scene.names, guesses, strict=True))
+        return rodjax.solve(scene, segments=segments, guess=guess, strain_limit=None)
+
+    def scene(self, scenario: Any, segments: int) -> rodjax.Scene | rodjax.Harness:
         if not scenario.quasi_static:
             raise NotImplementedError("dynamics")
-        if len(scenario.rods) != 1:
-            raise NotImplementedError("several rods")
-        rod = scenario.rods[0]
-        if rod.start_motion is not None or rod.end_motion is not None:
-            raise NotImplementedError("driven ends")
-        material = rod.material
-        body = rodjax.Rod.circular(
-            rod.length,
-            rod.radius,
-            material.youngs_modulus,
-            shear_modulus=material.shear_modulus,
-            density=material.density,
-        )
-        gravity = scenario.gravity if any(scenario.gravity) else None
-        start, end = (support(rod, end, segments) for end in (bench.End.START, bench.End.END))
-        return rodjax.Scene(body, start, end, gravity=gravity)
+        frictions = [each.friction for each in (*scenario.rods, *scenario.obstacles)]
+        if any(frictions):
+            # It has a memory, of which a shape to begin with says nothing.
+            raise NotImplementedError("friction")
+        scenes = [scene(scenario, rod, segments) for rod in scenario.rods]
+        if len(scenes) == 1:
+            return scenes[0]
+        if scenario.self_contact:
+            raise NotImplementedError("several rods that may touch themselves")
+        return rodjax.Harness({f"rod{k}": each for k, each in enumerate(scenes)}, contact=True)
+
+
+def scene(scenario: Any, rod: Any, segments: int) -> rodjax.Scene:
+    """Of one rod of the scenario."""
+    if rod.start_motion is not None or rod.end_motion is not None:
+        raise NotImplementedError("driven ends")
+    if bench.EndCondition.FREE is rod.start is rod.end:
+        raise NotImplementedError("a rod that nothing holds")
+    material = rod.material
+    body = rodjax.Rod.circular(
+        rod.length, rod.radius, material.youngs_modulus, shear_modulus=material.shear_modulus, density=material.density
+    )
+    start, end = (support(rod, end, segments) for end in (bench.End.START, bench.End.END))
+    return rodjax.Scene(
+        body,
+        start,
+        end,
+        gravity=scenario.gravity if any(scenario.gravity) else None,
+        obstacles=tuple(map(obstacle, scenario.obstacles)),
+        self_contact=scenario.self_contact and len(scenario.rods) == 1,
+    )
+
+
+def obstacle(given: Any) -> rodjax.Plane | rodjax.Cylinder:
+    if isinstance(given, bench.scenario.Plane):
+        return rodjax.Plane(given.point, given.unit_normal)
+    half = given.length / 2 * given.unit_axis
+    return rodjax.Cylinder(given.center - half, given.center + half, given.radius)
 
 
 def support(rod: Any, end: Any, segments: int) -> Support:

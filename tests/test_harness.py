@@ -72,6 +72,27 @@ def test_a_warm_start_of_the_same_harness_takes_no_step(both):
     assert jnp.max(jnp.abs(again["b"].nodes - parts["b"].nodes)) < 1e-14
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_cables_and_joints_begin_with_the_shapes_that_are_given(side):
+    """A rod between clamps that are nearer to one another than it is long stays on the side of its first shape."""
+    across = rodjax.frame((1, 0, 0), (0, 1, 0))
+    ends = Clamp((0, 0, 0), across), Clamp((0.8, 0, 0), across)
+    x = np.linspace(0, 0.8, 33)
+    arc = np.stack([x, np.zeros(33), side * 0.25 * np.sin(np.pi * x / 0.8) ** 2], axis=1)
+    whole = rodjax.solve(Scene(plain(1.0), *ends), segments=8, guess=rodjax.Guess(arc))
+    joint = Joint("cut", **ASIDE)
+    parts = Harness({"a": Scene(plain(0.5), ends[0], joint), "b": Scene(plain(0.5), joint, ends[1])})
+    shapes = {"a": rodjax.Guess(arc[:17]), "b": rodjax.Guess(arc[16:])}
+    found = rodjax.solve(parts, segments=4, guess=shapes)
+    assert found.stable
+    assert float(found.energy) == pytest.approx(float(whole.energy), rel=1e-9)
+    # About the line between the clamps the rod may be turned at no cost.
+    assert side * found["b"].nodes[0, 2] > 0.25
+    # The joint begins where the shape ends, turned as the shape: all else follows.
+    one = rodjax.solve(parts, segments=4, guess={"a": shapes["a"]})
+    assert side * one["b"].nodes[0, 2] > 0.25
+
+
 def test_derivatives_of_a_cut_rod_are_those_of_the_rod():
     solver = Newton(tolerance=1e-11)
 
@@ -293,6 +314,7 @@ def test_what_takes_no_harness_says_what_to_do(both, take, message):
         (lambda: Harness({"a": NEAR}), "cables['a'].obstacles must have no friction where ends of"),
         (lambda: rodjax.solve(PART), "scene.end is a Joint: make a Harness of the scene"),
         (lambda: rodjax.solve(Harness({"a": PART}), planar=True), "planar must be False"),
+        (lambda: rodjax.solve(Harness({"a": PART}), guess={"b": SHAPE}), "guess names the cable 'b', allowed are 'a'"),
         (lambda: rodjax.solve(Harness({"a": PART}), discretization="finite_difference"), "must be 'hermite'"),
         (lambda: rodjax.solve_path([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
         (lambda: rodjax.solve_batch([SOFT, SOFT]), "an end that is a Spring has an unknown pose"),
@@ -308,6 +330,7 @@ def test_what_cannot_be_is_said_in_one_line(make, message):
     assert "\n" not in str(error.value)
 
 
+SHAPE = rodjax.Guess([(0, 0, 0), (0.5, 0, 0)])
 PART = Scene(plain(0.5), START, Joint("cut"))
 HANGING = Scene(plain(0.5), Free(), Joint("j"), gravity=GRAVITY)
 NEAR = Scene(plain(0.5), START, Joint("j"), obstacles=[rodjax.Plane((0, 0, -9), (0, 0, 1), friction=0.3)])

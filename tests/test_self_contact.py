@@ -188,21 +188,27 @@ def test_parts_that_cross_at_first_are_led_apart():
     assert np.min(result.self_contacts.gaps) > -1e-9
 
 
-@pytest.mark.slow
+FEATURES = {
+    "flat": {"rod": rodjax.Rod(LENGTH, (1.0, 1.5), 1.0, 1e4, radius=RADIUS)},
+    "curved": {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=RADIUS, rest_curvature=(0.0, 2.0))},
+    "steps": {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=rodjax.Steps([0.3], [0.02, 0.015]))},
+    "sliding": {"clips": [rodjax.Clip(0.5, (0.42, 0.0, 0.0), sliding=True)]},
+    "floor": {"obstacles": [rodjax.Plane((0.0, 0.0, -0.025), (0.0, 0.0, 1.0))]},
+    "field": {"potentials": [rodjax.Potential(lambda place, s: 5 * place[2] ** 2)]},
+    "follower": {"distributed": [rodjax.DistributedForce((0.0, 0.5, 0.0), follower=True)]},
+}
+
+
 @pytest.mark.parametrize(
-    "others",
+    "names",
     [
-        {"rod": rodjax.Rod(LENGTH, (1.0, 1.5), 1.0, 1e4, radius=RADIUS)},
-        {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=RADIUS, rest_curvature=(0.0, 2.0))},
-        {"rod": rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, radius=rodjax.Steps([0.3], [0.02, 0.015]))},
-        {"clips": [rodjax.Clip(0.5, (0.42, 0.0, 0.0), sliding=True)]},
-        {"obstacles": [rodjax.Plane((0.0, 0.0, -0.025), (0.0, 0.0, 1.0))]},
-        {"potentials": [rodjax.Potential(lambda place, s: 5 * place[2] ** 2)]},
-        {"distributed": [rodjax.DistributedForce((0.0, 0.5, 0.0), follower=True)]},
+        # Each feature once, in company.
+        pytest.param(names, marks=pytest.mark.slow if len(names) > 1 else pytest.mark.exhaustive, id="-".join(names))
+        for names in [("flat", "sliding", "floor"), ("steps", "field"), ("curved", "follower"), *zip(FEATURES)]
     ],
-    ids=["flat", "curved", "steps", "sliding", "floor", "field", "follower"],
 )
-def test_every_rod_and_load_composes_with_it(others):
+def test_every_rod_and_load_composes_with_it(names):
+    others = {key: value for name in names for key, value in FEATURES[name].items()}
     result = rodjax.solve(hairpin(**others), segments=32, guess=guess())
     assert result.converged
     found = result.self_contacts

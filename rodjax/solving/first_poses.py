@@ -14,7 +14,10 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Clamp, Held, Joint, Swivel
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Poses
+from rodjax.solving.guess import Guess
 
+# Of each rod, where the user gives one.
+Shapes = tuple[Guess | None, ...]
 # Of the frames that neighbouring clamps suggest, beside the directions of the rods.
 FRAME_WEIGHT = 0.05
 # A chord shorter than this part of the rod has no direction.
@@ -28,7 +31,8 @@ MOST_LOOKS = 16
 class _Reach(NamedTuple):
     """From an end of a rod at a body to the next place: another body by its number, or a fixed place.
 
-    `sign`: 1 where the rod begins here, -1 where it ends here.
+    `sign`: 1 where the rod begins here, -1 where it ends here; `begins`, `along`: place of its end here and its unit
+    tangent there, where the shape of the rod is given.
     """
 
     body: int
@@ -41,21 +45,35 @@ class _Reach(NamedTuple):
     other_joint: Joint | None
     obstacles: tuple[Obstacle, ...] = ()
     radius: Any = None
+    begins: Any = None
+    along: Any = None
 
 
 @compiled
-def first_poses(harness: Harness) -> Poses:
-    """Each body where springs along the rods, as soft as these are long, would hold it, let down as far as the rods are
-    longer; what hangs on a single fixed place straight on from there. Axes so that the ends point along the chords of
-    their rods.
+def first_poses(harness: Harness, shapes: Shapes) -> Poses:
+    """Each body where given shapes of its rods end; else where springs along the rods, as soft as these are long, would
+    hold it, let down as far as the rods are longer; what hangs on a single fixed place straight on from there. Axes so
+    that the ends point along the chords of their rods, or as on their shapes.
     """
     bodies = Bodies.of(harness)
-    reaches = [reach for scene in harness.scenes for reach in _reaches(scene, harness)]
+    reaches = [
+        reach for scene, shape in zip(harness.scenes, shapes, strict=True) for reach in _reaches(scene, shape, harness)
+    ]
     count = len(harness.bodies)
     is_fixed = [body.support is not None for body in harness.bodies]
-    hangs = _hanging(reaches, is_fixed)
     positions: list[Any] = [bodies.position[j] if is_fixed[j] else None for j in range(count)]
     frames: list[Any] = [bodies.frame[j] if bodies.has_frame[j] else None for j in range(count)]
+    ends = {j: [reach for reach in _at(j, reaches) if reach.begins is not None] for j in range(count)}
+    sketched = [j for j in range(count) if ends[j] and not is_fixed[j]]
+    for j in sketched:
+        positions[j] = jnp.mean(jnp.stack([reach.begins for reach in ends[j]]), axis=0)
+    for j in sketched:  # as seen from where its rods end; then its own place beside these
+        if frames[j] is None:
+            frames[j] = _frame_at(j, positions, reaches)
+    for j in sketched:
+        positions[j] -= frames[j] @ jnp.mean(jnp.stack([reach.joint.offset for reach in ends[j]]), axis=0)
+    is_fixed = [fixed or j in sketched for j, fixed in enumerate(is_fixed)]
+    hangs = _hanging(reaches, is_fixed)
 
     gravity = next((scene.gravity for scene in harness.scenes if scene.gravity is not None), None)
     free = [j for j in range(count) if not is_fixed[j] and j not in hangs]
@@ -71,7 +89,7 @@ def first_poses(harness: Harness) -> Poses:
             if reach.other in place:
                 matrix = matrix.at[here, place[reach.other]].add(-weight)
             elif reach.other is not None and is_fixed[reach.other]:
-                right = right.at[here].add(weight * bodies.position[reach.other])
+                right = right.at[here].add(weight * positions[reach.other])
             elif reach.other is None and reach.place is not None:
                 right = right.at[here].add(weight * reach.place)
             else:  # what only hangs here pulls nowhere
@@ -108,7 +126,11 @@ def first_poses(harness: Harness) -> Poses:
     )
 
 
-def _reaches(scene: Scene, harness: Harness) -> list[_Reach]:
+def _at(body: int, reaches: list[_Reach]) -> list[_Reach]:
+    return [reach for reach in reaches if reach.body == body]
+
+
+def _reaches(scene: Scene, shape: Guess | None, harness: Harness) -> list[_Reach]:
     found = []
     length = scene.rod.length
     for here, there, sign in ((scene.start, scene.end, 1), (scene.end, scene.start, -1)):
@@ -132,6 +154,11 @@ def _reaches(scene: Scene, harness: Harness) -> list[_Reach]:
         if scene.obstacles:
             radius = end_radii(scene)[0 if sign == 1 else 1]
             found[-1] = found[-1]._replace(obstacles=scene.obstacles, radius=radius)
+        if shape is not None:
+            edge = (shape.points[1] - shape.points[0]) if sign == 1 else (shape.points[-1] - shape.points[-2])
+            length_of_edge = jnp.sqrt(jnp.sum(edge**2))
+            along = edge / jnp.where(length_of_edge > 0, length_of_edge, 1.0)
+            found[-1] = found[-1]._replace(begins=shape.points[0 if sign == 1 else -1], along=along)
     return found
 
 
@@ -175,7 +202,7 @@ def _end_beyond(reach: _Reach, positions: list[Any], frames: list[Any]) -> tuple
 
 def _lowered(body: int, positions: list[Any], reaches: list[_Reach], gravity: Float[Array, "3"]) -> Float[Array, "3"]:
     """The position of a body as far down as the rods between it and fixed places, else all of its rods, let it."""
-    beside = [reach for reach in reaches if reach.body == body]
+    beside = _at(body, reaches)
     fixed = [reach for reach in beside if reach.place is not None]
     falls = []
     for reach in fixed or beside:
@@ -207,16 +234,18 @@ def _until_touched(
 def _frame_at(body: int, positions: list[Any], reaches: list[_Reach]) -> Float[Array, "3 3"]:
     """The rotation that takes the tangents of the ends nearest to the chords of their rods: Davenport's method."""
     pairs = []
-    for reach in reaches:
-        if reach.body != body:
-            continue
-        place = reach.place if reach.other is None else positions[reach.other]
-        if place is None:
-            continue
-        chord = reach.sign * (place - positions[body])
-        size = jnp.sqrt(jnp.sum(chord**2))
-        is_long = size > LEAST_CHORD * reach.length
-        along = chord / jnp.where(is_long, size, 1.0)
+    for reach in _at(body, reaches):
+        if reach.along is None:
+            place = reach.place if reach.other is None else positions[reach.other]
+            if place is None:
+                continue
+            chord = reach.sign * (place - positions[body])
+            size = jnp.sqrt(jnp.sum(chord**2))
+            is_long = size > LEAST_CHORD * reach.length
+            along = chord / jnp.where(is_long, size, 1.0)
+        else:
+            along = reach.along
+            is_long = jnp.sum(along**2) > 0
         weight = jnp.where(is_long, 1.0, 0.0)
         pairs.append((reach.joint.frame[:, 2], along, weight))
         if reach.frame is not None:

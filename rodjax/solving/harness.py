@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -42,7 +42,7 @@ from rodjax.solving.equilibrium import (
     last_twist,
     on_one_side,
 )
-from rodjax.solving.first_poses import first_poses
+from rodjax.solving.first_poses import Shapes, first_poses
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_derivatives import differentiable_harness
 from rodjax.solving.harness_forces import (
@@ -82,15 +82,14 @@ def solve_harness(
     rtol: float | None = None,
     discretization: str | None = None,
     solver: Any = None,
-    guess: HarnessEquilibrium | None = None,
+    guess: HarnessEquilibrium | Mapping[str, Guess] | None = None,
     planar: bool = False,
     find: Any = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
-    shape: Guess | None = None,
     is_told: bool = True,
 ) -> HarnessEquilibrium:
-    """See `rodjax.solving.solve.solve`; `segments` may be those of each rod; `shape`: with which all rods begin where
-    there is no guess; `is_told`: whether warnings say what is wrong with the result.
+    """See `rodjax.solving.solve.solve`; `segments` may be those of each rod; `is_told`: whether warnings say what is
+    wrong with the result.
     """
     if discretization not in (None, "hermite"):
         raise ValueError(f"discretization must be 'hermite' where poses of ends are unknown, got {discretization!r}")
@@ -98,20 +97,14 @@ def solve_harness(
         instance(solver, "solver", Newton)
     if planar:
         raise ValueError("planar must be False where poses are unknown, in space")
-    if guess is not None:
-        instance(guess, "guess", HarnessEquilibrium)
-        if guess.energy.ndim:
-            raise ValueError(f"guess must be a single equilibrium, got a stack of shape {guess.energy.shape}")
-        if (guess.harness.names, guess.harness.joint_names) != (harness.names, harness.joint_names):
-            raise ValueError("guess must be an equilibrium of a harness with the same cables and joints in this order")
-    fixed, guess = not_differentiated(harness, guess)
+    fixed, earlier, shapes = not_differentiated(harness, *_begins(harness, guess))
     strain_limit = checked_strain_limit(strain_limit)
     if not harness.bodies:
         bodies = Bodies.of(harness)
         poses = Poses(bodies.position, bodies.frame)
     else:
-        poses = first_poses(fixed) if guess is None else _followed(fixed, guess)
-    kept = [None] * len(fixed) if guess is None else guess.segments
+        poses = first_poses(fixed, shapes) if earlier is None else _followed(fixed, earlier)
+    kept = [None] * len(fixed) if earlier is None else earlier.segments
     counts = segments if isinstance(segments, list) else [segments] * len(fixed)
     all_options, tolerance = [], rtol
     for scene, count, before in zip(clamped_rods(fixed), counts, kept, strict=True):
@@ -121,7 +114,7 @@ def solve_harness(
         if count is None and before is not None:
             options = dataclasses.replace(options, segments=before)
         all_options.append(options)
-    result = _solved(fixed, poses, tuple(all_options), guess, strain_limit, shape=shape)
+    result = _solved(fixed, poses, tuple(all_options), earlier, strain_limit, shapes=shapes)
     if is_known(result.status) and is_here(result.groups[0]):
         if segments is None:
             result = _refined(
@@ -138,14 +131,14 @@ def solve_harness(
 def solve_movable(scene: Scene, *, guess: Guess | Equilibrium | None = None, **options: Any) -> Equilibrium:
     """The equilibrium of a scene with an end that is a `Hinge`, `Slider` or `Spring`."""
     harness = of_one_rod(scene)
-    shape, earlier = None, None
+    earlier = None
     if isinstance(guess, Guess):
-        shape = guess
+        earlier = dict.fromkeys(harness.names, guess)
     elif guess is not None:
         instance(guess, "guess", (Guess, Equilibrium))
         check_single(guess)
         earlier = _as_harness(harness, guess)
-    return _of_one_rod(solve_harness(harness, guess=earlier, shape=shape, **options))
+    return _of_one_rod(solve_harness(harness, guess=earlier, **options))
 
 
 def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
@@ -196,6 +189,25 @@ def warn_of_harness(result: HarnessEquilibrium, strain_limit: Any) -> None:
 
 
 # --- the start -------------------------------------------------------------------------------------------------------
+
+
+def _begins(
+    harness: Harness, guess: HarnessEquilibrium | Mapping[str, Guess] | None
+) -> tuple[HarnessEquilibrium | None, Shapes]:
+    """An earlier equilibrium, or the shapes of cables in the order of the harness."""
+    if isinstance(guess, Mapping):
+        for name, shape in guess.items():
+            if name not in harness.names:
+                raise ValueError(f"guess names the cable {name!r}, allowed are {', '.join(map(repr, harness.names))}")
+            instance(shape, f"guess[{name!r}]", Guess)
+        return None, tuple(guess.get(name) for name in harness.names)
+    if guess is not None:
+        instance(guess, "guess", (HarnessEquilibrium, dict))
+        if guess.energy.ndim:
+            raise ValueError(f"guess must be a single equilibrium, got a stack of shape {guess.energy.shape}")
+        if (guess.harness.names, guess.harness.joint_names) != (harness.names, harness.joint_names):
+            raise ValueError("guess must be an equilibrium of a harness with the same cables and joints in this order")
+    return guess, (None,) * len(harness.scenes)
 
 
 @compiled
@@ -256,9 +268,11 @@ def _solved(
     guess: HarnessEquilibrium | None,
     strain_limit: Any,
     finer: dict[int, SolverState] | None = None,
-    shape: Guess | None = None,
+    shapes: Shapes = (),
 ) -> HarnessEquilibrium:
-    """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess."""
+    """On given meshes; `finer`: what rods begin with whose mesh is another one than that of the guess; `shapes`: with
+    which rods begin where there is none.
+    """
     structures = clamped_rods(harness, [options.segments for options in all_options])
     members = _members(structures, all_options)
     starts = []
@@ -270,7 +284,7 @@ def _solved(
         if start is None:
             each = []
             for number in group:
-                rod = shape if guess is None else guess.rod(number)
+                rod = shapes[number] if guess is None else guess.rod(number)
                 if finer is not None and number in finer:
                     assert isinstance(rod, Equilibrium)
                     each.append((finer[number], last_twist(rod)))

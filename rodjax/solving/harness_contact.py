@@ -260,8 +260,10 @@ class ContactModel(eqx.Module):
         return Memory(shifts, none, reversal, jnp.zeros((), int), jnp.zeros_like(self.force))
 
     def nowhere(self) -> Any:
+        """Motions of rods and bodies, and the multipliers of the contacts between rods, if there are any."""
         of_rods = tuple((jnp.zeros_like(rods.f), jnp.zeros_like(rods.c)) for rods in self.groups)
-        return of_rods, jnp.zeros_like(self.force)
+        between = None if self.between is None else jnp.zeros(5 * len(self.between.gaps), self.force.dtype)
+        return of_rods, jnp.zeros_like(self.force), between
 
     def bodies(self, q: Float[Array, "q"]) -> Float[Array, "j+1 6"]:
         """Their motions, and none of what is no body."""
@@ -353,7 +355,7 @@ class ContactModel(eqx.Module):
             # What contacts take from them counts with the first group.
             negative = (negative[0].at[0].add(touching.excess), *negative[1:])
         below = jnp.where(jnp.any(is_below), jnp.sum(is_below), memory.below)
-        return is_minimum, (tuple(motions), q), Memory(tuple(shifts), negative, reversal, below, push)
+        return is_minimum, (tuple(motions), q, between), Memory(tuple(shifts), negative, reversal, below, push)
 
     def _at_ends(self, rods: RodsInContact) -> Float[Array, "k 12 q"]:
         """The motions of the ends of rods by q."""
@@ -427,7 +429,7 @@ class ContactModel(eqx.Module):
         return _Touching(is_minimum, excess, jnp.linalg.inv(matrix), jnp.asarray(by_bodies), force)
 
     def opening(self, motion: Any) -> Array:
-        of_rods, q = motion
+        of_rods, q, _ = motion
         bodies = self.bodies(q)
         rows = [rods.opening(each, bodies) for rods, each in zip(self.groups, of_rods, strict=True)]
         if self.between is not None:
@@ -436,7 +438,7 @@ class ContactModel(eqx.Module):
 
     def rates(self, motion: Any) -> Float[Array, "5c"]:
         """Of the gaps between rods, and along the vectors of their curvature."""
-        of_rods, q = motion
+        of_rods, q, _ = motion
         total = 0.0
         for rods, (x, y) in zip(self.groups, of_rods, strict=True):
             if rods.columns is not None:
@@ -445,7 +447,7 @@ class ContactModel(eqx.Module):
 
     def along(self, motion: Any, change: Any, memory: Memory) -> tuple[Float[Array, ""], Float[Array, ""]]:
         stiffness = self.stiffness + memory.reversal
-        (of_rods, q), (changes, dq) = motion, change
+        (of_rods, q, _), (changes, dq, _) = motion, change
         slope = q @ stiffness @ dq - (self.force + memory.push) @ dq
         curvature = dq @ stiffness @ dq
         for rods, here, ahead, shift in zip(self.groups, of_rods, changes, memory.shifts, strict=True):
@@ -536,9 +538,14 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
     *of_contacts, is_closed, contact_compliance = map(model.rows, rows)
     contacts = BodyContacts(*of_contacts)
     end = sought(model, contacts, is_closed, contact_compliance, model.nowhere(), model.begin(shifts, damping))
-    of_rods, q = end.motion
-    change = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
-    change -= contacts.pressures
+    of_rods, q, multipliers = end.motion
+    found = contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance
+    if between is not None:
+        # Of closed ones the multipliers: by the gaps they would be off by rounding over a small compliance.
+        of_pairs = found[-len(between.gaps) :]
+        is_known = (of_pairs > 0) & end.is_done
+        found = found.at[-len(between.gaps) :].set(jnp.where(is_known, -multipliers[: len(between.gaps)], of_pairs))
+    change = contacts.allowed(found) - contacts.pressures
     motions, at_ends = [], []
     *changes, of_pairs = model.split(change)
     for rods, (x, y), row in zip(groups, of_rods, changes, strict=True):

@@ -34,9 +34,9 @@ from rodjax.solving.coupling import Coupling
 Members = tuple[tuple[int, ...], ...]
 # Of all contacts between rods of two groups, at most so many are sought in the model of a step.
 MOST_BETWEEN = 32
-# Compliance of contacts in the model of a step [L^3/EI]. Gaps are far from linear where rods slide along one another,
-# and the merit of a step has this compliance too: a small one would refuse all but short steps.
-CONTACT_COMPLIANCE = 1e-6
+# Compliance of contacts in the model of a step [L^3/EI]. Where the cells of two elements overlap, both may have a
+# contact at one place; what one of them lacks to touch is below 1e-8 L.
+CONTACT_COMPLIANCE = 1e-9
 
 
 class Pairs(NamedTuple):

@@ -1,5 +1,6 @@
 """solve(): the equilibrium of a scene or a harness."""
 
+from collections.abc import Mapping
 from typing import Any, overload
 
 from rodjax.checks import instance
@@ -38,7 +39,7 @@ def solve(
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: HarnessEquilibrium | None = None,
+    guess: HarnessEquilibrium | Mapping[str, Guess] | None = None,
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
@@ -54,7 +55,7 @@ def solve(
     rtol: float | None = None,
     discretization: Discretization | None = None,
     solver: Solver | None = None,
-    guess: Guess | Equilibrium | HarnessEquilibrium | None = None,
+    guess: Guess | Equilibrium | HarnessEquilibrium | Mapping[str, Guess] | None = None,
     planar: bool = False,
     find: Find = "minimum",
     strain_limit: Any = DEFAULT_STRAIN_LIMIT,
@@ -82,7 +83,8 @@ def solve(
         that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
-        supports and gravity. Of a harness an earlier equilibrium or `None`.
+        supports and gravity. Of a harness an earlier equilibrium, or `{name: Guess}` for some of its cables: joints
+        begin where these end.
     - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
         motions out of the plane too.
     - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that is

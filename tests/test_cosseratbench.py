@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import jax
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -68,6 +69,22 @@ def test_a_rope_rests_on_another_one():
     assert result.outcome == "completed"
     assert result.metrics["shape_error"] < 3e-6
     assert result.metrics["lift_error"] < 5e-5
+
+
+@pytest.mark.slow
+def test_ropes_that_slide_along_each_other_come_to_rest():
+    """The middle of an element of the lower one, where it touches, is where the cell of the element before ends: of two
+    contacts at one place one pushes, to rounding. Farther down, as the reference has it, the ropes are not stable.
+    """
+    scenario = registry.load_experiment("crossing").scenario
+    with jax.enable_x64(True):
+        result = adapter().equilibrium(scenario, 51)
+    assert result.stable
+    assert result.iterations <= 20
+    forces = result.rod_contacts["rod0", "rod1"].forces
+    assert np.sum(np.linalg.norm(forces, axis=1) > 0) == 1
+    # On 50, 64 and 100 elements: 31.66, 31.59 and 31.58 mm.
+    assert abs(float(result["rod0"].position_at([0.5])[0, 1])) == pytest.approx(0.0316, abs=3e-4)
 
 
 def test_directors_of_a_clamped_rod_turn_with_its_section():

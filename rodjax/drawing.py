@@ -13,7 +13,7 @@ from matplotlib.colors import LightSource, Normalize, to_rgba
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from rodjax.analysis.reactions import reactions
 from rodjax.analysis.samples import framed_at
@@ -41,6 +41,8 @@ LEAST_DEPTH = 0.3
 LABEL_SIZE = (6.4, 14.0)
 # Forces below this part of EI/L^2, moments of EI/L, are rounding and get no arrow.
 LEAST_LOAD = 1e-6
+# Of lines for contact forces: beside the longest arrow, and their color.
+CONTACT_LENGTH, CONTACT_COLOR = 0.6, "tab:orange"
 # Of the names of axes, clear of the numbers and of the color bar on the right [points].
 LABEL_PADS = {"x": 18, "y": 14, "z": 8}
 # Of clips and of obstacles, one after another, and how much of what is behind an obstacle it hides.
@@ -183,6 +185,31 @@ def draw_end_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, 
         ),
     ]
     return np.concatenate(tips)
+
+
+def draw_contacts(axes: Axes3D, equilibria: Sequence[Equilibrium], radii: Sequence[float]) -> str:
+    """Lines for the contact forces that act on rods drawn this thick: from their surface, where they are pressed, to
+    where the force comes from, by its size a length of the rod. Returns what to say of them in the picture.
+    """
+    feet, loads = [], []
+    for equilibrium, radius in zip(equilibria, radii, strict=True):
+        forces, steps = np.asarray(equilibrium.contact_forces), np.diff(np.asarray(equilibrium.s))
+        sizes = np.linalg.norm(forces, axis=1)
+        touches = sizes > LEAST_LOAD * float(equilibrium.state.units.force)
+        # Of the half elements on both sides of a node.
+        shares = (np.append(steps, 0.0) + np.append(0.0, steps)) / 2
+        along = forces[touches] / sizes[touches, None]
+        feet.append(np.asarray(equilibrium.nodes)[touches] - radius * along)
+        loads.append(forces[touches] / shares[touches, None])
+    begins, pressures = np.concatenate(feet), np.concatenate(loads)
+    if not len(begins):
+        return ""
+    nodes = np.concatenate([np.asarray(equilibrium.nodes) for equilibrium in equilibria])
+    largest = np.max(np.linalg.norm(pressures, axis=1))
+    ends = begins - CONTACT_LENGTH * ARROW_LENGTH * np.max(np.ptp(nodes, axis=0)) * pressures / largest
+    lines = np.stack([begins, ends], axis=1)
+    axes.add_collection3d(Line3DCollection(list(lines), colors=CONTACT_COLOR, linewidths=1.2))
+    return f"orange: contact, at most {largest:.3g} N/m"
 
 
 class Labels:

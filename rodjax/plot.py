@@ -22,6 +22,7 @@ from rodjax.drawing import (
     LABELS,
     Field,
     color_limits,
+    draw_contacts,
     draw_end_loads,
     draw_tube,
     halo,
@@ -51,7 +52,8 @@ def plot_rod(
 
     - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
     - `color_by`: `"curvature"`, `"twist"` or `"tension"`.
-    - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their magnitude.
+    - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their magnitude,
+        and contact forces as lines from where they come, longer where there are more newtons a metre.
     - `radius` [m] of the tube, of a rod whose radius varies at the thickest place; `None`: that of the rod, or thicker
       than life, 1.8 % of the picture, where the rod would be too thin to see: the figure says so.
     - `axes`: 3-D axes to draw in; `None`: those of a new figure.
@@ -67,6 +69,7 @@ def plot_rod(
     points = [draw_tube(axes, equilibrium, radius, color_by, norm, surroundings(equilibrium, radius))]
     if loads:
         points.append(draw_end_loads(axes, equilibrium))
+        note = _noted(note, draw_contacts(axes, [equilibrium], [radius]))
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     _add_color_bar([axes], norm, color_by, pad=0.08)
@@ -87,13 +90,15 @@ def plot_harness(
     result: HarnessEquilibrium,
     *,
     color_by: Field = "curvature",
+    loads: bool = False,
     radius: float | None = None,
     axes: Axes3D | None = None,
 ) -> Axes3D:
     """All rods of one equilibrium of a harness in one picture, with one scale of length and colour, and their names;
     obstacles near the first rod that has them.
 
-    `color_by` and `axes` as for `plot_rod`; `radius` [m]: of the thickest. Returns the axes. Raises `ValueError` or
+    `color_by` and `axes` as for `plot_rod`; `loads`: draw contact forces, of obstacles and of rods on one another, as
+    `plot_rod` does; `radius` [m]: of the thickest. Returns the axes. Raises `ValueError` or
     `TypeError` for arguments that make no sense.
     """
     instance(result, "result", HarnessEquilibrium)
@@ -108,15 +113,18 @@ def plot_harness(
     by_size = [rods[first], *rods]
     thick, note = thickness(by_size, None if radius is None else float(positive(radius, "radius")))
     norm = Normalize(*color_limits(np.concatenate([getattr(rod, color_by) for rod in rods])))
-    points, drawn = [], []
+    points, drawn, radii = [], [], []
     for (name, rod), own in zip(result.items(), true, strict=True):
         radius = thick * own / true[first] if own else thick
+        radii.append(radius)
         new = [obstacle for obstacle in rod.scene.obstacles if not any(eqx.tree_equal(obstacle, one) for one in drawn)]
         drawn += new
         points.append(draw_tube(axes, rod, radius, color_by, norm, surroundings(rod, radius, tuple(new))))
         middle = np.asarray(rod.nodes)[len(rod.s) // 2]
         x, y, z = map(float, middle)
         axes.text(x, y, z, name, fontsize=8, path_effects=halo(), zorder=10)
+    if loads:
+        note = _noted(note, draw_contacts(axes, rods, radii))
     set_view(axes, np.concatenate(points))
     axes.text2D(0.0, 0.0, note, transform=axes.transAxes, fontsize=8, color="0.4")
     _add_color_bar([axes], norm, color_by, pad=0.08)
@@ -210,6 +218,10 @@ def _checked_axes(axes: Iterable[AnyAxes], count: int, kind: type[AnyAxes]) -> t
 def figure_of(axes: Axes) -> Figure:
     """The whole figure of which axes are a part."""
     return cast(Figure, axes.get_figure(root=True))
+
+
+def _noted(*notes: str) -> str:
+    return "; ".join(filter(None, notes))
 
 
 def _add_color_bar(panels: Sequence[Axes3D], norm: Normalize, color_by: str, pad: float = 0.05) -> None:

@@ -13,9 +13,24 @@ from matplotlib.image import imread
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from rodjax import Clamp, Clip, Free, PointForce, Rod, Scene, Smooth, Steps, drawing, frame, plot, problems, solve
+from rodjax import (
+    Clamp,
+    Clip,
+    Free,
+    Plane,
+    PointForce,
+    Rod,
+    Scene,
+    Smooth,
+    Steps,
+    drawing,
+    frame,
+    plot,
+    problems,
+    solve,
+)
 from rodjax.discretization.twist import angle_about, transport_along
 
 SEGMENTS = 10
@@ -244,6 +259,23 @@ def test_a_free_end_without_load_has_no_arrow(cable):
     texts = [text.get_text() for text in plot.plot_rod(equilibrium, loads=True).texts]
     assert texts[0] == "0.01 N"
     assert [text.split()[-1] for text in texts[:-1]] == ["N", "m"]
+
+
+def test_contact_forces_are_lines_from_where_they_press(cable):
+    """A cable on a floor: one line for each node that lies, from below, the longest where a metre is pressed most."""
+    ends = (Clamp((x, 0.0, 0.0), frame((1.0, 0.0, 0.0))) for x in (0.0, 0.8))
+    scene = Scene(cable, *ends, gravity=(0.0, 0.0, -9.81), obstacles=[Plane((0.0, 0.0, -0.1), (0.0, 0.0, 1.0))])
+    lying = solve(scene, segments=16)
+    axes = plot.plot_rod(lying, loads=True)
+    (lines,) = (part for part in axes.collections if isinstance(part, Line3DCollection) and len(part._segments3d) > 3)  # pyright: ignore[reportAttributeAccessIssue]
+    ends_of_lines = np.asarray(lines._segments3d)  # pyright: ignore[reportAttributeAccessIssue]
+    forces, steps = np.asarray(lying.contact_forces), np.diff(np.asarray(lying.s))
+    touching = forces[:, 2] > 0
+    np.testing.assert_allclose(ends_of_lines[:, 0, :2], np.asarray(lying.nodes)[touching, :2], atol=1e-12)
+    ways = ends_of_lines[:, 1] - ends_of_lines[:, 0]
+    pressures = (forces[:, 2] / ((np.append(steps, 0) + np.append(0, steps)) / 2))[touching]
+    np.testing.assert_allclose(ways[:, 2] / np.min(ways[:, 2]), pressures / np.max(pressures), atol=1e-12)
+    assert f"at most {np.max(pressures):.3g} N/m" in axes.texts[-1].get_text()
 
 
 def test_pictures_are_not_blank(twisted):

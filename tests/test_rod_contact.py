@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.optimize import brentq
 
 import rodjax
-from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene
+from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene, plot
 from rodjax.analysis.sensitivity import moved
 from rodjax.solving.rod_contact_results import touching_rods
 
@@ -140,6 +141,15 @@ def test_derivatives_of_too_many_contacts_are_no_numbers(pressed, monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_picture_shows_what_beams_apply_to_each_other(pressed):
+    axes = plot.plot_harness(pressed, loads=True)
+    (lines,) = (part for part in axes.collections if isinstance(part, Line3DCollection))
+    ways = [end - begin for begin, end in map(np.asarray, lines._segments3d)]  # pyright: ignore[reportAttributeAccessIssue]
+    # Where they touch, from below on the upper one, from above on the lower one.
+    assert sorted(np.sign(way[2]) for way in ways) == [-1.0, 1.0]
+    assert "orange: contact" in axes.texts[-1].get_text()
+
+
 def test_no_beam_is_led_through_the_other():
     """Ends that are led past one another: in steps of a quarter of the radius the upper one stays the upper one."""
     path = rodjax.solve_path([crossing(down) for down in np.linspace(0.0, 6 * RADIUS, 13)], segments=8)

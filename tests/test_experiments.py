@@ -516,7 +516,9 @@ def test_a_knot_of_a_thin_rod_has_the_tension_of_its_loop():
     """From a sketch. EI/(2 R^2) in the limit; the rest of it falls as sqrt(r/R), to first order."""
     experiment = script("self_contact")
     middle, excess = 80, []
-    results = experiment.tightened(2 * middle)
+    # Compiled, and not where NumPy code has taken long enough, so that no clock decides by which roundings it goes on.
+    with rj.numpy_first(False):
+        results = experiment.tightened(2 * middle)
     for (_, radius), result in zip(experiment.KNOTS, results, strict=True):
         assert result.converged
         assert result.stable

@@ -32,7 +32,7 @@ def cable() -> rj.Scene:
 
 
 @pytest.mark.slow
-def test_no_neighbour_of_an_optimum_is_better():
+def test_no_neighbour_of_an_optimum_is_better(compiled_at_once):
     """Of 500 at random, half within a thousandth of the ranges, half within a ten thousandth."""
     # The first are those of a cable that came to 0.80652 and was called the best, where 0.80586 could be had.
     numbers = [

@@ -1,6 +1,6 @@
 """rodjax as a solver of cosseratbench, a benchmark of rod solvers (`pip install 'rodjax[cosseratbench]'`).
 
-cosseratbench finds `RodjaxSolver` by its entry point: `cosseratbench run cantilever catenary --solver rodjax`.
+cosseratbench finds `RodjaxSolver` by its entry point: `cosseratbench run cantilever catenary crossing --solver rodjax`.
 """
 
 import importlib

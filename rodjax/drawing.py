@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from rodjax.analysis.reactions import reactions
-from rodjax.analysis.samples import framed_at
+from rodjax.analysis.samples import framed_at, lengths_at_nodes
 from rodjax.checks import leaf
 from rodjax.model.along import Along, Value, value_at
 from rodjax.model.obstacles import Obstacle
@@ -188,19 +188,17 @@ def draw_end_loads(axes: Axes3D, equilibrium: Equilibrium) -> Float[np.ndarray, 
 
 
 def draw_contacts(axes: Axes3D, equilibria: Sequence[Equilibrium], radii: Sequence[float]) -> str:
-    """Lines for the contact forces that act on rods drawn this thick: from their surface, where they are pressed, to
-    where the force comes from, by its size a length of the rod. Returns what to say of them in the picture.
+    """Draws contact forces on rods drawn this thick as lines that end on their surface, as long as the force per length
+    is large; returns what to say of them in the picture.
     """
     feet, loads = [], []
     for equilibrium, radius in zip(equilibria, radii, strict=True):
-        forces, steps = np.asarray(equilibrium.contact_forces), np.diff(np.asarray(equilibrium.s))
+        forces = np.asarray(equilibrium.contact_forces)
         sizes = np.linalg.norm(forces, axis=1)
         touches = sizes > LEAST_LOAD * float(equilibrium.state.units.force)
-        # Of the half elements on both sides of a node.
-        shares = (np.append(steps, 0.0) + np.append(0.0, steps)) / 2
         along = forces[touches] / sizes[touches, None]
         feet.append(np.asarray(equilibrium.nodes)[touches] - radius * along)
-        loads.append(forces[touches] / shares[touches, None])
+        loads.append(forces[touches] / lengths_at_nodes(np.asarray(equilibrium.s))[touches, None])
     begins, pressures = np.concatenate(feet), np.concatenate(loads)
     if not len(begins):
         return ""

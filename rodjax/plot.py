@@ -53,7 +53,7 @@ def plot_rod(
     - `equilibrium`: a single one; of a path, take one with `jax.tree.map(lambda leaf: leaf[k], path)`.
     - `color_by`: `"curvature"`, `"twist"` or `"tension"`.
     - `loads`: draw the forces and moments (two-headed arrows) that act on the rod at its ends, with their magnitude,
-        and contact forces as lines from where they come, longer where there are more newtons a metre.
+        and contact forces as lines that end on the rod, as long as the force per length is large.
     - `radius` [m] of the tube, of a rod whose radius varies at the thickest place; `None`: that of the rod, or thicker
       than life, 1.8 % of the picture, where the rod would be too thin to see: the figure says so.
     - `axes`: 3-D axes to draw in; `None`: those of a new figure.
@@ -98,8 +98,8 @@ def plot_harness(
     obstacles near the first rod that has them.
 
     `color_by` and `axes` as for `plot_rod`; `loads`: draw contact forces, of obstacles and of rods on one another, as
-    `plot_rod` does; `radius` [m]: of the thickest. Returns the axes. Raises `ValueError` or
-    `TypeError` for arguments that make no sense.
+    `plot_rod` does; `radius` [m]: of the thickest. Returns the axes. Raises `ValueError` or `TypeError` for arguments
+    that make no sense.
     """
     instance(result, "result", HarnessEquilibrium)
     if result.energy.ndim:

@@ -97,6 +97,21 @@ def test_directors_of_a_clamped_rod_turn_with_its_section():
     np.testing.assert_allclose(directors[:, 1], 0.0, atol=1e-12)
 
 
+def test_rods_rest_on_planes_and_cylinders():
+    """The tip of the cantilever on a floor, its middle on a cylinder: both places of the centerline are then known."""
+    plane, cylinder = bench.scenario.Plane, bench.scenario.Cylinder
+    given = registry.load_experiment("cantilever").scenario
+    radius = given.rods[0].radius
+    floor = plane((0.0, 0.0, -0.005 - radius), (0.0, 0.0, 2.0))
+    peg = cylinder((0.5, 0.0, -0.001 - radius - 0.05), (0.0, 3.0, 0.0), radius=0.05, length=0.2)
+    with jax.enable_x64(True):
+        result = adapter().equilibrium(dataclasses.replace(given, obstacles=(floor, peg)), 8)
+    assert result.converged
+    # The cylinder is touched a little beside its top: 1e-3^2 of slope times its radius.
+    np.testing.assert_allclose(result.nodes[[4, 8], 2], [-0.001, -0.005], rtol=0, atol=1e-5)
+    assert np.all(np.asarray(result.contact_forces)[[4, 8], 2] > 0)
+
+
 def test_it_says_what_it_cannot_do():
     experiment = registry.load_experiment("cantilever")
 

@@ -11,6 +11,7 @@ from planar_frames import PlanarRod, solve_frame
 
 import rodjax
 from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring, plot
+from rodjax.solving.first_poses import first_poses
 
 GRAVITY = (0.0, 3.0, -9.81)
 START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
@@ -83,6 +84,10 @@ def test_cables_and_joints_begin_with_the_shapes_that_are_given(side):
     joint = Joint("cut", **ASIDE)
     parts = Harness({"a": Scene(plain(0.5), ends[0], joint), "b": Scene(plain(0.5), joint, ends[1])})
     shapes = {"a": rodjax.Guess(arc[:17]), "b": rodjax.Guess(arc[16:])}
+    poses = first_poses(parts, (shapes["a"], None))
+    np.testing.assert_allclose(poses.positions[0] + poses.frames[0] @ np.array(ASIDE["offset"]), arc[16], atol=1e-15)
+    edge = arc[16] - arc[15]
+    np.testing.assert_allclose(poses.frames[0] @ ASIDE["frame"][:, 2], edge / np.linalg.norm(edge), atol=1e-3)
     found = rodjax.solve(parts, segments=4, guess=shapes)
     assert found.stable
     assert float(found.energy) == pytest.approx(float(whole.energy), rel=1e-9)

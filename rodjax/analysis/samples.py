@@ -1,6 +1,6 @@
 """A rod at rest between its nodes: centerline, frames, and what it is strained and loaded by, at any arclengths."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from rodjax.analysis.clearance import radius_at
 from rodjax.analysis.curvature import curvature_along
+from rodjax.checks import namespace
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.section_loads import is_known_along, loads_between, section_loads
 from rodjax.discretization.twist import angle_about, transport
@@ -89,10 +90,7 @@ def _samples(equilibrium: Equilibrium, cell: Int[np.ndarray, "k"], fraction: Flo
     tension = between(equilibrium.tension) if force is None else np.sum(force * frames[..., 2], axis=-1)
     contact = None
     if equilibrium.scene.obstacles:
-        steps = np.diff(nodes, axis=-1)
-        none = np.zeros_like(steps[..., :1])
-        shares = (np.append(none, steps, axis=-1) + np.append(steps, none, axis=-1)) / 2
-        line = np.asarray(equilibrium.contact_forces) / shares[..., None]
+        line = np.asarray(equilibrium.contact_forces) / lengths_at_nodes(nodes)[..., None]
         contact = np.stack([between(line[..., k]) for k in range(3)], axis=-1)
     return Samples(
         s,
@@ -107,6 +105,14 @@ def _samples(equilibrium: Equilibrium, cell: Int[np.ndarray, "k"], fraction: Flo
         radius,
         contact,
     )
+
+
+def lengths_at_nodes(s: Any) -> Any:
+    """What of the rod belongs to each node at s [..., n+1]: half of the elements on both sides."""
+    xp = namespace(s)
+    steps = xp.diff(s, axis=-1)
+    none = xp.zeros_like(steps[..., :1])
+    return (xp.concatenate([none, steps], axis=-1) + xp.concatenate([steps, none], axis=-1)) / 2
 
 
 def _interpolated(s: np.ndarray, arclengths: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ class _Reach(NamedTuple):
 def first_poses(harness: Harness, shapes: Shapes) -> Poses:
     """Each body where given shapes of its rods end; else where springs along the rods, as soft as these are long, would
     hold it, let down as far as the rods are longer; what hangs on a single fixed place straight on from there. Axes so
-    that the ends point along the chords of their rods, or as on their shapes.
+    that the ends point as on these shapes, else along the chords of their rods.
     """
     bodies = Bodies.of(harness)
     reaches = [
@@ -232,9 +232,11 @@ def _until_touched(
 
 
 def _frame_at(body: int, positions: list[Any], reaches: list[_Reach]) -> Float[Array, "3 3"]:
-    """The rotation that takes the tangents of the ends nearest to the chords of their rods: Davenport's method."""
-    pairs = []
-    for reach in _at(body, reaches):
+    """The rotation that takes the tangents of the ends nearest to those of given shapes, else to the chords of their
+    rods: Davenport's method.
+    """
+    pairs, beside = [], _at(body, reaches)
+    for reach in [reach for reach in beside if reach.along is not None] or beside:
         if reach.along is None:
             place = reach.place if reach.other is None else positions[reach.other]
             if place is None:

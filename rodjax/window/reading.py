@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rodjax.analysis.clearance import arclengths_between, radius_at
 from rodjax.analysis.curvature import curvature_along, curvature_within
-from rodjax.analysis.samples import framed_at
+from rodjax.analysis.samples import framed_at, lengths_at_nodes
 from rodjax.checks import Numbers
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.rotations import from_frame
@@ -78,11 +78,8 @@ def _reading(equilibrium: Equilibrium) -> Reading:
     if isinstance(equilibrium.state.shape, Curve):
         values["curvature"] = curvature_within(equilibrium, s)
     if scene.obstacles:
-        steps = jnp.diff(nodes)
-        # Of the half elements on both sides of a node.
-        shares = (jnp.append(steps, 0.0) + jnp.append(jnp.zeros(1, s.dtype), steps)) / 2
         contact = jnp.sqrt(jnp.sum(equilibrium.contact_forces**2, axis=-1))
-        values["pressure"] = jnp.interp(s, nodes, contact / shares)
+        values["pressure"] = jnp.interp(s, nodes, contact / lengths_at_nodes(nodes))
     ends = equilibrium.nodes[jnp.array([0, -1])]
     clips = [clip.position[None] for clip in scene.clips]
     # At s = 0 what the support applies is the reverse of the section force.

@@ -534,9 +534,6 @@ def test_what_clips_do_not_go_with_is_said():
     ):
         with pytest.raises(ValueError, match=message):
             rj.solve(scene, **options)
-    curved = Rod(1.0, (1.0, 2.0), 1.0, 1e6)
-    with pytest.raises(ValueError, match=r"clips must be \(\) in the continuum for a rod, loads or clips"):
-        rj.solve_continuum(Scene(curved, scene.start, scene.end, clips=scene.clips))
 
 
 def test_a_result_without_clips_has_none():

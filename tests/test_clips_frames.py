@@ -649,8 +649,6 @@ def test_what_frames_in_clips_do_not_go_with_is_said():
         ):
             with pytest.raises(ValueError, match=message):
                 rj.solve(held, **options)
-        with pytest.raises(ValueError, match=r"clips must be \(\) in the continuum for a rod, loads or clips"):
-            rj.solve_continuum(held)
 
 
 @pytest.mark.slow

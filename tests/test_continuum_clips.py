@@ -135,6 +135,44 @@ def test_a_clip_that_holds_the_direction_parts_the_rod():
     np.testing.assert_allclose(whole.energy, first.energy + second.energy, rtol=1e-9)
 
 
+def test_clips_by_frames():
+    """A rod of two stiffnesses in clips that hold all, the direction, and the position of a rod that slides."""
+    first = frame((1.0, 0.2, 0.1))
+    clips = [
+        Clip(0.3, (0.25, 0.03, 0.1), frame=first),
+        Clip(0.55, (0.45, 0.05, 0.1), (1.0, 0.0, 0.2)),
+        Clip(0.8, (0.65, 0.1, 0.12), sliding=True),
+    ]
+    ends = Clamp(ORIGIN, LEVEL), Clamp((0.8, 0.1, 0.1), frame((1.0, 0.0, 0.3)))
+
+    def scene(clips) -> Scene:
+        return Scene(Rod(1.0, (1.0, 2.0), 0.7, 1e4, mass_per_length=1.0), *ends, (0, 0, -9.0), clips=clips)
+
+    coarse, fine = (rj.solve(scene(clips), segments=segments, solver=TIGHT) for segments in (16, 32))
+    truth = rj.solve_continuum(scene(clips), fine)
+    assert truth.converged
+    assert truth.residual < RESIDUAL
+    force = float(np.max(np.abs(truth.clip_forces)))
+    for name in (*FIELDS, "elastic_energy", "total_twist"):
+        exact = getattr(truth, name)
+        errors = [float(np.max(np.abs(getattr(result, name) - exact))) for result in (coarse, fine)]
+        # Of fourth order, and of the next.
+        assert errors[1] < errors[0] / 8, name
+    np.testing.assert_allclose(axial_forces(truth), 0.0, atol=1e-9 * force)
+    node = int(np.argmin(np.abs(truth.s - 0.3)))
+    np.testing.assert_allclose(truth.frames[node], first, atol=RESIDUAL)
+    np.testing.assert_array_equal(truth.clip_moments[2], 0.0)
+    # Virtual work: a move and a turn of the first clip, by differences of second order in 1e-3.
+    turn, move, h = jnp.array([0.3, -0.2, 0.5]), jnp.array([0.2, 0.4, -0.3]), 1e-3
+
+    def energy(part: float) -> float:
+        moved = Clip(0.3, clips[0].position + part * move, frame=rotate(first, part * turn))
+        return float(rj.solve_continuum(scene([moved, *clips[1:]]), truth).energy)
+
+    work = float(move @ truth.clip_forces[0] + turn @ truth.clip_moments[0])
+    assert (energy(h) - energy(-h)) / (2 * h) == pytest.approx(work, rel=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "end", "tangent"),

@@ -36,6 +36,9 @@ class Bedding(eqx.Module):
         return self.stiffness * (1 + self.growth * s) / 2 * position[2] ** 2
 
 
+BED = Bedding(jnp.asarray(400.0), 1.0)
+
+
 def bedding(stiffness, growth=0.0) -> Potential:
     return Potential(Bedding(jnp.asarray(stiffness), growth))
 
@@ -109,6 +112,68 @@ def test_a_rod_in_a_field_is_the_integrated_elastica():
     np.testing.assert_allclose(end[:2], result.nodes[-1, [0, 2]], rtol=0, atol=5e-7)
     np.testing.assert_allclose(end[3:], 0.0, atol=2e-5)
     assert float(result.error_estimate) < 5e-7
+
+
+PART = (0.31, 0.72)
+
+
+@pytest.mark.parametrize("EI", [1.0, (1.0, 2.0)])
+def test_a_uniform_field_along_a_part_is_a_force_along_it(EI):
+    """The part ends where the mesh had no nodes; of fourth order apart, as above."""
+    force = jnp.array([0.0, 3.0, -40.0])
+    field = Potential(Uniform(force), part=PART)
+    of_field, of_force = (
+        rj.solve(Scene(rod(EI), START, FAR, **loads), segments=32)
+        for loads in ({"potentials": [field]}, {"distributed": [rj.DistributedForce(force, part=PART)]})
+    )
+    for result in (of_field, of_force):
+        assert result.converged
+        assert set(PART) <= set(np.asarray(result.s))
+    for name in FIELDS:
+        size = max(1.0, float(np.max(np.abs(getattr(of_force, name)))))
+        # Seen are 1.1e-7.
+        np.testing.assert_allclose(getattr(of_field, name), getattr(of_force, name), rtol=0, atol=5e-7 * size)
+
+
+def test_derivatives_by_the_ends_of_a_part():
+    def seen(end):
+        part = jnp.stack([jnp.asarray(0.31), end])
+        result = rj.solve(Scene(rod(), START, FAR, potentials=[Potential(BED, part)]), segments=12)
+        return result.end_force[2] + result.end_moment[1] + result.energy
+
+    values = [float(seen(jnp.asarray(0.72 + k * 1e-3))) for k in (-2, -1, 1, 2)]
+    difference = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / 12e-3
+    # Of fourth order in steps of a thousandth of the length, and of solves to 1e-8 by that.
+    assert float(jax.grad(seen)(jnp.asarray(0.72))) == pytest.approx(difference, rel=1e-5)
+
+
+@pytest.mark.parametrize("part", [(0.3, 1.2), (0.5, 0.4), (-0.1, 0.5)])
+def test_parts_that_are_none(part):
+    with pytest.raises(ValueError, match=r"part must (be two arclengths|lie in 0 to 1 m)"):
+        Scene(rod(), START, FAR, potentials=[Potential(BED, part)])
+
+
+@pytest.mark.slow
+def test_the_continuum_is_what_meshes_in_fields_converge_to():
+    """Along a part and along all of the rod, beside gravity and a clip; by frames as by tangents."""
+    fields = [Potential(BED, PART), Potential(Uniform(jnp.array([0.0, 0.6, -8.0])))]
+    clip = rj.Clip(0.4, (0.33, 0.05, 0.12))
+    plain, framed = (
+        Scene(rod(EI), START, FAR, (0, 0, -9.0), clips=[clip], potentials=fields) for EI in (1.0, (1.0, 1.0))
+    )
+    meshes = [rj.solve(plain, segments=segments) for segments in (16, 32)]
+    truth, other = rj.solve_continuum(plain, meshes[1]), rj.solve_continuum(framed)
+    for result in (truth, other):
+        assert result.converged
+    for name in ("start_force", "clip_forces", "end_force", "end_moment", "energy"):
+        exact = getattr(truth, name)
+        size = float(np.max(np.abs(exact)))
+        np.testing.assert_allclose(getattr(other, name), exact, rtol=0, atol=1e-9 * size)
+        coarse, fine = (float(np.max(np.abs(getattr(mesh, name) - exact))) / size for mesh in meshes)
+        # Of fourth order: a sixteenth, or eight times less where errors of both orders cancel.
+        assert fine < coarse / 8, name
+    again = rj.solve(plain, guess=truth, segments=32)
+    np.testing.assert_allclose(again.nodes, meshes[1].nodes, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("EI", [1.0, (1.0, 2.0)])
@@ -297,7 +362,6 @@ def test_what_takes_no_fields_says_so(tmp_path):
     result = rj.solve(scene, segments=8)
     for refused, message in (
         (lambda: rj.solve(scene, discretization="finite_difference"), "discretization must be 'hermite'"),
-        (lambda: rj.solve_continuum(scene), r"potentials must be \(\) in the continuum"),
         (lambda: rj.save(result, tmp_path / "result.vtkhdf"), r"potentials must be \(\): a potential is code"),
         (lambda: rj.write_scene(scene, tmp_path / "scene.toml"), r"potentials must be \(\) to be written"),
     ):

@@ -21,22 +21,24 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.analysis.continuum_frames import growth_of_frames, solve_frames
 from rodjax.analysis.shooting import (
+    Fields,
     Reached,
     Section,
     Start,
     Stations,
     equilibrium,
     error_growth,
+    forces_at_nodes,
     from_rodrigues,
     integrated,
     met,
     misses,
+    places_of_sliding_clips,
     rotation_of,
     station_arclengths,
     turn_between,
@@ -44,6 +46,7 @@ from rodjax.analysis.shooting import (
 from rodjax.checks import instance, is_known, positive, whole_number
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
+from rodjax.discretization.nodes import varying
 from rodjax.geometry.vectors import root
 from rodjax.mechanics.energy import (
     axial_strain_under,
@@ -132,14 +135,10 @@ def solve_continuum(
             raise ValueError(f"guess must be a single equilibrium, got several of shape {guess.s.shape[:-1]}")
     if segments is None:
         segments = max(DEFAULT_SEGMENTS if guess is None else guess.s.shape[-1] - 1, least)
-    if scene.clips and needs_frames(scene):
-        raise ValueError("clips must be () in the continuum for a rod, loads or clips that need frames along the rod")
     if scene.obstacles:
         raise ValueError("obstacles must be () in the continuum: rodjax.solve takes them")
     if scene.self_contact:
         raise ValueError("self_contact must be False in the continuum: rodjax.solve takes it")
-    if scene.potentials:
-        raise ValueError("potentials must be () in the continuum: rodjax.solve takes them")
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)
@@ -169,23 +168,26 @@ def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
 
 
 class Piece(eqx.Module):
-    """A piece of rod from a cross section on, in the axes of its frame there, under n and m there."""
+    """A piece of rod from the arclength `start` on, in the axes of its frame there, under n and m there."""
 
+    start: Float[Array, ""]
     length: Float[Array, ""]
     EA: Float[Array, ""]
     force: Float[Array, "3"]
     moment: Float[Array, "3"]
     gravity: Float[Array, "3"] | None
+    fields: Fields | None
 
 
 class FarEnd(eqx.Module):
-    """The other end of a `Piece`, and energies of the piece without that of torsion."""
+    """The other end of a `Piece`, and energies of the piece without that of torsion. `force`: where fields act."""
 
     position: Float[Array, "3"]
     quaternion: Float[Array, "4"]
     moment: Float[Array, "3"]
     elastic_energy: Float[Array, ""]
-    weight_energy: Float[Array, ""]
+    load_energy: Float[Array, ""]
+    force: Float[Array, "3"] | None
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -196,23 +198,32 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
     aligned = jnp.array([1.0, 0.0, 0.0, 0.0], piece.length.dtype)
     zero = jnp.zeros_like(piece.length)
     # One vector: the program of a tree of five arrays is larger and takes longer to compile.
-    y0, unravel = ravel_pytree(FarEnd(origin, aligned, piece.moment, zero, zero))
+    force_there = None if piece.fields is None else piece.force
+    y0, unravel = ravel_pytree(FarEnd(origin, aligned, piece.moment, zero, zero, force_there))
 
     def slope(u, y, _):
         end = unravel(y)
-        force = piece.force if piece.gravity is None else piece.force - u * piece.length * piece.gravity
+        force = end.force
+        if force is None:
+            force = piece.force if piece.gravity is None else piece.force - u * piece.length * piece.gravity
         t = rotation_of(end.quaternion)[:, 2]
         bending = end.moment - jnp.sum(end.moment * t) * t
         curvature = curvature_under(rod, bending)
         axial_strain = axial_strain_under(rod, jnp.sum(force * t))
         dphi = (1 + axial_strain) * t
-        weight = zero if piece.gravity is None else dead_load_energy(piece.gravity, end.position)
+        energy = zero if piece.gravity is None else dead_load_energy(piece.gravity, end.position)
+        by_force = None
+        if piece.fields is not None:
+            of_fields, by_force = piece.fields.energy_and_slope(end.position, piece.start + u * piece.length)
+            energy += of_fields
+            by_force = by_force if piece.gravity is None else by_force - piece.gravity
         by_s = FarEnd(
             position=dphi,
             quaternion=_quaternion_rate(end.quaternion, curvature),
             moment=-jnp.cross(dphi, force),
             elastic_energy=density(rod, squared_curvature=jnp.sum(curvature**2), axial_strain=axial_strain),
-            weight_energy=weight,
+            load_energy=energy,
+            force=by_force,
         )
         return piece.length * ravel_pytree(by_s)[0]
 
@@ -238,20 +249,27 @@ def _far_end_jvp(rtol: float, primals: tuple[Piece], tangents: tuple[Piece]) -> 
     return end, jax.tree.map(lambda columns: columns @ tangent, jacobian)
 
 
-def _piece(scene: Scene, section: Section, length: Float[Array, ""]) -> Piece:
-    """The piece of rod of this length from a cross section on."""
+def _piece(
+    scene: Scene, section: Section, start: Float[Array, ""], length: Float[Array, ""], middle: Float[Array, ""]
+) -> Piece:
+    """The piece of rod of this length from a cross section on; `middle`: of the interval in which nothing jumps."""
     axes = section.frame.T
     gravity = None if scene.gravity is None else axes @ scene.gravity
-    return Piece(length, scene.rod.EA, axes @ section.force, axes @ section.moment, gravity)
+    n, m, fields = axes @ section.force, axes @ section.moment, Fields.beyond(scene, section, middle)
+    return Piece(start, length, scene.rod.EA, n, m, gravity, fields)
 
 
 def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEnd) -> Section:
     """The cross section at the other end of that piece."""
     spin = twist_under(scene.rod, section.torque) * length
+    if end.force is None:
+        force = section.force if scene.gravity is None else section.force - length * scene.gravity
+    else:
+        force = section.frame @ end.force
     return Section(
         position=section.position + section.frame @ end.position,
         frame=section.frame @ rotation_of(end.quaternion) @ _about_tangent(spin),
-        force=section.force if scene.gravity is None else section.force - length * scene.gravity,
+        force=force,
         moment=section.frame @ end.moment,
     )
 
@@ -260,7 +278,7 @@ def _beyond(scene: Scene, section: Section, length: Float[Array, ""], end: FarEn
 def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     scaled, units = nondimensional(scene)
     if slides(scene):
-        scaled = slid(scaled, _places(guess))
+        scaled = slid(scaled, places_of_sliding_clips(guess))
     start = _start(scaled, guess, units, intervals)
 
     def residual(stations: Stations, args: tuple[Scene, Start]):
@@ -268,10 +286,10 @@ def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segmen
         scene, start = start.slid(scene, stations)
         sections = start.sections(stations)
         pieces = _intervals(scene, start, sections)
-        return _residual(scene, start, stations, jax.vmap(functools.partial(far_end, rtol))(pieces))
+        return _residual(scene, start, stations, _reached(scene, start, sections, _far_ends(rtol, pieces)))
 
     # An unloaded rod between two pins can turn about the line through them, and one in clips where all lie on one line.
-    is_loaded = scene.gravity is not None or scene.point_forces
+    is_loaded = scene.gravity is not None or scene.point_forces or scene.potentials
     turns_freely = isinstance(scene.start, Pin) and isinstance(scene.end, Pin) and not is_loaded
     if scene.clips:
         directed = any(isinstance(end, Directed) for end in (scene.start, scene.end))
@@ -281,22 +299,29 @@ def _solve(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segmen
     return _equilibrium(scene, start, stations, iterations, rtol, segments)
 
 
-def _places(guess: Equilibrium) -> Float[Array, "slides"]:
-    """Of the sliding clips, as parts of the length."""
-    return jnp.stack([clip.at for clip in guess.scene.clips if clip.sliding]) / guess.scene.rod.length
+def _pieces(
+    scene: Scene, start: Start, sections: Section, stations: Int[Array, "m"], length: Float[Array, "m"]
+) -> Piece:
+    """From these stations on."""
+    begin = jax.tree.map(lambda leaf: leaf[stations], sections)
+    middles = (start.s[1:] + start.s[:-1]) / 2
+    middle = middles[jnp.minimum(stations, len(middles) - 1)]
+    return jax.vmap(functools.partial(_piece, scene))(begin, start.s[stations], length, middle)
 
 
 def _intervals(scene: Scene, start: Start, sections: Section) -> Piece:
-    before = jax.tree.map(lambda leaf: leaf[:-1], sections)
-    return jax.vmap(functools.partial(_piece, scene))(before, jnp.diff(start.s))
+    return _pieces(scene, start, sections, jnp.arange(len(start.s) - 1), jnp.diff(start.s))
+
+
+def _far_ends(rtol: float, pieces: Piece) -> FarEnd:
+    return jax.vmap(functools.partial(far_end, rtol))(pieces)
 
 
 def _residual(
-    scene: Scene, start: Start, stations: Stations, ends: FarEnd
+    scene: Scene, start: Start, stations: Stations, reached: Section
 ) -> tuple[Stations, Float[Array, "6"], Float[Array, "6"]]:
-    """What intervals that end in `ends` miss the next stations by, and the ends of the rod their supports."""
+    """What intervals that reach these sections miss the next stations by, and the ends of the rod their supports."""
     sections = start.sections(stations)
-    reached = _reached(scene, start, sections, ends)
     gaps, at_start, at_end = misses(scene, start, sections, reached)
     if not any(isinstance(end, Clamp) for end in (scene.start, scene.end)):
         # Both ends ask for no torque, which is constant along the rod, and none fixes the spin: it stays the guess's.
@@ -325,7 +350,7 @@ def _forces_along(scene: Scene, guess: Equilibrium, units: Units, s: Float[Array
 def _growth_along(scene: Scene, guess: Equilibrium, units: Units) -> tuple[Float[Array, "n+1 3"], Float[Array, "n+1"]]:
     """Forces at the nodes of a guess, and int sqrt(|n| + curvature^2) ds from the start to there."""
     s = guess.s / guess.s[-1]
-    force = _forces_along(scene, guess, units, s)
+    force = forces_at_nodes(guess, units) if scene.potentials else _forces_along(scene, guess, units, s)
     return force, error_growth(s, jnp.sqrt(jnp.sum(force**2, axis=1)), (guess.curvature * units.length) ** 2)
 
 
@@ -353,7 +378,7 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     fixed, fixed_units = jax.lax.stop_gradient((scene, units))
     x = guess.s / guess.s[-1]
     node_force, growth = _growth_along(fixed, guess, fixed_units)
-    at = station_arclengths(scene, x, growth, intervals)
+    at = station_arclengths(scene, x, growth, intervals, varying(scene))
 
     fixed_s = jax.lax.stop_gradient(at.s)
     reference = _frames_between(x, guess.frames, guess.total_twist, fixed_s)
@@ -365,8 +390,12 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     moments = across + torque_at(fixed.rod, guess.total_twist) * tangents
     force = jnp.stack([jnp.interp(fixed_s, x, component) for component in node_force.T], axis=1)
     moment = jnp.stack([jnp.interp(fixed_s, x, component) for component in moments.T], axis=1)
-    if scene.clips:
+    if scene.clips and scene.potentials:
+        nodes = jnp.argmin(jnp.abs(x[:, None] - fixed_s[at.clips][None]), axis=0)
+        force = force.at[at.clips].set(node_force[nodes])
+    elif scene.clips:
         force = _forces_along(fixed, guess, fixed_units, fixed_s)
+    if scene.clips:
         moment = moment.at[at.clips].set(_moments_beyond_clips(fixed, x, tangents, moments))
     arclengths = sliding_arclengths(fixed)
     return Start.near(guess, fixed_units, at, reference, force, moment, arclengths)
@@ -420,24 +449,17 @@ def _equilibrium(
     s = QuadraticRotationElements.of(scaled, equal).arclengths
     station = jnp.searchsorted(start.s, s, side="right") - 1
     before = jax.tree.map(lambda leaf: leaf[station], sections)
-    length = s - start.s[station]
-    intervals = _intervals(scaled, start, sections)
-    to_nodes = jax.vmap(functools.partial(_piece, scaled))(before, length)
-    pieces = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), intervals, to_nodes)
-    reached = jax.vmap(functools.partial(far_end, rtol))(pieces)
-    ends, node_ends = (
-        jax.tree.map(lambda leaf, cut=cut: leaf[cut], reached)
-        for cut in (slice(len(start.s) - 1), slice(len(start.s) - 1, None))
+    length, count = s - start.s[station], len(start.s) - 1
+    # One program for the intervals and from the stations to the points.
+    both = jnp.concatenate([jnp.arange(count, dtype=station.dtype), station])
+    lengths = jnp.concatenate([jnp.diff(start.s), length])
+    far_ends = _far_ends(rtol, _pieces(scaled, start, sections, both, lengths))
+    ends, point_ends = (
+        jax.tree.map(lambda leaf, cut=cut: leaf[cut], far_ends) for cut in (slice(count), slice(count, None))
     )
-    points = jax.vmap(functools.partial(_beyond, scaled))(before, length, node_ends)
+    points = jax.vmap(functools.partial(_beyond, scaled))(before, length, point_ends)
+    reached = _reached(scaled, start, sections, ends)
     s, nodes = s[::2], jax.tree.map(lambda leaf: leaf[::2], points)
-
-    clip_moments = None
-    if scaled.clips:
-        assert start.clips is not None
-        jumps = _reached(scaled, start, sections, ends).moment[start.clips - 1] - sections.moment[start.clips]
-        is_directed = np.array([clip.tangent is not None for clip in scaled.clips])
-        clip_moments = jnp.where(is_directed[:, None], jumps, 0.0)
     twist = twist_under(rod, sections.torque[0])
     moments = nodes.moment - nodes.torque[:, None] * nodes.tangent
     result = Reached(
@@ -448,10 +470,10 @@ def _equilibrium(
         axial_strain=axial_strain_under(rod, nodes.tension),
         total_twist=twist,
         elastic_energy=jnp.sum(ends.elastic_energy) + density(rod, twist=twist),
-        load_energy=jnp.sum(ends.weight_energy),
-        missed=_residual(scaled, start, stations, ends),
+        load_energy=jnp.sum(ends.load_energy),
+        missed=_residual(scaled, start, stations, reached),
         shape=Curve(nodes.position, points.tangent.T, s),
-        clip_moments=clip_moments,
+        intervals=reached,
     )
     return equilibrium(scene, start, stations, iterations, result)
 

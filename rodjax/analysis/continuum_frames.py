@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rodjax.analysis.shooting import (
+    Fields,
     Reached,
     Section,
     Start,
@@ -32,15 +33,17 @@ from rodjax.analysis.shooting import (
     integrated,
     met,
     misses,
+    places_of_sliding_clips,
     rotation_of,
     station_arclengths,
     sum_of_loads,
 )
-from rodjax.discretization.cells import ElementCells, varying
+from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.frame_point import FramePoint
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.discretization.framed_results import own_moments
+from rodjax.discretization.framed_results import own_moments, section_forces
+from rodjax.discretization.nodes import varying
 from rodjax.geometry.rotations import columns, continuous, from_frame, product, unit
 from rodjax.geometry.vectors import dot, root
 from rodjax.mechanics.energy import Sections, dead_load_energy
@@ -48,7 +51,7 @@ from rodjax.model.along import Smooth, Spline, Steps, Value
 from rodjax.model.loads import DistributedCouple, DistributedForce
 from rodjax.model.rest import RestStrain, SpaceCurve, SplinedCurve
 from rodjax.model.rod import Law
-from rodjax.model.scene import Scene, nondimensional
+from rodjax.model.scene import Scene, nondimensional, slid, slides, sliding_arclengths
 from rodjax.model.supports import Clamp
 from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium, form_and_point
@@ -157,6 +160,7 @@ class Piece(eqx.Module):
     gravity: Float[Array, "3"] | None
     dead_force: Float[Array, "3"] | None
     dead_couple: Float[Array, "3"] | None
+    fields: Fields | None
     material: Material
 
 
@@ -225,6 +229,10 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
         if piece.dead_force is not None:
             dead += piece.dead_force
         load = dead if material.force is None else dead + frame @ material.force
+        load_energy = dead_load_energy(dead, end.position)
+        if piece.fields is not None:
+            energy, by_position = piece.fields.energy_and_slope(end.position, s)
+            load, load_energy = load - by_position, load_energy + energy
         dmoment = -jnp.cross(dphi, end.force)
         if piece.dead_couple is not None:
             dmoment -= piece.dead_couple
@@ -237,7 +245,7 @@ def _far_end(rtol: float, piece: Piece) -> FarEnd:
             force=-load,
             moment=dmoment,
             elastic_energy=here.sections.density((k1, k2), twist, here.axial, here.shear),
-            load_energy=dead_load_energy(dead, end.position),
+            load_energy=load_energy,
             twist=here.strains[2],
         )
         return piece.length * ravel_pytree(by_s)[0]
@@ -300,7 +308,8 @@ def _reached(
         along = (sum_of_loads(scene, kind, False, middle) for kind in (DistributedForce, DistributedCouple))
         gravity, force, couple = (None if load is None else axes @ load for load in (scene.gravity, *along))
         n, m = axes @ section.force, axes @ section.moment
-        piece = Piece(start, length, interval, n, m, gravity, force, couple, material.loaded(scene, middle))
+        fields = Fields.beyond(scene, section, middle)
+        piece = Piece(start, length, interval, n, m, gravity, force, couple, fields, material.loaded(scene, middle))
         end = far_end(rtol, piece)
         beyond = Section(
             position=section.position + section.frame @ end.position,
@@ -329,22 +338,26 @@ def _over_intervals(scene: Scene, rtol: float, start: Start, sections: Section) 
 def solve_frames(scene: Scene, guess: Equilibrium, rtol: float, intervals: int, segments: int) -> Equilibrium:
     """As `solve_continuum`, from a guess with frames."""
     scaled, units = nondimensional(scene)
+    if slides(scene):
+        scaled = slid(scaled, places_of_sliding_clips(guess))
     start = _start(scaled, guess, units, intervals)
 
     def residual(stations: Stations, args: tuple[Scene, Start]):
         scene, start = args
+        scene, start = start.slid(scene, stations)
         sections = start.sections(stations)
         return misses(scene, start, sections, _over_intervals(scene, rtol, start, sections)[0])
 
     # Without a clamp some rods can spin without resistance, others cannot.
     is_clamped = isinstance(scene.start, Clamp) or isinstance(scene.end, Clamp)
+    is_clamped |= any(clip.frame is not None for clip in scene.clips)
     stations, iterations = met(residual, scaled, start, is_resisted=is_clamped)
     return _equilibrium(scene, start, stations, iterations, rtol, segments)
 
 
 class _Along(eqx.Module):
-    """Of a guess, nondimensional: forces, moments and quaternions of the frames at increasing arclengths, and
-    the growth of errors to the nodes.
+    """Of a guess, nondimensional: forces, moments and quaternions of the frames at increasing arclengths, the growth of
+    errors to the nodes, and forces and moments just beyond the clips.
     """
 
     arclengths: Float[Array, "m"]
@@ -354,6 +367,7 @@ class _Along(eqx.Module):
     quaternions: Float[Array, "4 k"]
     s: Float[Array, "n+1"]
     growth: Float[Array, "n+1"]
+    beyond_clips: tuple[Float[Array, "3 clips"], Float[Array, "3 clips"]] | None
 
 
 def _along(guess: Equilibrium, units: Units) -> _Along:
@@ -361,21 +375,21 @@ def _along(guess: Equilibrium, units: Units) -> _Along:
     form, point = form_and_point(guess)
     assert isinstance(form, FrameForm)
     assert isinstance(point, FramePoint)
-    by_cells = form.forces(point.quaternions, point.end_force)
-    own = own_moments(form, point)
+    scales = guess.state.units.force / units.force, guess.state.units.energy / units.energy
+    by_cells, own = scales[0] * section_forces(form, point), scales[1] * own_moments(form, point)
+    beyond_clips = None
+    if form.clip_nodes is not None:
+        beyond_clips = by_cells[:, 0, form.clip_nodes], -own[:, 0, form.clip_nodes]
     at = form.field.strain_arclengths
     arclengths = jnp.concatenate([at[0], at[-1, -1:]])
     forces = jnp.concatenate([by_cells[:, 0], by_cells[:, -1, -1:]], axis=1)
     moments = jnp.concatenate([-own[:, 0, :1], own[:, -1]], axis=1)
-    scales = guess.state.units.force / units.force, guess.state.units.energy / units.energy
-    forces, moments = scales[0] * forces, scales[1] * moments
 
     s = guess.s / guess.s[-1]
     size = jnp.interp(s, arclengths, jnp.sqrt(dot(forces, forces)))
     squared = (guess.curvature**2 + guess.twist**2) * units.length**2
-    return _Along(
-        arclengths, forces, moments, form.field.arclengths, point.quaternions, s, error_growth(s, size, squared)
-    )
+    growth = error_growth(s, size, squared)
+    return _Along(arclengths, forces, moments, form.field.arclengths, point.quaternions, s, growth, beyond_clips)
 
 
 @compiled
@@ -398,7 +412,12 @@ def _start(scene: Scene, guess: Equilibrium, units: Units, intervals: int) -> St
     quaternions = unit(between(along.frame_arclengths, along.quaternions))
     reference = jnp.moveaxis(columns(quaternions), 2, 0)
     force, moment = between(along.arclengths, along.forces).T, between(along.arclengths, along.moments).T
-    return Start.near(guess, fixed_units, at, reference, force, moment)
+    if scene.clips:
+        assert along.beyond_clips is not None
+        beyond = along.beyond_clips
+        force, moment = (each.at[at.clips].set(beyond[k].T) for k, each in enumerate((force, moment)))
+    arclengths = sliding_arclengths(jax.lax.stop_gradient(scene))
+    return Start.near(guess, fixed_units, at, reference, force, moment, arclengths)
 
 
 def _equilibrium(
@@ -406,6 +425,7 @@ def _equilibrium(
 ) -> Equilibrium:
     """The result, integrated from each station to the nodes behind it."""
     scaled, _ = nondimensional(scene)
+    scaled, start = start.slid(scaled, stations)
     sections = start.sections(stations)
     # Nodes, and the middles between them for what a discrete solve begins with.
     s = ElementCells.of(scaled, jnp.linspace(0.0, 1.0, segments + 1, dtype=start.s.dtype)).arclengths
@@ -438,6 +458,7 @@ def _equilibrium(
         load_energy=jnp.sum(ends.load_energy),
         missed=misses(scaled, start, sections, reached),
         shape=FramedCurve(nodes.position, quaternions, s),
+        intervals=reached,
         shear_strain=strained.shear,
     )
     return equilibrium(scene, start, stations, iterations, result)

@@ -21,13 +21,23 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from rodjax.discretization.forms import form_of
+from rodjax.discretization.section_loads import section_loads
 from rodjax.discretization.shape import Shape
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.along import Along
-from rodjax.model.loads import DistributedForce, PointCouple, per_length
-from rodjax.model.scene import Scene, dead_forces, held_at_both_ends, loads_at_nodes, nondimensional, slid
+from rodjax.model.loads import DistributedForce, PointCouple, Potential, acting, densities, per_length
+from rodjax.model.scene import (
+    Scene,
+    dead_forces,
+    has_node_positions,
+    held_at_both_ends,
+    loads_at_nodes,
+    nondimensional,
+    slid,
+)
 from rodjax.model.supports import Clamp, Free, Held, Support, Swivel
-from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState, form_and_point
 from rodjax.solving.status import Status, is_converged, with_strain
 from rodjax.units import Units
 
@@ -64,6 +74,33 @@ class Section(eqx.Module):
     @property
     def tension(self) -> Float[Array, "*k"]:
         return jnp.sum(self.force * self.tangent, axis=-1)
+
+
+class Fields(eqx.Module):
+    """Fields of forces in the axes of a cross section, from its position on; `acts`: 1 where they do beyond it."""
+
+    potentials: tuple[Potential, ...]
+    acts: Float[Array, "fields"]
+    position: Float[Array, "3"]
+    frame: Float[Array, "3 3"]
+
+    @staticmethod
+    def beyond(scene: Scene, section: Section, middle: Float[Array, ""]) -> "Fields | None":
+        """`middle`: of the interval in which nothing jumps; `None` where the scene has none."""
+        if not scene.potentials:
+            return None
+        return Fields(scene.potentials, acting(scene.potentials, middle), section.position, section.frame)
+
+    def energy_and_slope(
+        self, position: Float[Array, "3"], s: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+        """Per length, and its derivatives by the position: the force is the reverse."""
+
+        def energy(position: Float[Array, "3"]) -> Float[Array, ""]:
+            there = self.position + self.frame @ position
+            return jnp.sum(self.acts * densities(self.potentials, there, s))
+
+        return jax.value_and_grad(energy)(position)
 
 
 class Stations(eqx.Module):
@@ -131,6 +168,18 @@ class Start(eqx.Module):
         sliding = np.array([k for k, clip in enumerate(scene.clips) if clip.sliding])
         s = self.s.at[self.clips[sliding]].set(stations.arclengths)
         return slid(scene, stations.arclengths), eqx.tree_at(lambda start: start.s, self, s)
+
+
+def forces_at_nodes(guess: Equilibrium, units: Units) -> Float[Array, "n+1 3"]:
+    """On a mesh of elements, through the rod beyond each node, in other units than those of the guess."""
+    forces, _ = section_loads(*form_and_point(guess))
+    scale = guess.state.units.force / units.force
+    return scale * jnp.concatenate([forces[:, 0], forces[:, 1, -1:]], axis=1).T
+
+
+def places_of_sliding_clips(guess: Equilibrium) -> Float[Array, "slides"]:
+    """As parts of the length."""
+    return jnp.stack([clip.at for clip in guess.scene.clips if clip.sliding]) / guess.scene.rod.length
 
 
 def error_growth(
@@ -263,7 +312,9 @@ def _with_clips(scene: Scene, start: Start, gaps: Stations, after: Section, reac
         gap = start.clips[k] - 1
         here, before = (jax.tree.map(lambda leaf, gap=gap: leaf[gap], sections) for sections in (after, reached))
         force = force.at[gap].set(here.position - clip.position)
-        if clip.tangent is not None:
+        if clip.frame is not None:
+            moment = moment.at[gap].set(turn_between(clip.frame, here.frame))
+        elif clip.tangent is not None:
             torque = (here.torque - before.torque) / start.moment_scale
             moment = moment.at[gap].set(jnp.append(here.frame[:, :2].T @ clip.tangent, torque))
         if clip.sliding:
@@ -297,9 +348,10 @@ def _missed_support(end: Support, start: Start, section: Section, sign: float) -
 
 
 class Reached(eqx.Module):
-    """What the integration from the stations on gives, nondimensional: cross sections at the nodes and strains there,
-    and energies. `load_energy`: of the loads along the rod, as if each interval began at the origin; `missed`: between
-    stations and at supports; `shape`: what a discrete solve begins with; `clip_moments`: what the clips apply.
+    """What the integration from the stations on gives, nondimensional: cross sections at the ends of the intervals and
+    at the nodes, strains there, and energies. `load_energy`: of the loads along the rod, of dead ones as if each
+    interval began at the origin; `missed`: between stations and at supports; `shape`: what a discrete solve begins
+    with.
     """
 
     s: Float[Array, "n+1"]
@@ -312,7 +364,7 @@ class Reached(eqx.Module):
     load_energy: Float[Array, ""]
     missed: Any
     shape: Shape
-    clip_moments: Float[Array, "clips 3"] | None = None
+    intervals: Section
     shear_strain: Float[Array, "n+1 2"] | None = None
 
 
@@ -334,8 +386,20 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
     energy = reached.elastic_energy + reached.load_energy + _energy_at(scaled, start, from_origin)
     nodes = reached.nodes
     end_force = (last.force if held_at_both_ends(scene) else jnp.zeros_like(last.force))[:, None]
+    clip_moments = None
     if scene.clips:
-        end_force = _end_forces_of_spans(scaled, start, sections)
+        assert start.clips is not None
+        before, beyond = reached.intervals, sections
+        forces, moments = (
+            each[start.clips - 1] - other[start.clips]
+            for each, other in ((before.force, beyond.force), (before.moment, beyond.moment))
+        )
+        end_force = _seen_by_spans(scene, end_force, forces.T)
+        is_directed = np.array([clip.direction is not None for clip in scene.clips])
+        clip_moments = jnp.where(is_directed[:, None], moments, 0.0)
+    if has_node_positions(scene):
+        point = reached.shape.point(end_force, reached.total_twist)
+        end_force = form_of(scaled, reached.shape).begun(point, nodes.position, None, None).end_force
     return Equilibrium(
         s=reached.s * scene.rod.length,
         nodes=units.origin[None] + units.length * nodes.position,
@@ -359,30 +423,21 @@ def equilibrium(scene: Scene, start: Start, stations: Stations, iterations: Any,
         substeps=jnp.ones((), int),
         residual=residual,
         scene=scene,
-        state=SolverState(reached.shape, end_force, units, stations.arclengths, reached.clip_moments),
+        state=SolverState(reached.shape, end_force, units, stations.arclengths, clip_moments),
         discretization="continuum",
         shear_strain=reached.shear_strain,
     )
 
 
-def _end_forces_of_spans(scene: Scene, start: Start, sections: Section) -> Float[Array, "3 spans"]:
-    """The force at s = L as each span between clips sees it: that at its beginning without the loads beyond, as in
-    `discretization.layout`; where the start is free, with those before.
+def _seen_by_spans(
+    scene: Scene, end_force: Float[Array, "3 1"], clip_forces: Float[Array, "3 clips"]
+) -> Float[Array, "3 spans"]:
+    """The force at s = L as each span sees it, with those of the clips beyond; where the start is free, zero in the
+    first, and with those before.
     """
-    assert start.clips is not None
-    at = jnp.pad(start.clips, (1, 0))
-    load = jnp.cumsum(start.force_steps, axis=0)
-    if scene.gravity is not None:
-        load += start.s[:, None] * scene.gravity[None]
     if isinstance(scene.start, Free):
-        end_forces = sections.force[at] + load[at]
-        end_forces = end_forces if scene.start.force is None else end_forces + scene.start.force[None]
-        return end_forces.at[0].set(0.0).T
-    end_forces = sections.force[at] - (load[-1][None] - load[at])
-    if isinstance(scene.end, Free):
-        end_forces = end_forces if scene.end.force is None else end_forces - scene.end.force[None]
-        end_forces = end_forces.at[-1].set(0.0)
-    return end_forces.T
+        return jnp.pad(-jnp.cumsum(clip_forces, axis=1), ((0, 0), (1, 0)))
+    return end_force + jnp.pad(jnp.cumsum(clip_forces[:, ::-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
 
 
 def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Float[Array, ""]:

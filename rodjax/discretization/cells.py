@@ -22,13 +22,13 @@ from rodjax.checks import Numbers, namespace
 from rodjax.discretization.element_bending import SIMPSON
 from rodjax.discretization.element_points import interleaved, of_elements, parts_before, scatter_add
 from rodjax.discretization.element_strains import ElementStrains
-from rodjax.discretization.nodes import LEAST_ELEMENT, with_nodes_at, with_nodes_at_clips
+from rodjax.discretization.nodes import LEAST_ELEMENT, varying, with_nodes_of
 from rodjax.geometry.rotations import inverse, product, unit
 from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
-from rodjax.model.along import Steps, stiffness_at, value_at
+from rodjax.model.along import stiffness_at, value_at
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, loads_at_nodes
+from rodjax.model.scene import Scene
 
 # The frame that turns the correction of a segment vector: of an edge its own, of an element that in the middle.
 REFERENCE = 1
@@ -287,10 +287,7 @@ class ElementCells(eqx.Module):
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "ElementCells":
         """On these nodes, moved so that one lies at each clip, each point force and each jump of the rod."""
-        arclengths = [load.at for load in scene.point_forces] + [jump for steps in varying(scene) for jump in steps]
-        if scene.clips:
-            return ElementCells(*with_nodes_at_clips(scene, s, arclengths))
-        return ElementCells(with_nodes_at(s, jnp.sort(jnp.stack(arclengths)), may_repeat=True) if arclengths else s)
+        return ElementCells(*with_nodes_of(scene, s))
 
     @property
     def h(self) -> Float[Array, "n"]:
@@ -357,17 +354,6 @@ class ElementCells(eqx.Module):
         diagonal = self.scatter_add(jnp.stack([blocks[k, :, k] for k in range(3)], axis=-2))
         between = jnp.stack([blocks[1, :, 0], blocks[2, :, 1]], axis=-1)
         return diagonal, between.reshape(*between.shape[:2], -1), blocks[2, :, 0]
-
-
-def varying(scene: Scene) -> list[Float[Array, "k"]]:
-    """The arclengths of the jumps of a rod and of loads along it, and of loads that all belong to one node."""
-    rod = scene.rod
-    rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
-    values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
-    jumps = [value.jumps for value in values if isinstance(value, Steps)]
-    jumps += [load.part for load in scene.distributed if load.part is not None]
-    # Of such a load all is on one node, and what it does jumps there.
-    return jumps + [load.at[..., None] for load in loads_at_nodes(scene)]
 
 
 def segments_for_jumps(scene: Scene) -> tuple[Float[Numbers, "..."], Float[Numbers, "..."]] | None:

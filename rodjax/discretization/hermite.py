@@ -35,7 +35,7 @@ from rodjax.discretization.element_points import interleaved, of_elements, parts
 from rodjax.discretization.form import Form
 from rodjax.discretization.joints import Joints, tangent_bases, twist_derivatives, twist_gradient
 from rodjax.discretization.mixed_point import MixedPoint
-from rodjax.discretization.nodes import held_nodes, with_nodes_at, with_nodes_at_clips
+from rodjax.discretization.nodes import held_nodes, with_nodes_of
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.tangent_field import Blocks
 from rodjax.discretization.twist import angle_about, carried_in_bases, turns_of_bases
@@ -60,11 +60,8 @@ class QuadraticRotationElements(eqx.Module):
 
     @staticmethod
     def of(scene: Scene, s: Float[Array, "n+1"]) -> "QuadraticRotationElements":
-        """On these nodes, moved so that one lies at each clip and point force: the moment has a kink there."""
-        arclengths = [load.at for load in scene.point_forces]
-        if scene.clips:
-            return QuadraticRotationElements(*with_nodes_at_clips(scene, s, arclengths))
-        return QuadraticRotationElements(with_nodes_at(s, jnp.sort(jnp.stack(arclengths))) if arclengths else s)
+        """On these nodes, moved so that one lies at each clip, each point force and each jump of a load."""
+        return QuadraticRotationElements(*with_nodes_of(scene, s))
 
     @property
     def points(self) -> int:

@@ -1,41 +1,54 @@
 """Where the nodes of a mesh lie along the rod: moved so that there is one wherever the moment has a kink or a jump."""
 
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rodjax.model.scene import Scene
+from rodjax.model.along import Steps
+from rodjax.model.scene import Scene, loaded_parts, loads_at_nodes
 
 # Point forces nearer to one another, to a clip or to an end, in parts of an element, share it: shorter ones would cost
 # digits.
 LEAST_ELEMENT = 0.05
 
 
-def with_nodes_at(
-    s: Float[Array, "n+1"], arclengths: Float[Array, "k"], *, may_repeat: bool = False
-) -> Float[Array, "n+1"]:
+def varying(scene: Scene) -> list[Float[Array, "k"]]:
+    """The arclengths of the jumps of a rod and of loads along it, and of loads that all belong to one node."""
+    rod = scene.rod
+    rest = (*(rod.rest_curvature or ()), rod.rest_twist, rod.rest_strain)
+    values = (*rod.stiffnesses, *(rod.shear_pair or ()), rod.mass_per_length, *rest)
+    jumps = [value.jumps for value in values if isinstance(value, Steps)]
+    jumps += loaded_parts(scene)
+    # Of such a load all is on one node, and what it does jumps there.
+    return jumps + [load.at[..., None] for load in loads_at_nodes(scene)]
+
+
+def with_nodes_of(scene: Scene, s: Float[Array, "n+1"]) -> tuple[Float[Array, "n+1"], Int[Array, "clips"] | None]:
+    """The nodes moved so that one lies at each clip, each point force, where the moment has a kink, and each jump; the
+    numbers of those at the clips.
+    """
+    arclengths = [load.at for load in scene.point_forces] + [jump for jumps in varying(scene) for jump in jumps]
+    if scene.clips:
+        return with_nodes_at_clips(scene, s, arclengths)
+    return (with_nodes_at(s, jnp.sort(jnp.stack(arclengths))) if arclengths else s), None
+
+
+def with_nodes_at(s: Float[Array, "n+1"], arclengths: Float[Array, "k"]) -> Float[Array, "n+1"]:
     """The nodes moved, with all between them and the next one fixed, so that one lies at each of the sorted places.
 
-    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none. `may_repeat`: several of
-    them may be the same, so that there may be more of them than nodes.
+    Places nearer than `LEAST_ELEMENT` of an element to an end or to the last place get none.
     """
-    n, k = len(s) - 1, min(len(arclengths), len(s) - 2)
-    remaining: Iterable[Any] = range(k, 0, -1)
-    if may_repeat:
-        k = len(arclengths)
-        differ = jnp.concatenate([jnp.diff(arclengths) * n >= LEAST_ELEMENT, jnp.array([True])])
-        remaining = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
+    n = len(s) - 1
+    differ = jnp.concatenate([jnp.diff(arclengths) * n >= LEAST_ELEMENT, jnp.array([True])])
+    wanted = jnp.minimum(jnp.cumsum(differ[::-1])[::-1], n - 1)
     index = jnp.arange(n + 1)
     fixed, fixed_place = jnp.zeros((), index.dtype), jnp.zeros((), s.dtype)
-    for nodes_left, place in zip(remaining, arclengths[:k], strict=True):
+    for nodes_left, place in zip(wanted, arclengths, strict=True):
         nearest = jnp.clip(jnp.argmin(jnp.abs(s - place)), fixed + 1, n - nodes_left)
         moved = node_moved(s, index, (fixed, fixed_place), (nearest, place))
-        is_apart = (place - fixed_place) * n >= LEAST_ELEMENT
-        is_apart &= (1 - place) * n >= LEAST_ELEMENT
-        if may_repeat:
-            is_apart &= nearest > fixed
+        is_apart = ((place - fixed_place) * n >= LEAST_ELEMENT) & ((1 - place) * n >= LEAST_ELEMENT)
+        is_apart &= nearest > fixed
         s = jnp.where(is_apart, moved, s)
         fixed, fixed_place = jnp.where(is_apart, nearest, fixed), jnp.where(is_apart, place, fixed_place)
     return s

@@ -5,9 +5,9 @@ trapezoidal rule with the correction of its ends, of fourth order:
 
     h/2 (V_start + V_end) + h^2/12 (V'_start - V'_end),    V' = grad V . t + dV/ds
 
-So each node has a part of its own, a function of its position and tangent, and no node is coupled with another; between
-elements of one length the corrections cancel. Stretch and shear are left out of V', where they would be h^2 times their
-strains.
+A field along a part of the rod is that of the elements within. So each node has a part of its own, a function of its
+position and tangent, and no node is coupled with another; between elements of one length the corrections cancel.
+Stretch and shear are left out of V', where they would be h^2 times their strains.
 """
 
 from typing import NamedTuple
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.geometry.vectors import cross, dot
+from rodjax.model.loads import acting, densities
 from rodjax.model.scene import Scene
 
 
@@ -60,28 +61,24 @@ class PointForces(NamedTuple):
         return jumps - (1 - x) * (1 - 2 * x) * start + x * (1 - x) * (start + end) - x * (2 * x - 1) * end
 
 
-def _density(scene: Scene, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
-    return sum((potential(position, s) for potential in scene.potentials), jnp.zeros_like(s))
-
-
 def _beside(
     scene: Scene,
     position: Float[Array, "3"],
     tangent: Float[Array, "3"],
     s: Float[Array, ""],
-    weight: Float[Array, ""],
-    correction: Float[Array, ""],
+    weights: Float[Array, "fields"],
+    corrections: Float[Array, "fields"],
 ) -> Float[Array, ""]:
-    def density(position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
-        return _density(scene, position, s)
+    def of_fields(position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, "fields"]:
+        return densities(scene.potentials, position, s)
 
-    value, rate = jax.jvp(density, (position, s), (tangent, jnp.ones_like(s)))
-    return weight * value + correction * rate
+    values, rates = jax.jvp(of_fields, (position, s), (tangent, jnp.ones_like(s)))
+    return jnp.sum(weights * values + corrections * rates)
 
 
-def _weights(s: Float[Array, "n+1"]) -> tuple[Float[Array, "n+1"], Float[Array, "n+1"]]:
-    h = jnp.diff(s)
-    before, after = jnp.pad(h, (1, 0)), jnp.pad(h, (0, 1))
+def _weights(scene: Scene, s: Float[Array, "n+1"]) -> tuple[Float[Array, "n+1 fields"], Float[Array, "n+1 fields"]]:
+    h = jnp.diff(s)[:, None] * acting(scene.potentials, (s[1:] + s[:-1]) / 2)
+    before, after = jnp.pad(h, ((1, 0), (0, 0))), jnp.pad(h, ((0, 1), (0, 0)))
     return (before + after) / 2, (after**2 - before**2) / 12
 
 
@@ -89,7 +86,7 @@ def node_energies(
     scene: Scene, s: Float[Array, "n+1"], positions: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
 ) -> Float[Array, "n+1"]:
     """Of a nondimensional scene."""
-    weights = _weights(s)
+    weights = _weights(scene, s)
     return jax.vmap(lambda *node: _beside(scene, *node))(positions, tangents.T, s, *weights)
 
 
@@ -108,17 +105,18 @@ def at_nodes(
 ) -> NodeEnergy:
     """`axes`: about which the tangents turn, zero where they are held."""
 
-    def of_node(position, tangent, axes, s, weight, correction):
+    def of_node(position, tangent, axes, s, weights, corrections):
         def energy(change: Float[Array, "3+b"]) -> Float[Array, ""]:
             turn = axes @ change[3:]
             across = jnp.cross(turn, tangent)
             turned = tangent + across + jnp.cross(turn, across) / 2
-            return _beside(scene, position + change[:3], turned, s, weight, correction)
+            return _beside(scene, position + change[:3], turned, s, weights, corrections)
 
         nothing = jnp.zeros(3 + axes.shape[1], position.dtype)
         return *jax.value_and_grad(energy)(nothing), jax.hessian(energy)(nothing)
 
-    energy, first, second = jax.vmap(of_node)(positions, tangents.T, axes.transpose(2, 0, 1), s, *_weights(s))
+    nodes = positions, tangents.T, axes.transpose(2, 0, 1), s, *_weights(scene, s)
+    energy, first, second = jax.vmap(of_node)(*nodes)
     return NodeEnergy(
         energy,
         first[:, 3:].T,
@@ -150,19 +148,19 @@ def of_pulls(
 def on_elements(
     scene: Scene, s: Float[Array, "n+1"], positions: Float[Array, "n+1 3"], tangents: Float[Array, "3 n+1"]
 ) -> OnElements:
-    h = jnp.diff(s)
+    h, on_element = jnp.diff(s), acting(scene.potentials, (s[1:] + s[:-1]) / 2)
 
     def at_end(k: int, sign: int) -> tuple[Array, Array, Array]:
         nodes = slice(k, len(s) - 1 + k)
 
-        def of_node(position, tangent, s, h):
+        def of_node(position, tangent, s, h, acts):
             def energy(position, tangent):
-                return _beside(scene, position, tangent, s, h / 2, sign * h**2 / 12)
+                return _beside(scene, position, tangent, s, h / 2 * acts, sign * h**2 / 12 * acts)
 
-            density = jax.grad(lambda position: _density(scene, position, s))(position)
+            density = jax.grad(lambda position: jnp.sum(acts * densities(scene.potentials, position, s)))(position)
             return *jax.grad(energy, argnums=(0, 1))(position, tangent), -density
 
-        return jax.vmap(of_node)(positions[nodes], tangents.T[nodes], s[nodes], h)
+        return jax.vmap(of_node)(positions[nodes], tangents.T[nodes], s[nodes], h, on_element)
 
     ends = zip(at_end(0, 1), at_end(1, -1), strict=True)
     return OnElements(*(jnp.stack([start.T, end.T], axis=1) for start, end in ends))

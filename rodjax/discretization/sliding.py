@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.cells import varying
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of, form_on
-from rodjax.discretization.nodes import LEAST_ELEMENT
+from rodjax.discretization.nodes import LEAST_ELEMENT, varying
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding_point import SlidingChange, SlidingLinearization, SlidingPoint
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors

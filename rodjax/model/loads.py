@@ -1,14 +1,14 @@
 """Loads along the rod. Gravity is a vector of the scene; loads on a free end belong to `Free`."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, is_known, leaf, not_negative, number_array, shown, vector
 from rodjax.units import Units
@@ -137,37 +137,55 @@ def per_length(load: DistributedForce | DistributedCouple, s: Float[Array, "*k"]
     """The load at arclengths, which are none of those where its part ends."""
     value = load.couple if isinstance(load, DistributedCouple) else load.force
     value = jnp.broadcast_to(value.reshape(3, *[1] * s.ndim), (3, *s.shape))
-    if load.part is None:
-        return value
-    return jnp.where(((s > load.part[0]) & (s < load.part[1]))[None], value, 0.0)
+    return value if load.part is None else jnp.where(_is_within(load.part, s)[None], value, 0.0)
+
+
+def _is_within(part: Float[Array, "2"], s: Float[Array, "*k"]) -> Bool[Array, "*k"]:
+    return (s > part[0]) & (s < part[1])
 
 
 class Potential(eqx.Module):
-    """A field of forces all along the rod: buoyancy, an elastic bedding, a magnet.
+    """A field of forces along the rod: buoyancy, an elastic bedding, a magnet.
 
     `density`: from a position (3,) [m] and the arclength [m] to the energy per reference length () [J/m], in JAX; the
     force per length on the rod is minus its gradient by the position. It is differentiated three times, and must be
     smooth: the error of a field that has kinks is of lower order. Numbers in it are differentiable where it is a
     pytree, such as an `equinox.Module` with a `__call__` or a `jax.tree_util.Partial` of a function and its numbers; a
-    plain function is part of the program, compiled for it: make it once, not for each scene.
+    plain function is part of the program, compiled for it: make it once, not for each scene. `part`: as of a
+    `DistributedForce`.
 
     Raises `TypeError` or `ValueError` for a density that cannot be called so or gives no single real number.
     """
 
     density: Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, ""]]
+    part: Float[Array, "2"] | None
 
-    def __init__(self, density: Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, ""]]):
+    def __init__(self, density: Callable[[Float[Array, "3"], Float[Array, ""]], Float[Array, ""]], part: Any = None):
         if not callable(density):
             raise TypeError(f"density must be a function of a position (3,) and an arclength, got {shown(density)}")
         if any(callable(part) for part in jax.tree.leaves(density)):
             density = jax.tree_util.Partial(density)
         self.density = jax.tree.map(leaf, density)
+        self.part = _part(part)
 
     def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
         return self.density(position, s)
 
     def in_units(self, units: Units) -> "ScaledPotential":
         return ScaledPotential(self, units.origin, units.length, units.energy)
+
+
+def densities(
+    potentials: Sequence[Potential], position: Float[Array, "3"], s: Float[Array, ""]
+) -> Float[Array, "fields"]:
+    return jnp.stack([potential(position, s) for potential in potentials])
+
+
+def acting(potentials: Sequence[Potential], s: Float[Array, "*k"]) -> Float[Array, "*k fields"]:
+    """1 where a field acts, 0 elsewhere: at arclengths that are none of those where a part ends."""
+    parts = [potential.part for potential in potentials]
+    acts = [jnp.ones_like(s) if part is None else _is_within(part, s).astype(s.dtype) for part in parts]
+    return jnp.stack(acts, axis=-1)
 
 
 class ScaledPotential(Potential):
@@ -181,6 +199,7 @@ class ScaledPotential(Potential):
         self, potential: Potential, origin: Float[Array, "3"], length: Float[Array, ""], energy: Float[Array, ""]
     ):
         self.density, self.origin, self.length, self.energy = potential.density, origin, length, energy
+        self.part = None if potential.part is None else potential.part / length
 
     def __call__(self, position: Float[Array, "3"], s: Float[Array, ""]) -> Float[Array, ""]:
         return self.density(self.origin + self.length * position, self.length * s) * (self.length / self.energy)

@@ -63,7 +63,7 @@ class Scene(eqx.Module):
         that came through an obstacle since its guess or the last step of its path, or whose centerline lies within one,
         is not converged. Where no obstacle touches the rod they only cost time: to see how far it is from what it stays
         away from, `rodjax.clearance` needs none in the scene. Double precision only.
-    - `potentials`: `Potential`s, fields of forces all along the rod. Elements only, and not in the continuum.
+    - `potentials`: `Potential`s, fields of forces all along the rod, or along a part of it. Elements only.
     - `point_couples`: `PointCouple`s along the rod.
     - `self_contact`: whether the rod, which has a radius, touches itself without friction, where each element is
         nearest to the rod beyond it: at places that follow the shape, at most 48 at a time. Parts that wind around one
@@ -206,11 +206,12 @@ def _check_numbers(scene: Scene) -> None:
             raise ValueError(
                 f"{name} must lie inside 0 to {length:g} m, got {float(load.at):g} m; rodjax.Free takes loads on an end"
             )
-    for k, load in enumerate(scene.distributed):
-        if load.part is not None and float(load.part[1]) > length * (1 + ONE_PLACE):
-            raise ValueError(
-                f"distributed[{k}].part must lie in 0 to {length:g} m, got {np.asarray(load.part).tolist()}"
-            )
+    for name, loads in (("distributed", scene.distributed), ("potentials", scene.potentials)):
+        for k, load in enumerate(loads):
+            if load.part is not None and float(load.part[1]) > length * (1 + ONE_PLACE):
+                raise ValueError(
+                    f"{name}[{k}].part must lie in 0 to {length:g} m, got {np.asarray(load.part).tolist()}"
+                )
     start, end = scene.start, scene.end
     if isinstance(start, Held) and isinstance(end, Held):
         with np.errstate(over="ignore"):
@@ -421,6 +422,11 @@ def with_pins(scene: Scene) -> Scene:
 def dead_forces(scene: Scene) -> list[PointForce]:
     """The point forces that do not follow the rod."""
     return [load for load in scene.point_forces if not load.follower]
+
+
+def loaded_parts(scene: Scene) -> list[Float[Array, "2"]]:
+    """The arclengths between which loads along parts of the rod act."""
+    return [load.part for load in (*scene.distributed, *scene.potentials) if load.part is not None]
 
 
 def loads_at_nodes(scene: Scene) -> list[PointForce | PointCouple]:

@@ -18,7 +18,7 @@ from rodjax.discretization.cells import segments_for_jumps
 from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
-from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene, loads_at_nodes
+from rodjax.model.scene import MAX_SPAN, ONE_PLACE, Scene, loaded_parts, loads_at_nodes
 from rodjax.model.supports import Clamp, Clip, Held
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.status import Status
@@ -133,7 +133,7 @@ def _is_wrong(scenes: Scene) -> Bool[Numbers, "..."]:
     arclengths = [xp.zeros_like(length), *(clip.at for clip in clips), length]
     good += [before < after for before, after in itertools.pairwise(arclengths)]
     good += [(force.at >= 0) & (force.at <= length) for force in scenes.point_forces]
-    for part in (load.part for load in scenes.distributed if load.part is not None):
+    for part in loaded_parts(scenes):
         good += [part[..., 0] >= 0, part[..., 0] < part[..., 1], part[..., 1] <= length * (1 + ARCLENGTH_TOLERANCE)]
     good += [(load.at > 0) & (load.at < length) for load in loads_at_nodes(scenes)]
     frames = [end.frame for end in (scenes.start, scenes.end) if isinstance(end, Clamp)]

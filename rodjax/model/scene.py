@@ -225,14 +225,22 @@ def _check_numbers(scene: Scene) -> None:
     _check_turning(scene, length)
 
 
+def is_kept_from_turning(scene: Scene) -> bool:
+    """Whether supports, clips or loads keep the rod from turning about a place, wherever they are."""
+    ends = scene.start, scene.end
+    loads = scene.point_forces, scene.distributed, scene.obstacles, scene.potentials, scene.point_couples
+    return (
+        any(isinstance(end, Clamp | Swivel | Movable) for end in ends)
+        or any(clip.direction is not None for clip in scene.clips)
+        or scene.gravity is not None
+        or any(loads)
+        or any(isinstance(end, Free) and end.force is not None for end in ends)
+    )
+
+
 def _check_turning(scene: Scene, length: float) -> None:
     """Refuses a rod that is held at one place alone, about which nothing keeps it from turning."""
-    if any(isinstance(end, Clamp | Swivel | Movable) for end in (scene.start, scene.end)):
-        return
-    loaded = scene.gravity is not None or bool(scene.point_forces or scene.distributed or scene.obstacles)
-    loaded |= bool(scene.potentials or scene.point_couples)
-    loaded |= any(isinstance(end, Free) and end.force is not None for end in (scene.start, scene.end))
-    if loaded or any(clip.direction is not None for clip in scene.clips):
+    if is_kept_from_turning(scene):
         return
     held = [
         np.asarray(held.position) for held in (scene.start, *scene.clips, scene.end) if isinstance(held, Pin | Clip)

@@ -15,8 +15,7 @@ import numpy as np
 from rodjax.checks import instance, whole_number
 from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import Scene, has_potential
-from rodjax.model.supports import Directed
+from rodjax.model.scene import Scene, has_potential, is_kept_from_turning
 from rodjax.paths.harness_path import unstacked
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import compiled_only
@@ -142,8 +141,8 @@ class Session:
         )
         rods = rods_of(scene).values()
         self.length = max(float(rod.rod.length) for rod in rods)
-        # What of a scene depends on how its ends are turned is known where something holds their directions.
-        self._is_steady = all(isinstance(rod.start, Directed) or isinstance(rod.end, Directed) for rod in rods)
+        # Else whether a scene makes sense depends on where it holds its rods.
+        self._is_steady = all(map(is_kept_from_turning, rods))
 
     @property
     def result(self) -> Any:

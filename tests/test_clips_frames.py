@@ -587,7 +587,6 @@ def test_frames_of_clips_in_a_scene_file(tmp_path):
         ("d2 = [0, 1, 0]\n", "", r"clips\[1\].d2 or clips\[1\].frame is needed for clips\[1\].spin"),
         ("d2 = [0, 0, 3]", "d2 = [1, 0, 0]", r"clips\[0\].d2 must not be parallel"),
         ("tangent = [2, 0, 0]\n", "", r"clips\[0\].tangent or clips\[0\].frame is needed where"),
-        ("d2 = [0, 0, 3]", "d2 = [0, 0, 3]\nsliding = true", r"clips\[0\]: sliding must be False where frame is given"),
     ):
         path.write_text(SCENE_FILE.replace(old, new))
         with pytest.raises(rj.SceneFileError, match=message):
@@ -626,7 +625,6 @@ def test_a_scene_half_way_turns_the_frames_of_clips():
     ("arguments", "message"),
     [
         ({"tangent": (1, 0, 0), "frame": LEVEL}, "tangent must be None where frame is given"),
-        ({"sliding": True, "frame": LEVEL}, "sliding must be False where frame is given"),
         ({"frame": np.zeros((3, 3))}, "frame must be"),
         ({"frame": (1, 0, 0)}, r"frame must be numbers of shape \(3, 3\)"),
     ],

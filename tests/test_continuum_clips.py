@@ -174,6 +174,43 @@ def test_clips_by_frames():
 
 
 @pytest.mark.slow
+def test_a_rod_that_slides_while_its_twist_is_held():
+    """Wound up by an end: nothing pulls along it in the clip; its derivative by the place of the clip."""
+    held = frame((1.0, 0.2, 0.1))
+    end = Clamp((0.8, 0.1, 0.1), frame((1.0, 0.0, 0.3), (1.0, 1.0, 0.0)))
+
+    def scene(x) -> Scene:
+        clip = Clip(0.4, jnp.stack([x, jnp.array(0.05), jnp.array(0.12)]), frame=held, sliding=True)
+        rod = Rod(1.0, (1.0, 2.0), 0.7, 1e4, mass_per_length=1.0)
+        return Scene(rod, Clamp(ORIGIN, LEVEL), end, (0, 0, -9.0), clips=[clip])
+
+    x = jnp.array(0.33)
+    coarse, fine = (rj.solve(scene(x), segments=segments, solver=TIGHT, strain_limit=None) for segments in (16, 32))
+    truth = rj.solve_continuum(scene(x), fine)
+    assert truth.converged
+    for name in (*FIELDS, "total_twist"):
+        exact = getattr(truth, name)
+        errors = [float(np.max(np.abs(getattr(result, name) - exact))) for result in (coarse, fine)]
+        # Of fourth order, and of the next.
+        assert errors[1] < errors[0] / 8, name
+    np.testing.assert_allclose(coarse.scene.clips[0].at, truth.scene.clips[0].at, rtol=0, atol=1e-4)
+    for result in (fine, truth):
+        node = int(np.argmin(np.abs(result.s - result.scene.clips[0].at)))
+        np.testing.assert_allclose(result.frames[node], held, rtol=0, atol=RESIDUAL)
+        # Of forces of 100.
+        assert abs(float(result.clip_forces[0] @ held[:, 2])) < 1e-9
+        # The two spans are wound up by different torques.
+        assert float(np.ptp(result.twist)) > 0.5
+
+    def pull(x):
+        return rj.solve(scene(x), segments=16, solver=TIGHT, guess=coarse, strain_limit=None).end_force[2]
+
+    difference = float(pull(x + 1e-4) - pull(x - 1e-4)) / 2e-4
+    # Of second order in 3e-4 of the place.
+    assert float(jax.grad(pull)(x)) == pytest.approx(difference, rel=1e-5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "end", "tangent"),
     [

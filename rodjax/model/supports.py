@@ -124,7 +124,7 @@ class Clip(eqx.Module):
     A rod in a clip that holds its twist is solved by frames along it, as one whose section is not round is: by elements
     of a `Newton`.
 
-    Raises `ValueError` where both `tangent` and `frame` are given, and for a `frame` in a sliding clip.
+    Raises `ValueError` where both `tangent` and `frame` are given.
     """
 
     at: Float[Array, ""]
@@ -137,10 +137,6 @@ class Clip(eqx.Module):
         instance(sliding, "sliding", bool)
         if tangent is not None and frame is not None:
             raise ValueError("tangent must be None where frame is given, which has it as its third column")
-        if sliding and frame is not None:
-            raise ValueError(
-                "sliding must be False where frame is given: a rod that slides while its twist is held is not supported"
-            )
         self.sliding = sliding
         self.at = leaf(positive(at, "at"))
         self.position = leaf(vector(position, "position"))

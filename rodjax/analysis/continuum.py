@@ -155,9 +155,12 @@ def solve_continuum(
 
 
 def _near(scene: Scene, guess: Equilibrium | None) -> Equilibrium:
-    """A guess with the turns and clips that the scene states, and with frames where the scene needs them."""
+    """A guess with the turns and clips that the scene states, with frames where the scene needs them, and on elements,
+    which tell the forces at nodes, where fields act.
+    """
     has_frames = guess is not None and isinstance(guess.state.shape, FramedCurve)
-    if guess is not None and scene.turns is None and (has_frames or not needs_frames(scene)):
+    tells_forces = guess is not None and not (scene.potentials and guess.discretization == "finite_difference")
+    if guess is not None and tells_forces and scene.turns is None and (has_frames or not needs_frames(scene)):
         kinds = ([clip.sliding for clip in of.clips] for of in (scene, guess.scene))
         if operator.eq(*kinds):
             return guess

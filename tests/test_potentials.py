@@ -176,6 +176,26 @@ def test_the_continuum_is_what_meshes_in_fields_converge_to():
     np.testing.assert_allclose(again.nodes, meshes[1].nodes, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_derivatives_of_the_continuum_by_a_field_and_its_part():
+    def scene(stiffness, end) -> Scene:
+        part = jnp.stack([jnp.asarray(0.31), end])
+        return Scene(rod(), START, FAR, (0, 0, -9.0), potentials=[Potential(Bedding(stiffness, 1.0), part)])
+
+    stiffness, end = jnp.asarray(400.0), jnp.asarray(0.72)
+    begin = rj.solve(scene(stiffness, end), segments=16)
+
+    def seen(stiffness, end):
+        return rj.solve_continuum(scene(stiffness, end), begin).end_force[2]
+
+    by_stiffness, by_end = jax.grad(seen, argnums=(0, 1))(stiffness, end)
+    # Of second order in 2.5e-4 of the stiffness and 1e-4 of the length.
+    difference = (seen(stiffness + 0.1, end) - seen(stiffness - 0.1, end)) / 0.2
+    assert float(by_stiffness) == pytest.approx(float(difference), rel=1e-5)
+    difference = (seen(stiffness, end + 1e-4) - seen(stiffness, end - 1e-4)) / 2e-4
+    assert float(by_end) == pytest.approx(float(difference), rel=1e-5)
+
+
 @pytest.mark.parametrize("EI", [1.0, (1.0, 2.0)])
 def test_derivatives_by_the_numbers_of_a_field(EI):
     def seen(stiffness):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rodjax import Clamp, Clip, Free, Guess, Pin, PointForce, Rod, Scene, Swivel, frame, problems
-from rodjax.model.scene import between, nondimensional
+from rodjax import Clamp, Clip, Free, Guess, Joint, Pin, PointForce, Rod, Scene, Swivel, frame, problems
+from rodjax.model.scene import between, is_kept_from_turning, nondimensional
 
 ROD = Rod(2.0, EI=3.0, GJ=2.0, EA=500.0, mass_per_length=0.5)
 LEVEL = frame((1, 0, 0))
@@ -249,3 +249,23 @@ def test_a_frame_half_way_is_turned_by_half(axis, angle):
 def test_a_direction_may_have_any_length(size):
     swivel = Swivel((0, 0, 0), (3 * size, 0, 4 * size))
     np.testing.assert_allclose(swivel.tangent, [0.6, 0, 0.8], rtol=1e-15)
+
+
+APART = Pin((1.5, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "more", "expected"),
+    [
+        (Joint("a", LEVEL), Joint("b", LEVEL), {}, True),
+        (SWIVEL, Free(), {}, True),
+        (PIN, APART, {}, False),
+        (PIN, APART, {"gravity": (0, 0, -9.81)}, True),
+        (PIN, Free(force=(0, 0, 1.0)), {}, True),
+        (PIN, APART, {"clips": [Clip(1.0, (0.8, 0, 0.1))]}, False),
+        (PIN, APART, {"clips": [Clip(1.0, (0.8, 0, 0.1), (1, 0, 0))]}, True),
+    ],
+)
+def test_what_keeps_a_rod_from_turning_wherever_it_is_held(start, end, more, expected):
+    """A window makes such a scene anew before a move of its ends only where that may be refused."""
+    assert is_kept_from_turning(Scene(ROD, start, end, **more)) == expected

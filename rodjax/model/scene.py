@@ -226,7 +226,7 @@ def _check_numbers(scene: Scene) -> None:
 
 
 def is_kept_from_turning(scene: Scene) -> bool:
-    """Whether supports, clips or loads keep the rod from turning about a place, wherever they are."""
+    """Whether supports, clips or loads keep the rod from turning freely about a place, wherever supports are."""
     ends = scene.start, scene.end
     loads = scene.point_forces, scene.distributed, scene.obstacles, scene.potentials, scene.point_couples
     return (

@@ -141,7 +141,7 @@ class Session:
         )
         rods = rods_of(scene).values()
         self.length = max(float(rod.rod.length) for rod in rods)
-        # Else whether a scene makes sense depends on where it holds its rods.
+        # Else a scene may be refused for where its supports are, and is made anew before each move to see that.
         self._is_steady = all(map(is_kept_from_turning, rods))
 
     @property

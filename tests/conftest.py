@@ -39,6 +39,7 @@ if sys.platform == "linux":
 # A test process holds millions of objects that stay, which each full collection would look through again.
 gc.set_threshold(100_000, 50, 100)
 jax.config.update("jax_enable_x64", True)
+jax.devices()  # XLA reads its flags now, before a test that is the first one sets others
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 cache = rodjax.enable_compilation_cache()

@@ -1296,10 +1296,10 @@ def unwritable_places(example, world):
 # --- all of them -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("examples", [SHORT, pytest.param(LONG, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_bad_input_is_refused(name, examples, world, record_property):
+def test_bad_input_is_refused(name, world, record_property, pytestconfig):
     strategy, check = PROPERTIES[name]
+    examples = LONG if pytestconfig.getoption("--slow") else SHORT
     examples, tried = min(examples, DEAR.get(name, examples)), 0
 
     quiet: dict[str, Any] = dict(database=None, deadline=None, suppress_health_check=list(HealthCheck))

@@ -177,7 +177,7 @@ def between_clamps(x: jax.Array) -> Scene:
 
 @pytest.mark.optimized
 @pytest.mark.slow
-@pytest.mark.parametrize("discretization", ["finite_difference", "hermite"])
+@pytest.mark.parametrize("discretization", [pytest.param("finite_difference", marks=pytest.mark.exhaustive), "hermite"])
 def test_the_value_beside_a_derivative_is_the_plain_one_bit_by_bit(discretization):
     def loss(x):
         result = rj.solve(between_clamps(x), segments=SEGMENTS, discretization=discretization)

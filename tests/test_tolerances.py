@@ -158,10 +158,10 @@ def held_by_clips() -> tuple[rj.Equilibrium, list[Tolerance], Limits, list]:
 @pytest.mark.slow
 def test_a_cable_in_clips_beside_a_monte_carlo():
     result, given, limits, obstacles = held_by_clips()
-    envelope = rj.tolerances(result, given, limits=limits, obstacles=obstacles, samples=10_000)
+    envelope = rj.tolerances(result, given, limits=limits, obstacles=obstacles, samples=5_000)
     first, sampled = envelope.first_order, envelope.sampled
     assert sampled is not None
-    assert envelope.samples == 10_000
+    assert envelope.samples == 5_000
     assert envelope.flags == {}
     assert rj.tolerances(result, given, limits=limits, obstacles=obstacles).flags == {}
     # The moment of a clip that holds no direction is none.
@@ -173,7 +173,7 @@ def test_a_cable_in_clips_beside_a_monte_carlo():
     np.testing.assert_allclose(sampled.position, first.position, atol=0.05 * largest)
     for end in ("start_force", "end_force"):
         np.testing.assert_allclose(getattr(sampled, end), getattr(first, end), rtol=0.05)
-    # Four standard errors of 10000 samples, 0.02, beside what second order shifts the mean by.
+    # Four standard errors of 5000 samples, 0.028, beside what second order shifts the mean by.
     np.testing.assert_allclose(sampled.probability, first.probability, atol=0.03)
     np.testing.assert_allclose(sampled.any_broken, first.any_broken, atol=0.03)
     assert max(first.probability) <= first.any_broken <= envelope.any_bound

@@ -78,6 +78,11 @@ def test_a_report_has_what_a_route_found_of_each_cable(shortest):
     assert last.gradients is not None
     assert first.gradients.margins == last.gradients.margins == ("bend radius",)
     np.testing.assert_array_equal(last.gradients.derivatives[0], shortest.gradients["last: bend radius"])
+    # Once for both, above them, in text and page.
+    for told, first in ((str(report), "--- first"), (report.html(), "<h2>first</h2>")):
+        for once in ("It is optimal to first order", "upper bound"):
+            assert told.count(once) == 1, once
+            assert told.index(once) < told.index(first)
 
 
 FILE = """

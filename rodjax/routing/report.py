@@ -43,6 +43,7 @@ class Report:
     - `cables`: for each its name, equilibrium, margins, facts, what supports apply to it, and gradients
     - `obstacles`, and their `names`
     - `source`: what it was made of, such as the name of a file; `date`: the day on which it was made
+    - `design`: what the route of a harness found; that of one cable is told with its gradients
     """
 
     title: str
@@ -51,6 +52,7 @@ class Report:
     names: tuple[str, ...]
     source: str | None = None
     date: str = dataclasses.field(default_factory=lambda: datetime.date.today().isoformat())
+    design: Gradients | None = None
 
     @cached_property
     def verdict(self) -> str:
@@ -189,16 +191,22 @@ def report(
             instance(text, name, str)
     note("checking limits, supports and stability")
 
-    def of_cable(name: str, gradients: Gradients | Route | None) -> Gradients | None:
-        if not isinstance(gradients, Route):
-            return gradients
-        return Gradients.of(gradients, name if isinstance(gradients.scene, Harness) else None)
+    is_of_harness = isinstance(gradients, Route) and isinstance(gradients.scene, Harness)
+
+    def of_cable(name: str, one: Gradients | Route | None) -> Gradients | None:
+        if not isinstance(one, Route):
+            return one
+        if not isinstance(one.scene, Harness):
+            return Gradients.of(one)
+        of_one = Gradients.of(one, name)
+        return of_one._replace(remark="", ranges=None) if is_of_harness else of_one
 
     found = tuple(
         cable(name, one, limit, obstacles, names, of_cable(name, gradient))
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
     )
-    return Report("Route" if title is None else title, found, obstacles, names, source)
+    design = Gradients.of(gradients) if is_of_harness else None  # pyright: ignore[reportArgumentType]
+    return Report("Route" if title is None else title, found, obstacles, names, source, design=design)
 
 
 def _cables(equilibrium: Any) -> dict[str, Equilibrium]:

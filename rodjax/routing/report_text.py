@@ -106,6 +106,8 @@ def _of(cable: Cable, k: int, has_name: bool) -> tuple[str, str]:
 
 def text(report: "Report") -> str:
     parts = [report.title, f"{report.verdict}\n{made(report)}"]
+    if report.design is not None:
+        parts.append("\n".join(_design(report.design)))
     for cable in report.cables:
         heading = [f"--- {cable.name}: {_kept(cable)}"] if len(report.cables) > 1 else []
         parts.append("\n".join([*heading, cable.outcome]))
@@ -203,9 +205,15 @@ def gradients(cable: Cable) -> str:
     if cable.gradients is None:
         return ""
     found = cable.gradients
-    bounds = [table(rows, "<>>><") + "\n"] if (rows := ranges(found)) else []
     parts = [table(rows, "<" + ">" * (len(rows[0]) - 1)) for rows in derivatives(found)]
-    return "\n".join([*([found.remark] if found.remark else []), *bounds, CHANGES, *parts])
+    between = [] if found.ranges is None else [""]
+    return "\n".join([*_design(found), *between, CHANGES, *parts])
+
+
+def _design(gradients: Gradients) -> list[str]:
+    """Whether it is an optimum, and a table of `ranges`; nothing of what is not of a route."""
+    bounds = [table(rows, "<>>><")] if (rows := ranges(gradients)) else []
+    return [*([gradients.remark] if gradients.remark else []), *bounds]
 
 
 def ranges(gradients: Gradients) -> list[tuple[str, ...]]:

@@ -165,6 +165,8 @@ def _panel(report: Any) -> str:
     kind = {None: "", True: ' class="kept"', False: ' class="broken"'}[report.kept]
     parts = [f"<h1>{escape(report.title)}</h1>", f'<p id="verdict"{kind}>{escape(report.verdict)}</p>']
     parts.append(f'<p class="soft">{escape(report_text.made(report))}</p>')
+    if report.design is not None:
+        parts.append("<h2>design</h2>" + _found(report.design))
     for k, cable in enumerate(report.cables):
         if len(report.cables) > 1:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
@@ -245,11 +247,15 @@ def _supports(cable: Cable) -> str:
 
 def _gradients(gradients: Gradients) -> str:
     """What a route found, and by how much each design variable changes each margin."""
-    parts = ["<h2>design</h2>", f'<p class="soft">{escape(gradients.remark)}</p>' if gradients.remark else ""]
+    told = f"<p>{escape(report_text.CHANGES)}</p>"
+    return "".join(["<h2>design</h2>", _found(gradients), told, *map(_design, report_text.derivatives(gradients))])
+
+
+def _found(gradients: Gradients) -> str:
+    """Whether it is an optimum, and between which bounds the design lies."""
     bounds = report_text.ranges(gradients)
-    parts += [_design(bounds)] if bounds else []
-    parts += [f"<p>{escape(report_text.CHANGES)}</p>", *map(_design, report_text.derivatives(gradients))]
-    return "".join(parts)
+    remark = f'<p class="soft">{escape(gradients.remark)}</p>' if gradients.remark else ""
+    return remark + (_design(bounds) if bounds else "")
 
 
 def _design(rows: Sequence[Sequence[str]]) -> str:

@@ -181,10 +181,12 @@ def test_sensitivities_of_a_harness_are_its_derivatives(lying):
 
 
 def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
-    """Of rods with positions of nodes, whose ends move with a body, under the new forces of the step."""
-    slopes, known = [], assembly._slopes
+    """Of rods with positions of nodes, whose ends move with a body, under the new forces of the step. A slope that is
+    another one is no number here, with which no step is taken.
+    """
+    known = assembly._slopes
 
-    def noted(whole, all_here, steps, gradient):
+    def checked(whole, all_here, steps, gradient):
         def energy(part):
             found = jnp.zeros_like(part)
             for group, here, step, of_ends in zip(whole.groups, all_here, steps.rods, steps.ends, strict=True):
@@ -193,15 +195,13 @@ def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
             return found
 
         slope, rate = known(whole, all_here, steps, gradient)
-        # The body has no weight and no spring, so that all energy is that of the rods.
-        jax.debug.callback(lambda *found: slopes.append(found), slope, jax.grad(energy)(jnp.zeros_like(slope)))
-        return slope, rate
+        # The body has no weight and no spring, so that all energy is that of the rods; the same terms summed in
+        # another order, of a slope of 20 at first.
+        expected = jax.grad(energy)(jnp.zeros_like(slope))
+        is_same = jnp.abs(slope - expected) <= 1e-9 * jnp.abs(expected) + 2e-11
+        return jnp.where(is_same, slope, jnp.nan), rate
 
-    monkeypatch.setattr(assembly, "_slopes", noted)
-    with rodjax.numpy_first(False):
-        assert rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=5, solver=TIGHT).converged
-        jax.effects_barrier()
-    assert len(slopes) > 3
-    slope, rate = np.array(slopes).T
-    # The same terms summed in another order.
-    np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-12 * np.max(np.abs(rate)))
+    monkeypatch.setattr(assembly, "_slopes", checked)
+    result = rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=5, solver=TIGHT)
+    assert result.converged
+    assert result.iterations > 3

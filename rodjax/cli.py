@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 Result = TypeVar("Result", Equilibrium, rodjax.HarnessEquilibrium)
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+# The exit code where nobody reads what is printed, as after `| head`: that of other commands, which a signal ends.
+NOBODY_READS = 128 + 13
 
 
 class CommandError(ValueError):
@@ -73,6 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except (CommandError, ClusterError, SceneFileError, SweepError) as error:
         message = str(error)
+    except BrokenPipeError:  # of stdout, as nothing else that a command writes to is a pipe
+        _drop_what_cannot_be_printed()
+        return NOBODY_READS
     except OSError as error:
         message = f"{error.strerror or error}: {error.filename}" if error.filename else str(error)
         _drop_what_cannot_be_printed()
@@ -81,7 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _drop_what_cannot_be_printed() -> None:
-    """Where stdout goes to a full disk Python would try again as it ends, and fail with lines and a code of its own."""
+    """Where stdout goes to a full disk, or nobody reads it, Python would try again as it ends, and fail with lines and
+    a code of its own.
+    """
     try:
         sys.stdout.flush()
     except OSError:

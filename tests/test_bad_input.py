@@ -1339,7 +1339,7 @@ def test_a_full_disk_leaves_the_old_picture(world, monkeypatch):
     assert Path("a.png").read_bytes() == b"old"
 
 
-PRINT_TO_A_FULL_DISK = """
+PRINT_IN_VAIN = """
 import sys
 import rodjax.cli
 rodjax.cli._solve = lambda arguments: print("result") or 0
@@ -1350,6 +1350,17 @@ sys.exit(rodjax.cli.main(["solve", "scene.toml"]))
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_for_what_is_printed_is_one_line():
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-c", PRINT_TO_A_FULL_DISK]
+        command = [sys.executable, "-c", PRINT_IN_VAIN]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (2, "rodjax: [Errno 28] No space left on device\n")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="where nobody reads is another error")
+def test_where_nobody_reads_on_there_is_no_message():
+    """As after `| head`."""
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-c", PRINT_IN_VAIN]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -10,6 +10,8 @@ from rodjax import Clamp, Pin, Scene, frame, problems
 from rodjax.discretization.first_shape import first_shape
 from rodjax.geometry.interpolation import cubic, resampled
 from rodjax.model.scene import nondimensional
+from rodjax.solving import equilibrium
+from rodjax.solving.guess import hanging_guess
 
 
 def shape(scene: Scene, segments: int = 200) -> np.ndarray:
@@ -64,3 +66,57 @@ def test_cubic_interpolation_is_exact_for_cubics():
     points, slopes = jnp.stack([x**3, x, x**2], axis=1), jnp.stack([3 * x**2, 1 + 0 * x, 2 * x], axis=1)
     at = jnp.array([0.0, 0.3, 1.7, 3.0])
     np.testing.assert_allclose(cubic(x, points, slopes, at), jnp.stack([at**3, at, at**2], axis=1), atol=1e-14)
+
+
+BETWEEN = (rj.Swivel((0, 0, 0), (0.983, 0, 0.182)), rj.Swivel((0.494, 0, 0), (0.84, 0, 0.542)))
+PIPE_AND_BOX = [
+    rj.Capsule((0.089, -0.958, -0.333), (0.661, 0.958, -0.333), 0.035),
+    rj.Box((0.304, 0, -0.241), (0.193, 2, 0.193)),
+]
+
+
+def test_a_start_that_leads_nowhere_beside_obstacles_is_followed_by_an_arc(monkeypatch):
+    """The shape without obstacles has box and pipe on its way, between which there is no room."""
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6, mass_per_length=8.4, radius=0.005)
+    scene = rj.Scene(rod, *BETWEEN, (0, 0, -1.0), obstacles=PIPE_AND_BOX)
+    result = rj.solve(scene, segments=24)
+    assert result.converged
+    arc = hanging_guess(scene)
+    assert arc is not None
+    from_arc = rj.solve(scene, segments=24, guess=arc)
+    np.testing.assert_array_equal(result.nodes, from_arc.nodes)
+    with monkeypatch.context() as without:
+        without.setattr(equilibrium, "hanging_guess", lambda scene: None)
+        with pytest.warns(rj.NotConvergedWarning):
+            first = rj.solve(scene, segments=24)
+    # The work of both searches is told.
+    assert result.iterations == first.iterations + from_arc.iterations
+
+
+def test_an_arc_hangs_between_the_supports_as_long_as_the_rod():
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6, mass_per_length=1.0)
+    scene = rj.Scene(rod, *BETWEEN, (0, 0, -1.0))
+    arc = hanging_guess(scene)
+    assert arc is not None
+    points = np.asarray(arc.points)
+    np.testing.assert_allclose(points[[0, -1]], [(0, 0, 0), (0.494, 0, 0)], atol=2e-3)
+    assert np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)) == pytest.approx(1.0, abs=2e-3)  # as above
+    assert np.all(points[1:-1, 2] < 0)
+    assert np.all(points[:, 1] == 0)
+
+
+def test_where_nothing_hangs_an_arc_turns_with_the_scene():
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6)
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    turned = [rj.Swivel(turn @ end.position, turn @ end.tangent) for end in BETWEEN]
+    arc, other = hanging_guess(rj.Scene(rod, *BETWEEN)), hanging_guess(rj.Scene(rod, *turned))
+    assert arc is not None
+    assert other is not None
+    np.testing.assert_allclose(other.points, arc.points @ turn.T, atol=1e-12)
+
+
+def test_there_is_no_arc_through_clips_or_to_a_free_end():
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6)
+    start, end = BETWEEN
+    assert hanging_guess(rj.Scene(rod, start, rj.Free())) is None
+    assert hanging_guess(rj.Scene(rod, start, end, clips=[rj.Clip(0.5, (0.2, 0.1, 0))])) is None

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from rodjax.model.loads import DistributedForce
 from rodjax.model.scene import Scene, dead_forces, scene_axes
-from rodjax.model.supports import Directed, Free, Held, Support, Swivel
+from rodjax.model.supports import Directed, Free, Held, Pin, Support, Swivel
 
 
 def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
@@ -30,6 +30,15 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
         along = start.tangent if isinstance(start, Directed) else _pull(scene)
         return start.position[None] + _helix(along, end, u)
     return _bent_arc(start, end, scene.gravity, scene_axes(scene), u)
+
+
+def hanging_arc(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
+    """The arc between two held ends that sags as gravity alone has it, in a nondimensional scene."""
+    u = jnp.linspace(0.0, 1.0, segments + 1, dtype=scene.rod.length.dtype)[:, None]
+    assert isinstance(scene.start, Held)
+    assert isinstance(scene.end, Held)
+    start, end = Pin(scene.start.position), Pin(scene.end.position)
+    return _arc(start, end, scene.gravity, scene_axes(scene), u)[0]
 
 
 def _through_clips(scene: Scene, s: Float[Array, "k 1"]) -> Float[Array, "k 3"]:

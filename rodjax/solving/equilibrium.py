@@ -53,7 +53,7 @@ from rodjax.model.scene import (
 from rodjax.model.supports import Clamp
 from rodjax.notes import note
 from rodjax.programs.compilation import compiled
-from rodjax.solving.guess import Guess, beside_obstacles
+from rodjax.solving.guess import Guess, beside_obstacles, hanging_guess
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
@@ -162,11 +162,35 @@ def solve_scene(
     note(f"solving on {options.segments} segments")
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if is_known(result.status):
+        if guess is None and fixed_scene.obstacles and not result.converged:
+            result = _from_an_arc(result, fixed_scene, options, strain_limit)
         result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
     if fixed_scene is not scene:
         result = with_ranges(fixed_scene, result)
     warn_of_outcome(result, strain_limit)
     return result if fixed_scene is scene else differentiable(scene, result)
+
+
+def _from_an_arc(
+    result: Equilibrium, scene: Scene, options: Options, strain_limit: Float[Array, ""] | float
+) -> Equilibrium:
+    """Found from an arc that hangs between the supports, where the search from the scene's own shape found nothing
+    beside its obstacles; else the result as it is.
+    """
+    arc = None if options.planar or options.find != "minimum" else hanging_guess(scene)
+    if arc is None:
+        return result
+    note("solving again, from an arc that hangs between the supports")
+    other = _solve(scene, *first_state(scene, arc, options), strain_limit, options)
+    return _with_effort_of(other, result) if other.converged else result
+
+
+def _with_effort_of(last: Equilibrium, before: Equilibrium) -> Equilibrium:
+    return eqx.tree_at(
+        lambda result: (result.iterations, result.evaluations),
+        last,
+        (_sum(last.iterations, before.iterations), _sum(last.evaluations, before.evaluations)),
+    )
 
 
 def _looked_at(result: Equilibrium) -> Equilibrium:
@@ -200,11 +224,7 @@ def _refined(result: Equilibrium, options: Options, rtol: float, strain_limit: F
         )
         note(f"solving on {options.segments} segments, as the estimated error is {error:.1e} for rtol = {rtol:g}")
         finer = _solve(result.scene, _finer(result, defects, options), last_twist(result), strain_limit, options)
-        result = eqx.tree_at(
-            lambda result: (result.iterations, result.evaluations),
-            finer,
-            (_sum(finer.iterations, result.iterations), _sum(finer.evaluations, result.evaluations)),
-        )
+        result = _with_effort_of(finer, result)
     if last is not None:
         # Where no finer mesh had an equilibrium, that of the finest which had one.
         mesh = "the finest mesh" if result is last[0] else "the finest mesh with an equilibrium"

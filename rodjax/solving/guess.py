@@ -9,17 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, number_array, shown
+from rodjax.discretization.first_shape import hanging_arc
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.taut import drawn_in
-from rodjax.model.scene import Scene, scene_axes
+from rodjax.model.scene import Scene, nondimensional, scene_axes
 from rodjax.model.supports import Directed, Held
 from rodjax.model.triangle_mesh import Mesh
+from rodjax.programs.compilation import compiled
 from rodjax.units import Units
 
 # Cosine between neighbouring edges below which a guess counts as folded, and by how much of an edge it is unfolded.
 FOLDED = -0.99
 ASIDE = 0.05
+ARC_PIECES = 64
 
 
 class Guess(eqx.Module):
@@ -68,6 +71,19 @@ def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -
     first, last = (support.tangent if isinstance(support, Directed) else None for support in (start, end))
     string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, scene.rod.length)
     return jnp.where(is_needed, resampled(string, segments), nodes)
+
+
+def hanging_guess(scene: Scene) -> Guess | None:
+    """The arc that hangs between two supports, whatever tangents they hold; `None` with clips or a free end."""
+    if scene.clips or not isinstance(scene.start, Held) or not isinstance(scene.end, Held):
+        return None
+    return Guess(_hanging_points(scene))
+
+
+@compiled
+def _hanging_points(scene: Scene) -> Float[Array, "m 3"]:
+    scaled, units = nondimensional(scene)
+    return units.origin[None] + units.length * hanging_arc(scaled, ARC_PIECES)
 
 
 def _is_mesh(obstacle: Any) -> bool:

@@ -191,21 +191,20 @@ def report(
             instance(text, name, str)
     note("checking limits, supports and stability")
 
-    is_of_harness = isinstance(gradients, Route) and isinstance(gradients.scene, Harness)
+    design = None
+    if isinstance(gradients, Route) and isinstance(gradients.scene, Harness):
+        design = Gradients.of(gradients)
 
     def of_cable(name: str, one: Gradients | Route | None) -> Gradients | None:
         if not isinstance(one, Route):
             return one
-        if not isinstance(one.scene, Harness):
-            return Gradients.of(one)
-        of_one = Gradients.of(one, name)
-        return of_one._replace(remark="", ranges=None) if is_of_harness else of_one
+        of_one = Gradients.of(one, name if isinstance(one.scene, Harness) else None)
+        return of_one if design is None else of_one._replace(remark="", ranges=None)
 
     found = tuple(
         cable(name, one, limit, obstacles, names, of_cable(name, gradient))
         for (name, one), limit, gradient in zip(cables.items(), each_limits, each_gradients, strict=True)
     )
-    design = Gradients.of(gradients) if is_of_harness else None  # pyright: ignore[reportArgumentType]
     return Report("Route" if title is None else title, found, obstacles, names, source, design=design)
 
 

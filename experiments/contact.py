@@ -3,7 +3,8 @@
     python experiments/contact.py [scenes]
 
 Prints how many converge, iterations, and which of the rest are too short for their side; of the pegs also milliseconds
-of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Of friction the pull of a taut
+of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
+scenes as the cables become heavier, beside paths. Of friction the pull of a taut
 cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a floor, and back, beside its
 closed form.
 """
@@ -190,6 +191,39 @@ def dragged(friction: float = 0.3, segments: int = 64) -> None:
     )
 
 
+def branches(count: int, seed: int = 0, segments: int = 24, heavier: float = 30.0) -> None:
+    """`rj.follow` as gravity grows: how many come to its end, at the equilibrium that paths of forty steps find."""
+    rng = np.random.default_rng(seed)
+    points, corners, critical, seconds, same, others = [], [], [], [], 0, []
+    for k in range(count):
+        scene, shape = random_scene(rng)
+        last = rj.solve(scene, segments=segments, guess=rj.Guess(shape), strain_limit=None)
+        if not last.converged:
+            continue
+        scenes = [dataclasses.replace(scene, gravity=g * scene.gravity) for g in np.linspace(1, heavier, 41)]
+        begin = time.perf_counter()
+        branch = rj.follow([scenes[0], scenes[-1]], guess=last)
+        seconds.append(time.perf_counter() - begin)
+        points.append(len(branch.parameter))
+        critical.append(len(branch.critical_points))
+        changed = np.any(np.diff(np.linalg.norm(branch.equilibria.obstacle_forces, axis=-1) > 0, axis=0), axis=(1, 2))
+        corners.append(int(np.sum(changed)))
+        for each in scenes[1:]:
+            last = rj.solve(each, segments=segments, guess=last, strain_limit=None)
+        is_there = branch.ended is rj.BranchEnd.SCENES and float(branch.parameter[-1]) == 1.0
+        if is_there and bool(last.converged) and np.max(np.abs(branch.equilibria.nodes[-1] - last.nodes)) < 1e-8:
+            same += 1
+        else:
+            how = branch.ended.name if not is_there else "OTHER"
+            others.append((k, how, critical[-1], bool(last.converged)))
+    print(
+        f"branches as gravity grows to {heavier:g} times, seed {seed}, {segments} elements: {same} of {len(points)} "
+        f"end where a path does; equilibria median {np.median(points):g}, most {max(points)}, between which contacts "
+        f"change {sum(corners)} times; {sum(critical)} critical points; seconds median {np.median(seconds):.2g}; "
+        f"others (scene, why, critical points, whether the path converged): {others}"
+    )
+
+
 if __name__ == "__main__":
     set_up()
     warnings.simplefilter("ignore")
@@ -205,3 +239,4 @@ if __name__ == "__main__":
     cold(scenes, radius=3e-4)
     cold(scenes, EI=(1.0, 2.0))
     cold(scenes, EI=(1.0, 2.0), rest_curvature=(1.0, 0.0))
+    branches(scenes)

@@ -225,7 +225,7 @@ def test_every_feature_solves_in_a_harness(names):
 
 
 # What branches (`rj.follow`, `rj.critical_point`, `at_critical="stop"`) refuse: loads without a potential, as no energy
-# tells where they lose stability, and contact, which opens and closes along them.
+# tells where they lose stability.
 NOT_ON_BRANCHES = {
     "have none": [
         "follower force along",
@@ -235,7 +235,6 @@ NOT_ON_BRANCHES = {
         "end moment",
         "follower end force",
     ],
-    "without obstacles": ["floor"],
 }
 
 

@@ -673,11 +673,6 @@ def single(parts):
             lambda: rj.write_scene(dataclasses.replace(with_floor(), obstacles=(OWN,)), "floor.toml"),
             "scene.obstacles[0].obstacles[1] must be of the kinds plane, sphere, capsule, pipe, cylinder, box or union",
         ),
-        (lambda: rj.follow([with_floor(), with_floor()]), "needs scenes without obstacles"),
-        (
-            lambda: rj.solve_path([with_floor(), with_floor()], at_critical="stop"),
-            "at_critical must be 'jump' for scenes with obstacles",
-        ),
     ],
 )
 def test_what_obstacles_do_not_go_with_is_said(make, message):

@@ -416,7 +416,7 @@ def test_no_friction_is_no_term():
             lambda: rj.Union(rj.Plane((0, 0, 0), (0, 0, 1), friction=0.1)),
             "obstacles[0].friction must be 0 within a Union",
         ),
-        (lambda: rj.follow([on_floor(), on_floor(-0.1)]), "needs scenes without obstacles"),
+        (lambda: rj.follow([on_floor(), on_floor(-0.1)]), "needs scenes without friction"),
         (
             lambda: rj.solve_path(
                 [

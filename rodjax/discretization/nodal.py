@@ -210,10 +210,12 @@ class NodalForm(PositionForm):
 
     def contact_energy(self, there: Any, point: Any, others: NodalChange) -> Float[Array, ""]:
         """That in `objective`, at a trial of a step from `point`."""
-        gaps, _ = gaps_and_normals(self, there.nodal.positions)
-        if smooth_obstacles(self.scene):
-            gaps = jnp.concatenate([gaps, within_elements(self, there)[2]])
-        return self._merit_of_contacts(contact_model(self, point, gaps, None), others)
+        return self._merit_of_contacts(contact_model(self, point, self.gaps(there), None), others)
+
+    def gaps(self, point: Any) -> Float[Array, "k n+1"]:
+        """Between rod and obstacles, in the rows of pressures."""
+        gaps, _ = gaps_and_normals(self, point.nodal.positions)
+        return jnp.concatenate([gaps, within_elements(self, point)[2]]) if smooth_obstacles(self.scene) else gaps
 
     def _merit_of_contacts(self, model: Unilateral, others: NodalChange) -> Float[Array, ""]:
         pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE

@@ -91,7 +91,9 @@ def contacts_at(form: PositionForm, point: Any) -> Contacts:
         far_rows, by_rotations = found.rows, found.by_rotations
         gaps = jnp.concatenate([gaps, found.gaps[None]])
     normals = jnp.pad(normals, ((0, len(gaps) - len(normals)), (0, 0), (0, 0)))
-    is_closed, displacements = nodal.pressures > GAP_WEIGHT * (gaps + relaxation(form, gaps)[:, None]), None
+    displacements, is_closed = None, form.closed
+    if is_closed is None:
+        is_closed = nodal.pressures > GAP_WEIGHT * (gaps + relaxation(form, gaps)[:, None])
     if nodal.friction is not None and across is not None:
         displacements = travelled(form, nodal.positions, nodal.friction)
         sticks = sticking(form, nodal, normals, displacements)
@@ -168,9 +170,10 @@ def contact_residuals(form: PositionForm, point: Any, contacts: Contacts) -> tup
     balance = form.applied(point).T - contacts.rows.pushed(forces)
     balance = jnp.where(form.is_held[:, None], 0.0, balance)
     off_balance = jnp.where(form.is_at_support[:, None], 0.0, balance) if form.ends_move else balance
-    # Of a gap and a pressure one is zero, none is negative.
+    # Of a gap and a pressure one is zero, and none is negative where the closed contacts are those that press.
     weighted = GAP_WEIGHT * gaps
-    amiss = jnp.max(jnp.abs(jnp.where(pressures < weighted, pressures, weighted)), initial=0.0)
+    is_open = pressures < weighted if form.closed is None else ~form.closed
+    amiss = jnp.max(jnp.abs(jnp.where(is_open, pressures, weighted)), initial=0.0)
     if nodal.friction is not None and contacts.reference_displacements is not None:
         normals = contacts.rows.normals[np.array(rough_obstacles(form.scene))]
         exerted, slips = pulled(nodal.friction.forces, contacts.reference_displacements, normals)

@@ -36,11 +36,13 @@ BESIDE = 0.3
 class PositionForm(Form):
     """A nondimensional scene; the `end_force` of its points is (3, n): that through each element, and their `nodal` is
     there. `ends_move`: of a linearisation in which clamped ends have no given position (`released`). `pushed`: which
-    ends are in bodies that obstacles push out, `None` where none is.
+    ends are in bodies that obstacles push out, `None` where none is. `closed`: the contacts that count as closed, of
+    all rows of pressures; `None` for those that press.
     """
 
     ends_move: bool = eqx.field(kw_only=True, static=True, default=False)
     pushed: Bool[Array, "2"] | None = eqx.field(kw_only=True, default=None)
+    closed: Bool[Array, "k n+1"] | None = eqx.field(kw_only=True, default=None)
 
     def released(self, point: Any) -> Linearization:
         """The ends that clamps hold may turn and move; `residual` without these."""

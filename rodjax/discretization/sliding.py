@@ -25,6 +25,7 @@ from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import NEUTRAL, Form
 from rodjax.discretization.forms import form_of, form_on
+from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.nodes import LEAST_ELEMENT, varying
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding_point import SlidingChange, SlidingLinearization, SlidingPoint
@@ -78,7 +79,11 @@ class SlidingForm(Form):
         else:
             field = dataclasses.replace(field, s=s)
         form = form_on(scene, field).in_plane_of(self.first)
-        return dataclasses.replace(form, scene=slid(self.scene, arclengths))
+        form = dataclasses.replace(form, scene=slid(self.scene, arclengths))
+        if not isinstance(form, PositionForm):
+            return form
+        assert isinstance(self.first, PositionForm)
+        return dataclasses.replace(form, closed=self.first.closed)
 
     def _fixed(self, arclengths: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
         """Arclengths that have nodes, in turn, and how far those go along."""

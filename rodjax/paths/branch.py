@@ -11,6 +11,7 @@ Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1
 stability analysis" (2010).
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -32,7 +33,7 @@ from rodjax.paths.harness_modes import HarnessMode, mode_of_motion
 from rodjax.paths.harness_place import HarnessProblem
 from rodjax.paths.modes import Mode, mode_of
 from rodjax.paths.place import added, left_of, less, nearest_to_zero, scaled
-from rodjax.paths.rod_place import RodProblem
+from rodjax.paths.rod_place import BranchContacts, RodProblem, pressing
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import on_mesh_of
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -57,6 +58,7 @@ class Station(eqx.Module):
     - `stiffness`, `motion`: the eigenvalue [EI/L^2] of the Hessian nearest to zero, neutral turns apart, and its motion
     - `slope`: the work of the residual that a change of the parameter makes in this motion, as a part of the most that
       it could be
+    - `contacts`: with obstacles; `None` without such, and of harnesses
     """
 
     parameter: Float[Array, ""]
@@ -67,13 +69,29 @@ class Station(eqx.Module):
     stiffness: Float[Array, ""]
     motion: Any
     slope: Float[Array, ""]
+    contacts: BranchContacts | None
+
+    @property
+    def closed(self) -> Bool[Array, "k n+1"] | None:
+        """The contacts that count as closed."""
+        return None if self.contacts is None else self.contacts.closed
+
+    def reversed(self) -> "Station":
+        """The same on the way back."""
+        contacts = self.contacts
+        if contacts is not None:
+            contacts = dataclasses.replace(contacts, rates=-contacts.rates)
+        along = jax.tree.map(jnp.negative, self.along)
+        return dataclasses.replace(self, along=along, contacts=contacts)
 
 
-def problem_of(scenes: Scene | Harness, segment: Int[Array, ""], result: Any) -> Any:
-    """The scenes or harnesses about an equilibrium."""
+def problem_of(
+    scenes: Scene | Harness, segment: Int[Array, ""], result: Any, closed: Bool[Array, "k n+1"] | None = None
+) -> Any:
+    """The scenes or harnesses about an equilibrium, of a rod with these contacts closed; `None`: those that press."""
     if isinstance(scenes, Harness):
         return HarnessProblem(scenes, segment, result)
-    return RodProblem(scenes, segment, result)
+    return RodProblem(scenes, segment, result, closed)
 
 
 def count_of(scenes: Scene | Harness) -> int:
@@ -110,12 +128,13 @@ def stepped(
     along: BranchTangent,
     distance: Float[Array, ""],
     target: Float[Array, ""],
+    closed: Bool[Array, "k n+1"] | None,
 ) -> Station:
     """The equilibrium at a distance along a direction, at right angles to it; or under the parameter `target`.
 
-    `target`: not a number where the parameter is free.
+    `target`: not a number where the parameter is free; `closed`: the contacts that stay closed, as others stay open.
     """
-    problem = problem_of(scenes, segment, result)
+    problem = problem_of(scenes, segment, result, closed)
     is_given = ~jnp.isnan(target)
     first = jnp.where(is_given, target, parameter + distance * along.rate)
     direction, reach = problem.departure(parameter, along.motion, distance)
@@ -169,16 +188,27 @@ def stepped(
     left = left_of(place, neutral, motion)
     status = jnp.where(state.is_converged, Status.CONVERGED, Status.MAX_ITERATIONS)
     outcome = Outcome(state.magnitude, state.iterations, state.iterations, status.astype(int))
+    along = BranchTangent(scaled(state.follows, sign), sign)
+    contacts = None
+    if closed is not None:
+        contacts = problem.contacts(state.parameter, place, along.motion, along.rate)
     return Station(
         parameter=state.parameter,
         equilibrium=problem.result(state.parameter, place, outcome, state.index),
-        along=BranchTangent(scaled(state.follows, sign), sign),
+        along=along,
         alignment=jnp.abs(cosine),
         index=state.index,
         stiffness=stiffness,
         motion=motion,
         slope=place.work_share(left),
+        contacts=contacts,
     )
+
+
+@compiled
+def closed_contacts(result: Equilibrium) -> Bool[Array, "k n+1"] | None:
+    """Those that press; `None` without obstacles."""
+    return pressing(result)
 
 
 @compiled

@@ -17,7 +17,8 @@ from rodjax.checks import instance, is_known, number_array, positive, whole_numb
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.paths.branch import BranchTangent, count_of, mode_at
-from rodjax.paths.critical import differentiable_parameter
+from rodjax.paths.corners import changes_contacts
+from rodjax.paths.critical import Changing, differentiable_parameter
 from rodjax.paths.harness_modes import HarnessMode
 from rodjax.paths.harness_path import are_harnesses, stack_harnesses
 from rodjax.paths.harness_place import harness_at
@@ -40,18 +41,19 @@ FOLD = 1e-5
 # How far from a critical point a new branch is entered: root mean square of the turn of the tangents [rad].
 SWITCH = 0.1
 
-Kind = Literal["fold", "branch"]
+Kind = Literal["fold", "branch", "contact"]
 
 
 class CriticalPoint(eqx.Module):
     """An equilibrium at which the stiffness of a motion vanishes.
 
     - `parameter`: where in the sequence of scenes, from 0 to m - 1
-    - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; or `"branch"`,
-      where another branch of equilibria crosses, as where a straight strut buckles
+    - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; `"branch"`,
+      where another branch of equilibria crosses, as where a straight strut buckles; or `"contact"`, where a contact
+      opens or closes, and with that the branch turns back or the index changes
     - `equilibrium`: there, of harnesses a `HarnessEquilibrium`; its scene is that of the parameter
     - `mode`: the critical motion, whose stiffness [N] is what is left of zero, of a harness a `HarnessMode`. Where a
-      rod may buckle in all directions at once, one of them
+      rod may buckle in all directions at once, one of them; where a contact opens or closes, the one nearest to that
     - `index_before`, `index_after`: the number of motions along which the energy falls, on both sides along the branch
     """
 
@@ -117,8 +119,12 @@ def follow(
     - `progress`: whether a call that takes longer than 2 s says on stderr what it does; `None`: in a terminal or
         notebook.
 
-    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, and for loads without a potential,
-    obstacles and `self_contact`. Keller, "Numerical solution of bifurcation and nonlinear eigenvalue problems" (1977).
+    Beside obstacles each point at which a contact opens or closes is one of its equilibria: there the branch has a
+    corner, and may turn back.
+
+    Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, for loads without a potential,
+    friction and `self_contact`, and for harnesses beside obstacles. Keller, "Numerical solution of
+    bifurcation and nonlinear eigenvalue problems" (1977).
     """
     stacked = _checked(scenes, "follow")
     steps = _checked_steps(step, max_step, max_points)
@@ -186,8 +192,9 @@ def critical_point(
 
     `jax.grad`, `jacfwd` and `jacrev` of `.parameter` work for every number of the scenes, by the implicit function
     theorem, first derivatives only: at a fold by the change of the residual in the critical motion, at a branch point
-    by that of the critical eigenvalue along the branch. What is left of symmetry is taken for kept: an imperfection,
-    which makes two branches of those that cross, adds nothing. Other fields have no derivatives.
+    by that of the critical eigenvalue along the branch, where a contact opens or closes by that of its pressure or gap.
+    What is left of symmetry is taken for kept: an imperfection, which makes two branches of those that cross, adds
+    nothing. Other fields have no derivatives.
 
     **Arguments:** as for `follow`.
 
@@ -210,7 +217,9 @@ def critical_point(
             f"{found.ended.value}"
         )
     point = _critical_point(found.crossings[0])
-    parameter = differentiable_parameter(stacked, point.parameter, point.equilibrium, point.kind == "fold")
+    station, contact = found.crossings[0].station, found.crossings[0].contact
+    closes = None if contact is None else Changing(station.closed, jnp.asarray(contact))
+    parameter = differentiable_parameter(stacked, point.parameter, point.equilibrium, point.kind == "fold", closes)
     return eqx.tree_at(lambda point: point.parameter, point, parameter)
 
 
@@ -233,7 +242,7 @@ def switch_branch(
 
     The parameter is larger than that of the point where the new branch goes forward, else smaller: to follow it away
     from the point give `follow` this `direction`. Where the equilibrium is not found it is flagged as not converged.
-    Raises as `follow` does.
+    Raises as `follow` does, and `ValueError` where a contact opens or closes on the way.
     """
     stacked = _checked(scenes, "switch_branch")
     instance(point, "point", CriticalPoint)
@@ -242,7 +251,10 @@ def switch_branch(
         raise ValueError(f"side must be 1 or -1, got {side!r}")
     segment, station = begun(stacked, float(point.parameter), point.equilibrium, 1.0)
     along = BranchTangent(station.motion, jnp.zeros_like(station.parameter))
-    there = towards(stacked, segment, station.parameter, station.equilibrium, along, side * distance)
+    here = station.parameter, station.equilibrium
+    there = towards(stacked, segment, *here, along, side * distance, closed=station.closed)
+    if changes_contacts(there):
+        raise ValueError(f"distance must be less than {distance:g}: so far from the point a contact opens or closes")
     return there.parameter, there.equilibrium
 
 
@@ -252,10 +264,16 @@ def _critical_point(crossing: Crossing) -> CriticalPoint:
         parameter=station.parameter,
         equilibrium=station.equilibrium,
         mode=mode_at(station.equilibrium, station.stiffness, station.motion),
-        kind="fold" if crossing.turns and abs(float(station.slope)) > FOLD else "branch",
+        kind=_kind(crossing),
         index_before=crossing.index_before,
         index_after=crossing.index_after,
     )
+
+
+def _kind(crossing: Crossing) -> Kind:
+    if crossing.contact is not None:
+        return "contact"
+    return "fold" if crossing.turns and abs(float(crossing.station.slope)) > FOLD else "branch"
 
 
 @compiled

@@ -3,8 +3,9 @@
 At a fold the residual F vanishes under a change of the scenes where F_p dp + F_lambda d(lambda), the work in the
 critical motion, does. At a branch point the critical eigenvalue stays zero: the quadratic form of the critical motion,
 which changes with the scenes, the parameter and the equilibrium; this follows by the linearised system, in which
-motions without stiffness take no part (Werner & Spence 1984). In both cases a number that is a function of scenes and
-parameter alone stays zero, and its derivatives by both, in one sweep backwards, say how the parameter follows.
+motions without stiffness take no part (Werner & Spence 1984). Where a contact opens or closes its pressure or gap stays
+zero. In all cases a number that is a function of scenes and parameter alone stays zero, and its derivatives by both, in
+one sweep backwards, say how the parameter follows.
 """
 
 import functools
@@ -13,7 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
@@ -27,18 +28,32 @@ from rodjax.solving.result import Equilibrium
 DOUBLE = 1e-5
 
 
+class Changing(eqx.Module):
+    """The closed contacts on the side from which a branch comes, and the row and node of one that opens or closes."""
+
+    closed: Any
+    contact: Int[Array, "2"]
+
+
 @eqx.filter_custom_jvp
 def differentiable_parameter(
-    scenes: Scene | Harness, parameter: Float[Array, ""], result: Equilibrium | HarnessEquilibrium, is_fold: bool
+    scenes: Scene | Harness,
+    parameter: Float[Array, ""],
+    result: Equilibrium | HarnessEquilibrium,
+    is_fold: bool,
+    changing: Changing | None,
 ) -> Float[Array, ""]:
-    """The parameter of a critical point, with its derivative by the scenes."""
+    """The parameter of a critical point, with its derivative by the scenes; `changing`: of one that a contact makes."""
     return parameter
 
 
 @differentiable_parameter.def_jvp
 def _(primals, tangents):
-    scenes, parameter, result, is_fold = primals
-    gradient = _gradient(_once(scenes), parameter, result, is_fold)
+    scenes, parameter, result, is_fold, changing = primals
+    if changing is None:
+        gradient = _gradient(_once(scenes), parameter, result, is_fold)
+    else:
+        gradient = _gradient_of_change(_once(scenes), parameter, result, changing)
     changes = jax.tree.map(
         lambda by, change: jnp.zeros_like(parameter) if change is None else jnp.sum(by * change),
         gradient,
@@ -91,6 +106,29 @@ def _gradient(scenes: Any, parameter: Float[Array, ""], result: Any, is_fold: bo
     # What stays zero: the eigenvalue less the work of the residual in this motion.
     *of_work, _ = derivatives((followed, jnp.zeros_like(none)))
     by_scenes, by_parameter = jax.tree.map(jnp.subtract, of_eigenvalue, of_work)
+    return jax.tree.map(lambda by: -by / by_parameter, by_scenes)
+
+
+@compiled
+def _gradient_of_change(scenes: Any, parameter: Float[Array, ""], result: Any, changing: Changing) -> Any:
+    """The same where a pressure or a gap becomes zero."""
+    segment = jnp.clip(jnp.floor(parameter), 0, count_of(scenes) - 2).astype(int)
+    begin = problem_of(scenes, segment, result, changing.closed)
+    point = begin.point
+    here = begin.located(parameter, point)
+    nothing = jax.tree.map(jnp.zeros_like, here.residual)
+
+    def amount(scenes: Any, parameter: Float[Array, ""], motion: Any) -> tuple[Any, Float[Array, ""]]:
+        problem = problem_of(scenes, segment, result, changing.closed)
+        place = problem.located(parameter, problem.moved(parameter, point, motion))
+        return place.residual, problem.amounts(place)[tuple(changing.contact)]
+
+    (_, none), derivatives = jax.vjp(amount, scenes, parameter, nothing)
+    *of_amount, by_motion = derivatives((nothing, jnp.ones_like(none)))
+    neutral = here.neutral()
+    followed = _solved(here.regularized(neutral), here, by_motion, here.metric, (neutral,), (neutral,))
+    *of_work, _ = derivatives((followed, jnp.zeros_like(none)))
+    by_scenes, by_parameter = jax.tree.map(jnp.subtract, of_amount, of_work)
     return jax.tree.map(lambda by: -by / by_parameter, by_scenes)
 
 

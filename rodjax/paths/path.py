@@ -164,16 +164,16 @@ def _check_stop(scenes: Scene | Harness) -> None:
 
 
 def not_followed(scenes: Scene | Harness) -> str | None:
-    """What keeps branches of scenes from being followed: "potential", where loads have none, "obstacles",
-    "self_contact" or "contact" of rods of a harness; `None` where nothing does.
+    """What keeps branches of scenes from being followed: "potential", where loads have none, "friction",
+    "self_contact", and of the rods of a harness "obstacles" or "contact"; `None` where nothing does.
     """
     each = scenes.scenes if isinstance(scenes, Harness) else (scenes,)
     if not all(map(has_potential, each)) or (isinstance(scenes, Harness) and not scenes.has_potential):
         return "potential"
-    if any(scene.obstacles for scene in each):
-        return "obstacles"
-    if isinstance(scenes, Harness) and scenes.contact:
-        return "contact"
+    if any(map(has_friction, each)):
+        return "friction"
+    if isinstance(scenes, Harness) and (scenes.contact or any(scene.obstacles for scene in each)):
+        return "contact" if scenes.contact else "obstacles"
     return "self_contact" if any(scene.self_contact for scene in each) else None
 
 

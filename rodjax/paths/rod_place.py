@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,16 +13,26 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.motion import Metric, Motion, neutral_turn
+from rodjax.discretization.nodal import NodalForm
+from rodjax.discretization.node_contacts import GAP_WEIGHT
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.vectors import components
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnyFactors, AnySystem, SaddlePointSystem, factor, transposed
+from rodjax.mechanics.passage import Before
 from rodjax.model.scene import Scene, between, nondimensional
 from rodjax.paths.place import Place, work
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, free_form_and_point
+from rodjax.solving.result import (
+    Equilibrium,
+    Found,
+    SolverState,
+    build_result,
+    form_and_point,
+    free_form_and_point,
+)
 from rodjax.solving.stability import carried_to
 from rodjax.solving.status import Outcome
 
@@ -123,6 +133,16 @@ def _held(
     return system, holds
 
 
+class BranchContacts(eqx.Module):
+    """The contacts of a point of a branch: which count as `closed`; what of each must not become negative, the pressure
+    of a closed one and the gap of another [EI/L^2], and the `rates` of these along the branch.
+    """
+
+    closed: Bool[Array, "k n+1"]
+    amounts: Float[Array, "k n+1"]
+    rates: Float[Array, "k n+1"]
+
+
 class Direction(eqx.Module):
     """A motion with its turns as vectors in global axes: the changes of tangents, or rotations of frames."""
 
@@ -202,11 +222,14 @@ def scene_at(scenes: Scene, segment: Int[Array, ""], parameter: Float[Array, ""]
 
 
 class RodProblem(eqx.Module):
-    """The scenes about an equilibrium, and what they make of it under other parameters."""
+    """The scenes about an equilibrium, and what they make of it under other parameters; `closed`: the contacts that
+    count as closed, `None` for those that press.
+    """
 
     scenes: Scene
     segment: Int[Array, ""]
     equilibrium: Equilibrium
+    closed: Bool[Array, "k n+1"] | None = None
 
     @property
     def point(self) -> Point:
@@ -220,7 +243,13 @@ class RodProblem(eqx.Module):
     def _at(self, parameter: Float[Array, ""], point: Point, motion: Motion | None = None) -> tuple[Form, Point]:
         scaled, _ = nondimensional(scene_at(self.scenes, self.segment, parameter))
         state = self.equilibrium.state
-        return carried_to(scaled, state.shape, point, motion, made_at=state.arclengths)
+        form, point = carried_to(scaled, state.shape, point, motion, made_at=state.arclengths)
+        if self.closed is None:
+            return form, point
+        if isinstance(form, SlidingForm):
+            first = dataclasses.replace(form.first, closed=self.closed)
+            return dataclasses.replace(form, first=first), point
+        return dataclasses.replace(form, closed=self.closed), point
 
     def moved(self, parameter: Float[Array, ""], point: Point, motion: Motion) -> Point:
         """The point carried to a parameter, and moved there."""
@@ -269,13 +298,49 @@ class RodProblem(eqx.Module):
     ) -> Equilibrium:
         scene = scene_at(self.scenes, self.segment, parameter)
         units = nondimensional(scene)[1]
-        form, point, arclengths = place.form, place.point, None
-        if isinstance(form, SlidingForm):
-            assert isinstance(point, SlidingPoint)
-            form, point, arclengths = form.at(point.arclengths), point.inner, point.arclengths
+        arclengths = place.point.arclengths if isinstance(place.point, SlidingPoint) else None
+        form, point = _settled(place.form, place.point)
         shape = self.equilibrium.state.shape.reached(form, point)
-        found = Found(SolverState(shape, point.end_force, units, arclengths), point, outcome, index == 0)
-        return build_result(scene, found, jnp.ones((), int))
+        state = SolverState(shape, point.end_force, units, arclengths)
+        if isinstance(form, NodalForm) and scene.obstacles:
+            points, _, _ = form.samples(shape.nodes, point)
+            before = Before(units.origin[None] + units.length * points, scene.obstacles)
+            state = dataclasses.replace(state, pressures=point.nodal.pressures, before=before)
+        return build_result(scene, Found(state, point, outcome, index == 0), jnp.ones((), int))
+
+    def amounts(self, place: RodPlace) -> Float[Array, "k n+1"]:
+        """See `BranchContacts`."""
+        form, point = _settled(place.form, place.point)
+        assert isinstance(form, NodalForm)
+        return jnp.where(form.closed, point.nodal.pressures, GAP_WEIGHT * form.gaps(point))
+
+    def contacts(
+        self, parameter: Float[Array, ""], place: RodPlace, motion: Motion, rate: Float[Array, ""]
+    ) -> BranchContacts | None:
+        """Those at a place, and how they change along a motion and a change of the parameter; `None` without such."""
+        if self.closed is None:
+            return None
+
+        def amounts(parameter: Float[Array, ""], motion: Motion) -> Float[Array, "k n+1"]:
+            form, point = self._at(parameter, place.point, motion)
+            return self.amounts(dataclasses.replace(place, form=form, point=point))
+
+        still = jax.tree.map(jnp.zeros_like, motion)
+        return BranchContacts(self.closed, *jax.jvp(amounts, (parameter, still), (rate, motion)))
+
+
+def _settled(form: Form, point: Any) -> tuple[Form, Any]:
+    """Of a rod that slides, where its clips are."""
+    return (form.at(point.arclengths), point.inner) if isinstance(form, SlidingForm) else (form, point)
+
+
+def pressing(result: Equilibrium) -> Bool[Array, "k n+1"] | None:
+    """The contacts with obstacles that press; `None` without obstacles."""
+    form, point = form_and_point(result)
+    if not result.scene.obstacles:
+        return None
+    assert isinstance(form, NodalForm)
+    return point.nodal.pressures > GAP_WEIGHT * form.gaps(point)
 
 
 def no_motion(result: Equilibrium) -> Motion:

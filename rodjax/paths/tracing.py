@@ -1,19 +1,26 @@
 """Along a branch of equilibria step by step, from scene to scene and through folds; its critical points, located."""
 
 import enum
-import functools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from rodjax.discretization.form import NEUTRAL
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene, slides
 from rodjax.notes import note
-from rodjax.paths.branch import BranchTangent, Station, count_of, is_misplaced, no_motion, on_new_mesh, stepped
+from rodjax.paths.branch import (
+    BranchTangent,
+    Station,
+    closed_contacts,
+    count_of,
+    is_misplaced,
+    no_motion,
+    on_new_mesh,
+)
+from rodjax.paths.corners import Corner, TooLongError, corner_in
+from rodjax.paths.line import Line, Step, towards
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 
@@ -56,12 +63,15 @@ DEFAULT_STEPS = StepControl(first=0.02, longest=0.1, most=1000)
 
 
 class Crossing(NamedTuple):
-    """A critical point, the index on both sides, and whether the parameter turns round."""
+    """A critical point, the index on both sides, whether the parameter turns round, and the row and node of a contact
+    that opens or closes there; `None` where that is not what makes it critical.
+    """
 
     station: Station
     index_before: int
     index_after: int
     turns: bool
+    contact: tuple[int, int] | None = None
 
 
 class Trace(NamedTuple):
@@ -70,43 +80,24 @@ class Trace(NamedTuple):
     ended: BranchEnd
 
 
-class Line(NamedTuple):
-    """The points that steps of several lengths from one station find, or from there to given parameters."""
-
-    scenes: Scene | Harness
-    segment: int
-    station: Station
-
-    def at(self, distance: float, target: float = math.nan) -> Station:
-        station = self.station
-        return towards(
-            self.scenes, self.segment, station.parameter, station.equilibrium, station.along, distance, target
-        )
-
-
-def towards(
-    scenes: Scene | Harness,
-    segment: int,
-    parameter: Float[Array, ""],
-    result: Equilibrium | HarnessEquilibrium,
-    along: BranchTangent,
-    distance: float,
-    target: float = math.nan,
-) -> Station:
-    number = functools.partial(jnp.asarray, dtype=parameter.dtype)
-    return stepped(scenes, jnp.asarray(segment, int), parameter, result, along, number(distance), number(target))
-
-
 def begun(
-    scenes: Scene | Harness, parameter: float, result: Equilibrium | HarnessEquilibrium, direction: float
+    scenes: Scene | Harness,
+    parameter: float,
+    result: Equilibrium | HarnessEquilibrium,
+    direction: float,
+    closed: Any = None,
 ) -> tuple[int, Station]:
-    """The station of an equilibrium under the scene of a parameter, which is to grow or to fall from there."""
+    """The station of an equilibrium under the scene of a parameter, which is to grow or to fall from there; `closed`:
+    its closed contacts, `None` for those that press.
+    """
     last = count_of(scenes) - 1
     segment = math.floor(parameter) if direction > 0 else math.ceil(parameter) - 1
     segment = min(max(segment, 0), last - 1)
     dtype = result.energy.dtype
     along = BranchTangent(no_motion(result), jnp.asarray(direction, dtype))
-    return segment, towards(scenes, segment, jnp.asarray(parameter, dtype), result, along, 0.0, parameter)
+    if closed is None and isinstance(result, Equilibrium):
+        closed = closed_contacts(result)
+    return segment, towards(scenes, segment, jnp.asarray(parameter, dtype), result, along, 0.0, parameter, closed)
 
 
 def trace(
@@ -131,27 +122,51 @@ def trace(
     while len(stations) < steps.most:
         note(f"following a branch, {len(stations)} equilibria so far")
         line = Line(scenes, segment, station)
-        step = _step(line, distance)
+        step, corner = _as_far_as_a_corner(line, distance)
         if step is None:
             distance /= 2
             if distance < LEAST_STEP * steps.longest:
                 return Trace(stations, crossings, BranchEnd.LEAST_STEP)
             continue
         found = _crossings(line, step)
+        if corner is not None:
+            found += _at_corner(step.there, corner)
         crossings += found[:1] if only_first else found
         if only_first and found:
             return Trace(stations, crossings, BranchEnd.FIRST_CRITICAL)
-        station = step.there
-        if isinstance(scenes, Scene) and slides(scenes):
+        station = step.there if corner is None else corner.beyond
+        # Contacts belong to the nodes of a mesh.
+        if isinstance(scenes, Scene) and slides(scenes) and not scenes.obstacles:
             station, made = _on_its_mesh(Line(scenes, segment, station), step.bound, made, mesh)
         stations.append(station)
         if step.bound is not None:
             rising = step.bound > segment
             if step.bound in (0, last):
                 return Trace(stations, crossings, BranchEnd.SCENES)
-            segment, station = begun(scenes, step.bound, station.equilibrium, 1.0 if rising else -1.0)
+            way = 1.0 if rising else -1.0
+            segment, station = begun(scenes, step.bound, station.equilibrium, way, station.closed)
         distance = min(distance * step.growth, steps.longest)
     return Trace(stations, crossings, BranchEnd.MAX_POINTS)
+
+
+def _as_far_as_a_corner(line: Line, distance: float) -> tuple[Step | None, Corner | None]:
+    """A step, `None` where it must be shorter, and the corner of the branch at which it ends, if it does."""
+    step = _step(line, distance)
+    if step is None:
+        return None, None
+    try:
+        corner = corner_in(line, step)
+    except TooLongError:
+        return None, None
+    return (step, None) if corner is None else (corner.step, corner)
+
+
+def _at_corner(before: Station, corner: Corner) -> list[Crossing]:
+    """Where the index or the way of the parameter changes as a contact opens or closes."""
+    beyond = corner.beyond
+    turns = float(before.along.rate * beyond.along.rate) < 0
+    indices = int(before.index), int(beyond.index)
+    return [Crossing(before, *indices, turns, corner.contact)] if turns or indices[0] != indices[1] else []
 
 
 def _on_its_mesh(line: Line, bound: int | None, made: Any, mesh: Any) -> tuple[Station, Any]:
@@ -167,17 +182,7 @@ def _on_its_mesh(line: Line, bound: int | None, made: Any, mesh: Any) -> tuple[S
     return (there, there.equilibrium) if _is_good(there) else (station, made)
 
 
-class _Step(NamedTuple):
-    """What a step found, `at` any part of it; `bound`: the number of the scene at which it stopped, if it did."""
-
-    there: Station
-    length: float
-    at: Callable[[float], Station]
-    bound: int | None
-    growth: float
-
-
-def _step(line: Line, distance: float) -> _Step | None:
+def _step(line: Line, distance: float) -> Step | None:
     """A step along the branch, no further than the next scene; `None` where it must be shorter."""
     there = line.at(distance)
     if not _is_good(there):
@@ -185,7 +190,7 @@ def _step(line: Line, distance: float) -> _Step | None:
     growth = _growth(there)
     begin, end = float(line.station.parameter), float(there.parameter)
     if line.segment < end < line.segment + 1:
-        return _Step(there, distance, lambda part: line.at(part * distance), None, growth)
+        return Step(there, distance, lambda part: line.at(part * distance), None, growth)
     bound = line.segment if end <= line.segment else line.segment + 1
     if begin == bound:
         return None
@@ -197,7 +202,7 @@ def _step(line: Line, distance: float) -> _Step | None:
     landed = at(1.0)
     if not _is_good(landed) or landed.along.rate * line.station.along.rate <= 0:
         return None
-    return _Step(landed, share, at, bound, growth)
+    return Step(landed, share, at, bound, growth)
 
 
 def _is_good(station: Station) -> bool:
@@ -226,11 +231,13 @@ class _Side(NamedTuple):
         return int(self.station.index)
 
 
-def _crossings(line: Line, step: _Step) -> list[Crossing]:
+def _crossings(line: Line, step: Step) -> list[Crossing]:
+    if not step.length:
+        return []
     return _between(line, step, (0.0, line.station), (1.0, step.there))
 
 
-def _between(line: Line, step: _Step, before: tuple[float, Station], after: tuple[float, Station]) -> list[Crossing]:
+def _between(line: Line, step: Step, before: tuple[float, Station], after: tuple[float, Station]) -> list[Crossing]:
     """The critical points between two parts of a step: where the index changes, or the parameter turns round.
 
     By regula falsi on the eigenvalue nearest to zero, or the rate of the parameter, and by halves where that does not

@@ -10,11 +10,11 @@ from jax.test_util import check_grads
 from numpy_programs import by_numpy
 
 import rodjax as rj
-from rodjax.linalg.blocks import negative_count
 from rodjax.linalg.bordered import BorderedFactors, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
+from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.solving.result import form_and_point
 
 
@@ -352,6 +352,18 @@ def test_negative_eigenvalues_are_counted(size):
 
 
 # --- borders that may be full ----------------------------------------------------------------------------------------
+
+
+def test_inverses_and_their_derivatives():
+    """Also where pivots are exchanged, stacked along other axes, and twice differentiated."""
+    matrices = jnp.asarray(np.random.default_rng(0).normal(size=(6, 3, 3)))
+    matrices = matrices.at[0, 0, 0].set(0.0)
+    found = jax.jit(inverse_matrix)(matrices)
+    np.testing.assert_allclose(found @ matrices, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(inverse_matrix, in_axes=2, out_axes=2)(matrices.transpose(1, 2, 0)).T.mT, found)
+    for order in (jax.jacfwd, jax.jacrev, lambda f: jax.jacfwd(jax.jacrev(f))):
+        both = [order(inverse)(matrices[0]) for inverse in (inverse_matrix, jnp.linalg.inv)]
+        np.testing.assert_allclose(*both, rtol=1e-10, atol=1e-10 * float(jnp.max(jnp.abs(both[1]))))
 
 
 def complemented(complement: jax.Array) -> BorderedFactors:

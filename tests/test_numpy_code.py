@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 
 import rodjax as rj
-from rodjax.linalg.blocks import negative_count
+from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.programs import answers, compilation, numpy_operations
 from rodjax.programs.answers import ANSWERS, one_answer
 from rodjax.programs.compilation import compiled
@@ -25,11 +25,16 @@ PLACES = np.array([3, 0, 7, -9])
 SAME_ORDER = dict(num_keys=2, dimension=0)
 
 
-def windows(mode):
+def at_run_time(places, x):
+    """The same places, but no constant of the program."""
+    return places + jnp.argmax(x[0] * 0)
+
+
+def windows(mode, starts_of=lambda starts, x: starts):
     """Gathers of windows, some beyond the array."""
     dims = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(0,), start_index_map=(0, 1))
     starts = np.array([[0, 1], [3, 4], [5, 0], [1, -2]])
-    return lambda x: lax.gather(x, starts, dims, slice_sizes=(1, 3), mode=mode)
+    return lambda x: lax.gather(x, starts_of(starts, x), dims, slice_sizes=(1, 3), mode=mode)
 
 
 def decayed(rate):
@@ -91,6 +96,15 @@ OPERATIONS = {
         x.at[PLACES].get(mode="fill"),
         jnp.take_along_axis(x, PLACES[:, None], 1),
     ],
+    "places at run time": lambda x: [
+        x[at_run_time(PLACES, x)],
+        x[at_run_time(PLACES, x), 2],
+        x.at[at_run_time(PLACES, x)].get(mode="fill"),
+        *[windows(mode, at_run_time)(x) for mode in ("clip", "fill")],
+        x.at[at_run_time(PLACES, x), 1].add(x[:, 0]),
+        x.at[at_run_time(PLACES, x)].multiply(2.0, mode="drop"),
+        x.at[at_run_time(np.array([1, 1]), x), 2].max(0.3),
+    ],
     "slices at run time": lambda x: [
         lax.dynamic_slice(x, (jnp.argmax(x[:, 0]), 3), (2, 3)),
         lax.dynamic_update_slice(x, x[:2, :2], (jnp.argmax(x[:, 0]), 3)),
@@ -100,6 +114,10 @@ OPERATIONS = {
     "windows": lambda x: [windows(mode)(x) for mode in ("clip", "fill")],
     "updates": lambda x: [
         x.at[1].set(0.0),
+        x.at[1, 2].add(3.0),
+        x.at[1:3, 0].add(x[0, :2]),
+        x.at[:, 2:3].set(x[:, :1]),
+        x.at[np.array([1, 1, 2]), 0].add(x[:3, 1]),
         x.at[PLACES, 1].add(x[:, 0]),
         x.at[PLACES].multiply(2.0, mode="drop"),
         x.at[jnp.array([1, 1]), 2].max(0.3),
@@ -132,6 +150,9 @@ OPERATIONS = {
         jnp.linalg.svd(x, full_matrices=False)[1],
         jnp.linalg.pinv(jnp.stack([x, x / 0]), rtol=1e-10),
         negative_count(STACK - jnp.mean(STACK)),
+        *[inverse_matrix(matrix) for matrix in (POSITIVE + x[0, 0], STACK, STACK[:0])],
+        jax.vmap(inverse_matrix, in_axes=2)(jnp.moveaxis(STACK, 0, 2)),
+        jax.vmap(negative_count, in_axes=3)((STACK - jnp.mean(STACK))[:, :, :, None]),
         jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(POSITIVE), True), x),
         *[
             lax.linalg.triangular_solve(POSITIVE, x if left else x.T, left_side=left, lower=lower, transpose_a=flip)
@@ -183,6 +204,11 @@ def test_a_singular_triangle_spoils_no_other():
     x = numpy_operations.triangular_solve(singular, STACK, True, True, False, False)
     assert np.isfinite(x[0]).all()
     assert np.isnan(x[1]).all()
+    singular[0] = np.nan
+    inverses = numpy_operations.inverse(np.concatenate([singular, STACK, np.ones((1, 4, 4))]))
+    np.testing.assert_allclose(inverses[2:4] @ STACK, np.broadcast_to(np.eye(4), (2, 4, 4)), atol=1e-12)
+    assert np.isnan(inverses[[0, 1, 4]]).all()
+    np.testing.assert_array_equal(numpy_operations.negative_counts(np.concatenate([singular[:1], -STACK])), [0, 4, 4])
 
 
 def test_single_precision_stays_single():

@@ -85,26 +85,3 @@ def _inverse_of_three(
     is_negative = (a < 0) & (minor > 0) & (determinant < 0)
     count = jnp.where(is_positive, 0, jnp.where(is_negative, 3, jnp.where(determinant < 0, 1, 2)))
     return jnp.stack([jnp.stack(row) for row in inverse]) / determinant[None, None], jnp.sum(count)
-
-
-def negative_count(matrices: Float[Array, "m c c"]) -> Int[Array, ""]:
-    """How many negative eigenvalues symmetric matrices of any small size have together.
-
-    By Sturm's count on tridiagonal matrices similar to them, a sixth of the work of eigenvalues (Golub & Van Loan,
-    Matrix Computations, section 8.4).
-    """
-    if matrices.shape[-1] == 1:
-        return jnp.sum(matrices < 0)
-    _, diagonal, beside, _ = jax.lax.linalg.tridiagonal(matrices, lower=True)
-    least = jnp.finfo(matrices.dtype).tiny
-
-    def pivot(value: Float[Array, "m"]) -> Float[Array, "m"]:
-        """Not zero, and counted with the sign that the next one sees."""
-        return jnp.where(jnp.abs(value) < least, least, value)
-
-    last = pivot(diagonal[:, 0])
-    count = jnp.sum(last < 0)
-    for k in range(1, matrices.shape[-1]):
-        last = pivot(diagonal[:, k] - beside[:, k - 1] ** 2 / last)
-        count += jnp.sum(last < 0)
-    return count

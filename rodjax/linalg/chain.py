@@ -25,8 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.blocks import inverse_of_blocks, negative_count
+from rodjax.linalg.blocks import inverse_of_blocks
 from rodjax.linalg.far_rows import FarRows
+from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.programs.parts import traced_once
 
 # Solutions with soft contacts, after the first one.
@@ -418,7 +419,7 @@ class ChainFactors(eqx.Module):
         at = np.arange(k, k + len(far.elements))
         is_closed = self.contacts.is_closed[far.row, far.elements]
         harder = jnp.where(is_closed, (1 - HARD) * self.contacts.contact_compliance, 0.0)
-        return jnp.linalg.inv(self.bordered.at[at, at].add(harder))
+        return inverse_matrix(self.bordered.at[at, at].add(harder))
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -557,12 +558,12 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
 
     def inverted(block: Array, scale: Array) -> tuple[Array, Array]:
         pivot = scale[:, None] * block * scale[None]
-        return pivot, scale[:, None] * jnp.linalg.inv(pivot) * scale[None]
+        return pivot, scale[:, None] * inverse_matrix(pivot) * scale[None]
 
-    def eliminated(inverse: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+    def eliminated(before: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         block, below, above, scale = given
-        pivot, inverse = inverted(block - below @ inverse @ above, scale)
-        return inverse, (pivot, inverse)
+        pivot, here = inverted(block - below @ before @ above, scale)
+        return here, (pivot, here)
 
     begin, first = inverted(blocks[0], scale[0])
     _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, above, scale[1:]))
@@ -587,7 +588,7 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     matrix = -border.compliance - border.times(*solution[:2])
     if is_symmetric:
         negative += negative_count(jax.lax.stop_gradient(matrix)[None]) - border.positive
-    return ChainFactors(*chain, border, solution, matrix, jnp.linalg.inv(matrix), negative)
+    return ChainFactors(*chain, border, solution, matrix, inverse_matrix(matrix), negative)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:
@@ -623,7 +624,7 @@ def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+
             [of_rotations[:, 0, :, j], of_rotations[:, 2, :, j], of_gaps[:, :, j], of_nodes[:, :, j]], 1
         )
 
-    inverse = jnp.linalg.inv(system.diagonal[..., 1::2].transpose(2, 0, 1) + of_rotations[:, 1, :, 1])
+    inverse = inverse_matrix(system.diagonal[..., 1::2].transpose(2, 0, 1) + of_rotations[:, 1, :, 1])
     columns = of_middle.at[..., :b].add(of_rotations[:, 1, :, 0]).at[..., b : 2 * b].add(of_rotations[:, 1, :, 2])
     rows = of_point(1).at[:, : 2 * b + 3].add(of_middle.transpose(0, 2, 1))
     direct = jnp.pad(direct, ((0, 0), (0, 6), (0, 0)))

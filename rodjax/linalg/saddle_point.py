@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
+from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.programs.parts import traced_once
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
@@ -175,7 +176,7 @@ def _factor(
         negative += below - k
     else:
         rows = system.rows
-        complement = jnp.linalg.inv(-system.compliance - _dots(rows[:, :, None], solution))
+        complement = inverse_matrix(-system.compliance - _dots(rows[:, :, None], solution))
         negative = jnp.zeros_like(negative)
     return Factors(elimination, rows, solution, complement, negative), x
 

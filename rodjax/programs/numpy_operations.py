@@ -28,6 +28,8 @@ class _Limit(threading.local):
 
 
 _limit = _Limit()
+# Of a scan every so many steps.
+CLOCK_STEPS = 8
 
 
 @contextlib.contextmanager
@@ -80,7 +82,8 @@ def scan(
     rows = tuple(np.empty((length, *shape), dtype) for shape, dtype in kinds)
     count = len(carry)
     for k in range(length - 1, -1, -1) if reverse else range(length):
-        _look_at_clock()
+        if not k % CLOCK_STEPS:
+            _look_at_clock()
         new = body(*constants, *carry, *[column[k] for column in columns])
         carry = new[:count]
         for row, value in zip(rows, new[count:], strict=True):
@@ -116,22 +119,28 @@ def split(x: np.ndarray, sizes: Sequence[int], axis: int) -> Values:
     return tuple(np.split(x, list(itertools.accumulate(sizes))[:-1], axis))
 
 
-def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
-    """Edges that are negative cut off; `config`: low, high and interior padding of each axis."""
-    x = np.asarray(x)
-    spread = [max(0, n + (n - 1) * gap) if n else 0 for n, (_, _, gap) in zip(x.shape, config, strict=True)]
-    sizes = [n + low + high for n, (low, high, _) in zip(spread, config, strict=True)]
-    result = np.full(sizes, value, x.dtype)
-    from_, to = [], []
-    for n, size, (low, _, gap) in zip(x.shape, sizes, config, strict=True):
-        step = gap + 1
-        first = -(min(low, 0) // step)  # the first entry that is not cut off
-        last = min(n, -(-(size - low) // step))
-        from_.append(slice(first, max(first, last)))
-        to.append(slice(low + first * step, low + max(last - 1, first - 1) * step + 1, step))
-    if all(part.stop > part.start for part in from_):
-        result[tuple(to)] = x[tuple(from_)]
-    return result
+class Padding:
+    """Low, high and interior padding of each axis of an array of a shape; edges that are negative are cut off."""
+
+    def __init__(self, shape: Sequence[int], config: Sequence[tuple[int, int, int]]):
+        spread = [max(0, n + (n - 1) * gap) if n else 0 for n, (_, _, gap) in zip(shape, config, strict=True)]
+        self.sizes = tuple(n + low + high for n, (low, high, _) in zip(spread, config, strict=True))
+        from_, to = [], []
+        for n, size, (low, _, gap) in zip(shape, self.sizes, config, strict=True):
+            step = gap + 1
+            first = -(min(low, 0) // step)  # the first entry that is not cut off
+            last = min(n, -(-(size - low) // step))
+            from_.append(slice(first, max(first, last)))
+            to.append(slice(low + first * step, low + max(last - 1, first - 1) * step + 1, step))
+        self.places = (tuple(to), tuple(from_)) if all(part.stop > part.start for part in from_) else None
+
+    def __call__(self, x: Any, value: Any) -> np.ndarray:
+        result = np.empty(self.sizes, x.dtype)
+        result.fill(value)
+        if self.places is not None:
+            to, from_ = self.places
+            result[to] = x[from_]
+        return result
 
 
 def _starts(starts: Values, sizes: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, ...]:
@@ -173,6 +182,7 @@ class Windows:
     ):
         inner = [axis for axis in range(len(shape)) if axis not in fixed and axis not in batched]
         count = len(outer) + len(inner)
+        self.inner, self.sizes = inner, tuple(sizes)
         self.shape = (*outer, *(sizes[axis] for axis in inner))
         self.ones = (1,) * len(inner)
         self.moves = moves
@@ -202,6 +212,28 @@ class Windows:
             index.append(places)
         return tuple(index), True if is_within is True or is_within.all() else is_within
 
+    def region(self, starts: np.ndarray) -> "Region | None":
+        """Where windows lie that begin where the program says; `None` for those beyond the array."""
+        places, is_within = self.places(starts)
+        if is_within is not True:
+            return None
+        if starts.ndim > 1:
+            return Region(places)
+        firsts = [int(np.ravel(place)[0]) for place in places]
+        slices = [slice(first, first + size) for first, size in zip(firsts, self.sizes, strict=True)]
+        return Region(tuple(slices[axis] if axis in self.inner else first for axis, first in enumerate(firsts)))
+
+
+class Region:
+    """Places of an array by which NumPy picks them; whether each is there once."""
+
+    def __init__(self, places: tuple[Any, ...]):
+        self.places = places
+        self.is_unique = True
+        if any(isinstance(place, np.ndarray) for place in places):
+            together = np.stack([np.ravel(place) for place in np.broadcast_arrays(*places)])
+            self.is_unique = np.unique(together, axis=1).shape == together.shape
+
 
 def _line(n: int, axis: int, count: int) -> np.ndarray:
     """0 to n - 1 along one of so many axes."""
@@ -219,6 +251,14 @@ def gather(x: Any, starts: np.ndarray, windows: Windows, order: Sequence[int], m
     return result.transpose(order)
 
 
+def gather_at(x: Any, region: Region, shape: tuple[int, ...], order: Sequence[int]) -> np.ndarray:
+    """The same where the places are known as the code is written."""
+    result = np.asarray(x)[region.places]
+    if result.shape != shape:
+        result = np.broadcast_to(result, shape)
+    return result.transpose(order)
+
+
 def scatter(
     x: Any, starts: np.ndarray, updates: Any, combine: Any, windows: Windows, order: Sequence[int]
 ) -> np.ndarray:
@@ -233,6 +273,18 @@ def scatter(
         result[places] = updates
     else:
         combine.at(result, places, updates)
+    return result
+
+
+def scatter_at(x: Any, updates: Any, combine: Any, region: Region, order: Sequence[int]) -> np.ndarray:
+    """The same where the places are known as the code is written."""
+    result, updates = np.array(x), np.asarray(updates).transpose(order)
+    if combine is None:
+        result[region.places] = updates
+    elif region.is_unique:
+        result[region.places] = combine(result[region.places], updates)
+    else:
+        combine.at(result, region.places, updates)
     return result
 
 
@@ -283,8 +335,15 @@ class Product:
         rows, columns = ([shape[axis] for axis in axes] for shape, axes in zip(shapes, free, strict=True))
         self.matrices = [*outer, math.prod(rows), n], [*outer, n, math.prod(columns)]
         self.shape = [*outer, *rows, *columns]
+        # As most products are of matrices as they are.
+        self.is_plain = all(
+            order == list(range(len(order))) and list(shape) == matrix
+            for order, shape, matrix in zip(self.orders, shapes, self.matrices, strict=True)
+        )
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        if self.is_plain:
+            return np.matmul(a, b)
         left = a.transpose(self.orders[0]).reshape(self.matrices[0])
         right = b.transpose(self.orders[1]).reshape(self.matrices[1])
         return np.matmul(left, right).reshape(self.shape)
@@ -375,6 +434,27 @@ def eigh(x: np.ndarray, lower: bool) -> Values:
         return vectors, values
 
     return _each_matrix(one, x)
+
+
+def inverse(x: np.ndarray) -> np.ndarray:
+    """Not a number where a matrix is singular."""
+    try:
+        return np.linalg.inv(x)
+    except np.linalg.LinAlgError:
+
+        def one(matrix: np.ndarray) -> Values:
+            try:
+                return (np.linalg.inv(matrix),)
+            except np.linalg.LinAlgError:
+                return (np.full_like(matrix, np.nan),)
+
+        return _each_matrix(one, x)[0]
+
+
+def negative_counts(x: np.ndarray) -> np.ndarray:
+    """How many eigenvalues of each symmetric matrix are negative; none where it has no numbers."""
+    is_known = np.isfinite(x).all((-2, -1), keepdims=True)
+    return np.sum(np.linalg.eigvalsh(np.where(is_known, x, 0.0)) < 0, axis=-1)
 
 
 def svd(x: np.ndarray) -> Values:

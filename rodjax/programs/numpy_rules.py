@@ -150,7 +150,8 @@ def _iota(body: Any, equation: Any) -> str:
 
 
 def _pad(body: Any, equation: Any, x: str, value: str) -> str:
-    return f"op.pad({x}, {value}, {body.writer.constant(tuple(equation.params['padding_config']))})"
+    padding = numpy_operations.Padding(equation.invars[0].aval.shape, equation.params["padding_config"])
+    return f"{body.writer.constant(padding)}({x}, {value})"
 
 
 def _dynamic_slice(body: Any, equation: Any, x: str, *starts: str) -> str:
@@ -186,8 +187,18 @@ def _gather(body: Any, equation: Any, x: str, starts: str) -> str:
     # Axes of the result, as they stand in what was picked: those of the starts, then those of a window.
     others = [axis for axis in range(result.ndim) if axis not in dims.offset_dims]
     order = tuple(int(k) for k in np.argsort([*others, *dims.offset_dims]))
+    region = _region(body, windows, starts)
+    if region is not None:
+        fixed = ", ".join(map(body.writer.constant, (region, windows.shape, order)))
+        return f"op.gather_at({x}, {fixed})"
     fixed = [windows, order, np.asarray(missing, result.dtype)]
     return f"op.gather({', '.join([x, starts, *map(body.writer.constant, fixed)])})"
+
+
+def _region(body: Any, windows: numpy_operations.Windows, starts: str) -> numpy_operations.Region | None:
+    """Where windows lie whose starts are constants of the program."""
+    known = body.writer.space.get(starts)
+    return None if known is None else windows.region(known)
 
 
 def _unlikely(dtype: np.dtype) -> int:
@@ -213,7 +224,12 @@ def _scatter(combine: str) -> Rule:
             dims.scatter_indices_batching_dims,
             equation.params["mode"] in MOVES,
         )
-        fixed = [windows, (*others, *dims.update_window_dims)]
+        order = (*others, *dims.update_window_dims)
+        region = _region(body, windows, starts)
+        if region is not None:
+            fixed = ", ".join(map(body.writer.constant, (region, order)))
+            return f"op.scatter_at({x}, {updates}, {combine}, {fixed})"
+        fixed = [windows, order]
         return f"op.scatter({', '.join([x, starts, updates, combine, *map(body.writer.constant, fixed)])})"
 
     return rule

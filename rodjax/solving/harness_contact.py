@@ -25,6 +25,7 @@ from rodjax.discretization.form import Linearization
 from rodjax.discretization.nodal import NodalForm, held_back
 from rodjax.discretization.node_contacts import contact_model
 from rodjax.linalg.chain import ChainSystem, factor_chain
+from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
 from rodjax.solving.coupling import Coupling, EndContacts
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
@@ -426,7 +427,7 @@ class ContactModel(eqx.Module):
             force += jnp.einsum("k,kz->z", rods.shares, found.force[:, 12:])
         excess = jnp.sum(jnp.linalg.eigvalsh(matrix) < 0) - between.positive
         is_minimum = (negative + excess == 0) & jnp.isfinite(jnp.sum(matrix))
-        return _Touching(is_minimum, excess, jnp.linalg.inv(matrix), jnp.asarray(by_bodies), force)
+        return _Touching(is_minimum, excess, inverse_matrix(matrix), jnp.asarray(by_bodies), force)
 
     def opening(self, motion: Any) -> Array:
         of_rods, q, _ = motion

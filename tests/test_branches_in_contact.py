@@ -128,6 +128,20 @@ def test_where_a_contact_opens_follows_the_scenes():
     np.testing.assert_allclose(slope, 1.0, rtol=1e-7)
 
 
+@pytest.mark.slow
+def test_a_path_stops_before_the_column_falls():
+    scenes = [column(10.0, aside) for aside in (0.01, 0.004, -0.002, -0.008)]
+    path = rj.solve_path(scenes, segments=SEGMENTS, at_critical="stop")
+    assert path.energy.shape == (2,)
+    np.testing.assert_allclose(path.nodes[..., 1], 0.0, atol=1e-12)
+    fallen = rj.solve_path(scenes, segments=SEGMENTS)
+    assert np.all(fallen.converged)
+    assert np.max(np.abs(fallen.nodes[-1, :, 1])) > 0.3
+    (point,) = rj.critical_points(scenes, fallen)
+    assert point.kind == "contact"
+    np.testing.assert_allclose(point.parameter, 5 / 3, atol=1e-6)
+
+
 # --- cables on a floor ------------------------------------------------------------------------------------------------
 
 FLOOR = Plane((0.0, 0.0, -RADIUS), (0.0, 0.0, 1.0))

@@ -312,6 +312,7 @@ class RodProblem(eqx.Module):
         """See `BranchContacts`."""
         form, point = _settled(place.form, place.point)
         assert isinstance(form, NodalForm)
+        assert form.closed is not None
         return jnp.where(form.closed, point.nodal.pressures, GAP_WEIGHT * form.gaps(point))
 
     def contacts(

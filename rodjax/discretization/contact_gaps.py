@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, THINNER, Elements, Places
-from rodjax.discretization.layout import CellForces
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve, wide_cells, with_wells
 from rodjax.geometry.vectors import root
@@ -152,9 +151,7 @@ def curve(form: PositionForm, point: Any) -> Curve:
     s = form.field.s
     free = jnp.where(form.is_at_support, 0.0, 1.0).astype(s.dtype)
     radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
-    assert isinstance(form.layout, CellForces)
-    normal = form.layout.normal  # of the plane of the rod
-    found = Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, normal)
+    found = Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, form.normal)
     if not has_wells(form.scene):
         return found
     is_wide = point.nodal.is_wide

@@ -19,6 +19,10 @@ from rodjax.linalg.blocks import partial_sums
 from rodjax.model.scene import Scene, has_node_positions
 from rodjax.model.supports import Held
 
+# Of a cell of a rod in a plane, along the normal of that [L^3/EI]. Where contacts are as stiff as 1e10 EI/L^3, one of 1
+# leaves the signs of pivots to rounding.
+COMPLIANCE_OUT_OF_PLANE = 1e-6
+
 
 class SpanForces(eqx.Module):
     """One force in each span. Unknown are those of spans between two held places; a span with a free end has none.
@@ -118,8 +122,10 @@ class CellForces(eqx.Module):
         return CellForces(self.parts, None if axes is None else jnp.cross(axes[:, 0], axes[:, 1]))
 
     def compliance(self, by_cell: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
-        """Of each cell; along the normal one that leaves the force there zero."""
-        return by_cell if self.normal is None else by_cell + (self.normal[:, None] * self.normal[None])[..., None]
+        """Of each cell; along the normal a small one, which leaves the force there zero."""
+        if self.normal is None:
+            return by_cell
+        return by_cell + COMPLIANCE_OUT_OF_PLANE * (self.normal[:, None] * self.normal[None])[..., None]
 
     @property
     def size(self) -> int:

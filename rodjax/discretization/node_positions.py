@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization import potentials
 from rodjax.discretization.form import Form, Linearization
-from rodjax.discretization.layout import SpanForces
+from rodjax.discretization.layout import CellForces, SpanForces
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.potentials import NodeEnergy
 from rodjax.geometry.interpolation import cubic
@@ -43,6 +43,12 @@ class PositionForm(Form):
     ends_move: bool = eqx.field(kw_only=True, static=True, default=False)
     pushed: Bool[Array, "2"] | None = eqx.field(kw_only=True, default=None)
     closed: Bool[Array, "k n+1"] | None = eqx.field(kw_only=True, default=None)
+
+    @property
+    def normal(self) -> Float[Array, "3"] | None:
+        """Of the plane of a rod that stays in one."""
+        assert isinstance(self.layout, CellForces)
+        return self.layout.normal
 
     def released(self, point: Any) -> Linearization:
         """The ends that clamps hold may turn and move; `residual` without these."""

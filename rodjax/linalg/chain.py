@@ -310,6 +310,20 @@ class ChainSystem(eqx.Module):
             between=between if self.between is None else self.between + between,
         )
 
+    def in_plane(self, normal: Float[Array, "3"] | None) -> "ChainSystem":
+        """Without what obstacles and fields do along a normal to displacements, of which a rod in a plane has none."""
+        if normal is None:
+            return self
+        b, identity = len(self.diagonal), jnp.eye(3, dtype=normal.dtype)
+        within = identity - normal[:, None] * normal[None]
+        turning, between = self.turning, self.between
+        if turning is not None:
+            turning = jnp.einsum("icn,cd->idn", turning, within)
+        if between is not None:
+            both = jax.scipy.linalg.block_diag(jnp.eye(b, dtype=normal.dtype), within)
+            between = jnp.einsum("pi,ijn,jq->pqn", both, between, both)
+        return dataclasses.replace(self, stiffness=within @ self.stiffness @ within, turning=turning, between=between)
+
     def condensed(self) -> "ChainSystem":
         """Without the pressures, as elimination goes along the rod."""
         system = self.contacts.condensed(self)

@@ -45,7 +45,7 @@ Kind = Literal["fold", "branch", "contact"]
 
 
 class CriticalPoint(eqx.Module):
-    """An equilibrium at which the stiffness of a motion vanishes.
+    """An equilibrium at which the stiffness of a motion vanishes, or a contact opens or closes.
 
     - `parameter`: where in the sequence of scenes, from 0 to m - 1
     - `kind`: `"fold"`, where the branch turns back in the parameter, so that a path beyond it jumps; `"branch"`,
@@ -123,8 +123,8 @@ def follow(
     corner, and may turn back.
 
     Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, for loads without a potential,
-    friction and `self_contact`, and for harnesses beside obstacles. Keller, "Numerical solution of
-    bifurcation and nonlinear eigenvalue problems" (1977).
+    friction and `self_contact`, and for harnesses beside obstacles. Keller, "Numerical solution of bifurcation and
+    nonlinear eigenvalue problems" (1977).
     """
     stacked = _checked(scenes, "follow")
     steps = _checked_steps(step, max_step, max_points)

@@ -48,6 +48,24 @@ def test_a_column_that_leans_buckles_as_between_a_clamp_and_a_pin():
     np.testing.assert_allclose(by_EI, load, rtol=1e-5)
 
 
+def test_a_branch_is_entered_only_as_far_as_its_contacts_stay():
+    """Bent to one side the column presses harder on the body; to the other less, until it leaves it."""
+    scenes = [column(0.0, 0.5), column(25.0, 0.5)]
+    point = rj.critical_point(scenes, segments=SEGMENTS)
+    center, pushes = np.array([1.0, -RADIUS - BODY]), {}
+    for side in (1, -1):
+        _, bent = rj.switch_branch(scenes, point, side=side, distance=0.01)
+        assert bent.converged
+        np.testing.assert_allclose(np.linalg.norm(bent.nodes[-1, :2] - center), RADIUS + BODY, atol=1e-12)
+        pushes[side] = float(bent.obstacle_forces[0].sum(0)[1])
+    harder = max(pushes, key=lambda side: pushes[side])
+    assert pushes[-harder] < 0.5 < pushes[harder]
+    _, bent = rj.switch_branch(scenes, point, side=harder, distance=0.2)
+    assert bent.converged
+    with pytest.raises(ValueError, match=r"distance must be less than 0\.2: so far from the point a contact opens"):
+        rj.switch_branch(scenes, point, side=-harder, distance=0.2)
+
+
 def test_beside_a_body_that_it_does_not_touch_a_column_buckles_as_without():
     scenes = [column(0.0, 0.0, away=0.05), column(3.0, 0.0, away=0.05)]
     point = rj.critical_point(scenes, segments=SEGMENTS)

@@ -335,7 +335,7 @@ class Product:
         rows, columns = ([shape[axis] for axis in axes] for shape, axes in zip(shapes, free, strict=True))
         self.matrices = [*outer, math.prod(rows), n], [*outer, n, math.prod(columns)]
         self.shape = [*outer, *rows, *columns]
-        # As most products are of matrices as they are.
+        # Most products are of matrices without any axis to be moved.
         self.is_plain = all(
             order == list(range(len(order))) and list(shape) == matrix
             for order, shape, matrix in zip(self.orders, shapes, self.matrices, strict=True)
@@ -363,16 +363,19 @@ def _each_matrix(function: Callable[..., Values], *arrays: np.ndarray) -> Values
     return tuple(column.reshape(outer + column.shape[1:]) for column in columns)
 
 
+def _or_no_numbers(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    """A function of square matrices, not a number for those of which NumPy has none, as in JAX."""
+    try:
+        return function(x)
+    except np.linalg.LinAlgError:
+        if x.ndim == 2:
+            return np.full_like(x, np.nan)
+    return _each_matrix(lambda matrix: (_or_no_numbers(function, matrix),), x)[0]
+
+
 def cholesky(x: np.ndarray) -> np.ndarray:
-    """Not a number where a matrix is not positive definite, as in JAX."""
-
-    def one(matrix: np.ndarray) -> Values:
-        try:
-            return (np.linalg.cholesky(matrix),)
-        except np.linalg.LinAlgError:
-            return (np.full_like(matrix, np.nan),)
-
-    return _each_matrix(one, x)[0]
+    """Not a number where a matrix is not positive definite."""
+    return _or_no_numbers(np.linalg.cholesky, x)
 
 
 def lu(x: np.ndarray) -> Values:
@@ -438,17 +441,7 @@ def eigh(x: np.ndarray, lower: bool) -> Values:
 
 def inverse(x: np.ndarray) -> np.ndarray:
     """Not a number where a matrix is singular."""
-    try:
-        return np.linalg.inv(x)
-    except np.linalg.LinAlgError:
-
-        def one(matrix: np.ndarray) -> Values:
-            try:
-                return (np.linalg.inv(matrix),)
-            except np.linalg.LinAlgError:
-                return (np.full_like(matrix, np.nan),)
-
-        return _each_matrix(one, x)[0]
+    return _or_no_numbers(np.linalg.inv, x)
 
 
 def negative_counts(x: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, taut
+from rodjax.model.scene import nondimensional
+from rodjax.solving.guess import beside_obstacles
 
 RADIUS = 0.005
 PIPE = rj.Capsule((0.3, -1, 0), (0.3, 1, 0), 0.1)
@@ -176,3 +178,85 @@ def test_starts_that_are_too_long_or_within_obstacles_come_to_rest(name):
     # At contact points to rounding; the supports are no nearer.
     distances = np.min([np.asarray(obstacle.distance(result.nodes)) for obstacle in obstacles], axis=0)
     assert np.min(distances) > RADIUS - 1e-9
+
+
+def cantilever(weight: float, obstacles: list[rj.Obstacle], turn=None, *, is_reversed: bool = False) -> rj.Scene:
+    """A cable that points along x, straight at first."""
+    turn = np.eye(3) if turn is None else turn
+    rod = rj.Rod(1.0, 1.0, 0.8, 1e6, weight, radius=RADIUS)
+    start = rj.Clamp((0.0, 0.0, 0.0), turn @ np.asarray(rj.frame((-1.0 if is_reversed else 1.0, 0.0, 0.0))))
+    ends = (rj.Free(), start) if is_reversed else (start, rj.Free())
+    return rj.Scene(rod, *ends, turn @ np.array([0.0, 0.0, -1.0]), obstacles=obstacles)
+
+
+# The first within which a straight cable ends, the second that it goes through in the middle.
+BOXES = {"it ends within": ((0.9, 0.0, 0.0), 0.24), "through the middle": ((0.4, 0.0, 0.0), 0.2)}
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_a_free_end_is_led_out_on_top(name):
+    """However all of it is turned, and whichever end is free."""
+    center, size = np.array(BOXES[name][0]), BOXES[name][1]
+    straight = np.linspace(0, 1, 65)[:, None] * np.array([1.0, 0.0, 0.0])
+    found = []
+    for turn, is_reversed in (
+        (np.eye(3), False),
+        (np.eye(3), True),
+        (Rotation.from_rotvec([0.5, -1.1, 2.3]).as_matrix(), False),
+    ):
+        scene, units = nondimensional(
+            cantilever(1.0, [rj.Box(turn @ center, (size, 2.0, size), turn)], turn, is_reversed=is_reversed)
+        )
+        assert float(units.length) == 1.0
+        points = straight @ turn.T
+        nodes = np.asarray(beside_obstacles(scene, jnp.asarray(points[::-1] if is_reversed else points), 64))
+        found.append((nodes[::-1] if is_reversed else nodes) @ turn)
+    over, reversed_, turned = found
+    np.testing.assert_allclose(reversed_, over, atol=1e-5)  # the axes of the scene, with another clamp, by 3e-6
+    np.testing.assert_allclose(turned, over, atol=1e-9)
+    box = rj.Box(center, (size, 2.0, size))
+    np.testing.assert_array_less(RADIUS, np.asarray(box.distance(over)))
+    inside = np.abs(over[:, 0] - center[0]) < size / 2
+    assert np.sum(inside) > 5
+    assert np.min(over[inside, 2]) > size / 2
+    np.testing.assert_allclose(over[0], 0.0, atol=1e-15)
+    # Cut by chords of the string before it is led out once more.
+    assert length_of(over) == pytest.approx(1.0, abs=1e-2)
+    chord = over[1] - over[0]
+    assert chord[0] / np.linalg.norm(chord) > np.cos(np.deg2rad(5))  # along the clamp, as above
+
+
+# Weight, capsule, box, sphere: a straight cable goes through one or two of them, and the others are far away. None of
+# these came to rest from there: the search came through, was pressed to nothing, or found no better point.
+FAR = 9.0
+FREE_SCENES = {
+    "capsule and sphere": (
+        1063.632,
+        ((0.693, -0.469, -0.029), (0.961, 0.531, -0.029), 0.026),
+        ((0.0, 0.0, FAR), 0.1),
+        ((0.792, -0.042, -0.007), 0.085),
+    ),
+    "box": (
+        1808.897,
+        ((0.0, -1.0, FAR), (0.0, 1.0, FAR), 0.1),
+        ((0.672, 0.043, -0.007), 0.18),
+        ((0.0, 0.0, FAR), 0.1),
+    ),
+    "capsule and box": (
+        377.605,
+        ((0.918, -0.55, -0.038), (0.978, 0.45, -0.038), 0.063),
+        ((0.427, -0.021, 0.004), 0.164),
+        ((0.0, 0.0, FAR), 0.1),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FREE_SCENES)
+def test_a_cable_with_a_free_end_whose_first_shape_is_through_obstacles_comes_to_rest(name):
+    weight, capsule, (center, size), sphere = FREE_SCENES[name]
+    obstacles = [rj.Capsule(*capsule), rj.Box(center, (size, 1.0, size)), rj.Sphere(*sphere)]
+    result = rj.solve(cantilever(weight, obstacles), segments=32)
+    assert bool(result.converged)
+    assert bool(result.stable)
+    distances = np.min([np.asarray(obstacle.distance(result.nodes)) for obstacle in obstacles], axis=0)
+    assert np.min(distances) > RADIUS - 1e-9  # as above

@@ -11,7 +11,7 @@ from rodjax.discretization.first_shape import first_shape
 from rodjax.geometry.interpolation import cubic, resampled
 from rodjax.model.scene import nondimensional
 from rodjax.solving import equilibrium
-from rodjax.solving.guess import hanging_guess
+from rodjax.solving.guess import other_guess
 
 
 def shape(scene: Scene, segments: int = 200) -> np.ndarray:
@@ -81,12 +81,12 @@ def test_a_start_that_leads_nowhere_beside_obstacles_is_followed_by_an_arc(monke
     scene = rj.Scene(rod, *BETWEEN, (0, 0, -1.0), obstacles=PIPE_AND_BOX)
     result = rj.solve(scene, segments=24)
     assert result.converged
-    arc = hanging_guess(scene)
+    arc = other_guess(scene, planar=False)
     assert arc is not None
     from_arc = rj.solve(scene, segments=24, guess=arc)
     np.testing.assert_array_equal(result.nodes, from_arc.nodes)
     with monkeypatch.context() as without:
-        without.setattr(equilibrium, "hanging_guess", lambda scene: None)
+        without.setattr(equilibrium, "other_guess", lambda scene, **_: None)
         with pytest.warns(rj.NotConvergedWarning):
             first = rj.solve(scene, segments=24)
     # The work of both searches is told.
@@ -96,7 +96,7 @@ def test_a_start_that_leads_nowhere_beside_obstacles_is_followed_by_an_arc(monke
 def test_an_arc_hangs_between_the_supports_as_long_as_the_rod():
     rod = rj.Rod(1.0, 1.0, 0.8, 1e6, mass_per_length=1.0)
     scene = rj.Scene(rod, *BETWEEN, (0, 0, -1.0))
-    arc = hanging_guess(scene)
+    arc = other_guess(scene, planar=False)
     assert arc is not None
     points = np.asarray(arc.points)
     np.testing.assert_allclose(points[[0, -1]], [(0, 0, 0), (0.494, 0, 0)], atol=2e-3)
@@ -109,14 +109,23 @@ def test_where_nothing_hangs_an_arc_turns_with_the_scene():
     rod = rj.Rod(1.0, 1.0, 0.8, 1e6)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
     turned = [rj.Swivel(turn @ end.position, turn @ end.tangent) for end in BETWEEN]
-    arc, other = hanging_guess(rj.Scene(rod, *BETWEEN)), hanging_guess(rj.Scene(rod, *turned))
+    arc, other = (other_guess(rj.Scene(rod, *ends), planar=False) for ends in (BETWEEN, turned))
     assert arc is not None
     assert other is not None
     np.testing.assert_allclose(other.points, arc.points @ turn.T, atol=1e-12)
 
 
-def test_there_is_no_arc_through_clips_or_to_a_free_end():
+def test_a_rod_curved_at_rest_with_a_free_end_begins_again_straight():
+    start = rj.Clamp((0.1, 0, 0), rj.frame((0, 0.6, 0.8)))
+    scene = rj.Scene(rj.Rod(2.0, 1.0, 1.0, 1e6, rest_curvature=(1.0, 0.0)), start, rj.Free())
+    straight = other_guess(scene, planar=True)
+    assert straight is not None
+    np.testing.assert_allclose(np.asarray(straight.points)[[0, -1]], [(0.1, 0, 0), (0.1, 1.2, 1.6)], atol=1e-12)
+
+
+def test_there_is_no_other_shape_through_clips_in_a_plane_or_of_a_straight_rod_with_a_free_end():
     rod = rj.Rod(1.0, 1.0, 0.8, 1e6)
     start, end = BETWEEN
-    assert hanging_guess(rj.Scene(rod, start, rj.Free())) is None
-    assert hanging_guess(rj.Scene(rod, start, end, clips=[rj.Clip(0.5, (0.2, 0.1, 0))])) is None
+    assert other_guess(rj.Scene(rod, start, rj.Free()), planar=False) is None
+    assert other_guess(rj.Scene(rod, start, end), planar=True) is None
+    assert other_guess(rj.Scene(rod, start, end, clips=[rj.Clip(0.5, (0.2, 0.1, 0))]), planar=False) is None

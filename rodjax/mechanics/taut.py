@@ -19,11 +19,13 @@ ROUNDS = 2250
 # The string touches an obstacle from which it is less than this part of the radius away.
 TOUCHES = 0.05
 # A string is drawn in by this many pieces, at most so many times, until a round changes its length by no more than this
-# part: then it is taut; at least so often, for kinks. Its places are then so often spread evenly along it.
+# part: then it is taut; at least so often, for kinks; with a free end, so often in all. Its places are then so often
+# spread evenly along it.
 DRAWN_PIECES = 64
 DRAWN_ROUNDS = 3000
 LEAST_CHANGE = 1e-7
 LEAST_ROUNDS = 5
+ROUNDS_OUT = 60
 SPREADS = 3
 # It is drawn in where it is longer than the rod by this part, or nearer to an obstacle than the radius by this one, and
 # kept away by this part more than the radius.
@@ -36,6 +38,7 @@ BESIDE = 0.1
 OPPOSITE = -0.1
 DIRECTIONS = 8
 MOST_STEPS = 24
+ALIKE = 1e-6
 
 
 def _distance(obstacles: tuple[Obstacle, ...]) -> Callable[[Float[Array, "3"]], Float[Array, ""]]:
@@ -124,12 +127,50 @@ def drawn_in(
     return string, is_needed
 
 
+def led_out(
+    points: Float[Array, "m 3"],
+    tangent: Float[Array, "3"] | None,
+    first_side: Float[Array, "3"],
+    obstacles: tuple[Obstacle, ...],
+    radius: Float[Array, ""],
+    length: Float[Array, ""],
+) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
+    """A string held at its first place alone that begins as `points` and is led out of the obstacles, `length` long;
+    and whether that was needed. It goes straight on beyond what it lies on, and has the tangent that a support holds.
+    Where each side is as near it takes that of `first_side`.
+    """
+    begin = resampled(points, DRAWN_PIECES)
+    nearest = jnp.min(jax.vmap(_distance(obstacles))(begin[1:]))
+    is_needed = nearest < (1 - NEARER) * radius
+    radius, step = (1 + BESIDE) * radius, length / DRAWN_PIECES
+
+    def straight_on(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
+        if tangent is not None:
+            string = string.at[1].set(string[0] + step * tangent)
+        return string.at[-1].set(2 * string[-2] - string[-3])
+
+    # With a place beyond its end, which need not be outside.
+    string = jnp.concatenate([begin, 2 * begin[-1:] - begin[-2:-1]])
+    string = _led_to_one_side(string, obstacles, radius, first_side)
+    rounds = jnp.where(is_needed, ROUNDS_OUT, 0)
+    string = jax.lax.fori_loop(0, rounds, lambda _, last: _pulled(last, obstacles, radius, straight_on), string)
+    for _ in range(SPREADS):
+        beyond = string[-1:] + 2 * length * _unit(string[-1:] - string[-3:-2])
+        string = _spread(jnp.concatenate([string, beyond]), length + 2 * step)[:-1]
+        string = _outside(string, obstacles, radius)
+    return string[:-1], is_needed
+
+
 def _led_to_one_side(
-    string: Float[Array, "q 3"], obstacles: tuple[Obstacle, ...], radius: Float[Array, ""]
+    string: Float[Array, "q 3"],
+    obstacles: tuple[Obstacle, ...],
+    radius: Float[Array, ""],
+    first_side: Float[Array, "3"] | None = None,
 ) -> Float[Array, "q 3"]:
     """Out of obstacles that it crosses in their middle, whose distance would lead one half of it forwards and the other
     backwards: in the direction across, of several, in which all of it is out soonest. Directions are counted from
-    where the string sags.
+    where the string sags, or from `first_side` of a string that is free at its end: that leads it out also where it
+    ends within.
     """
     places, distance = string[1:-1], _distance(obstacles)
     distances, normals = jax.vmap(jax.value_and_grad(distance))(places)
@@ -140,11 +181,14 @@ def _led_to_one_side(
     # In the middle itself there may be no normal: of places on both sides of another.
     is_opposite = jnp.sum(normals[2:] * normals[:-2], axis=1) < OPPOSITE
     parts = jnp.pad(is_within[2:] & is_within[1:-1] & is_within[:-2] & is_opposite, 1)
+    if first_side is not None:
+        parts = parts.at[-1].set(is_within[-1])
     is_parted = jax.ops.segment_max(parts.astype(int), number, count)[number] > 0
     first = jax.ops.segment_min(k, number, count)[number]
     last = jax.ops.segment_max(k, number, count)[number]
     along = _unit(string[jnp.clip(last + 2, 0, count + 1)] - string[jnp.clip(first, 0, count + 1)])
-    sag = jnp.broadcast_to(jnp.mean(string, axis=0) - (string[0] + string[-1]) / 2, along.shape)
+    side = jnp.mean(string, axis=0) - (string[0] + string[-1]) / 2 if first_side is None else first_side
+    sag = jnp.broadcast_to(side, along.shape)
     aside = _unit(sag - jnp.sum(sag * along, axis=1, keepdims=True) * along)
     angles = jnp.arange(DIRECTIONS, dtype=string.dtype)[:, None, None] * (2 * jnp.pi / DIRECTIONS)
     across = jnp.cos(angles) * aside[None] + jnp.sin(angles) * jnp.cross(along, aside)[None]
@@ -156,7 +200,7 @@ def _led_to_one_side(
     steps = jnp.where(jnp.any(is_parted), MOST_STEPS, 0)
     ways = jax.lax.fori_loop(0, steps, further, jnp.zeros(across.shape[:2], string.dtype))
     farthest = jax.vmap(lambda way: jax.ops.segment_max(way, number, count))(ways)[:, number]
-    best = jnp.argmin(farthest, axis=0)
+    best = jnp.argmax(farthest <= (1 + ALIKE) * jnp.min(farthest, axis=0, keepdims=True), axis=0)  # the first of those
     out = ways[best, k][:, None] * across[best, k]
     return string.at[1:-1].add(jnp.where((is_parted & is_within)[:, None], out, 0.0))
 
@@ -166,9 +210,9 @@ def _unit(vectors: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
     return jnp.where(sizes > 0, vectors / jnp.where(sizes > 0, sizes, 1.0), 0.0)
 
 
-def _spread(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
-    """The same string with places at equal distances along it."""
+def _spread(string: Float[Array, "q 3"], length: Float[Array, ""] | None = None) -> Float[Array, "q 3"]:
+    """The same string with places at equal distances along it, as far as `length`."""
     steps = jnp.sqrt(jnp.sum(jnp.diff(string, axis=0) ** 2, axis=1))
     along = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
-    at = jnp.linspace(0.0, 1.0, len(string), dtype=steps.dtype) * along[-1]
+    at = jnp.linspace(0.0, 1.0, len(string), dtype=steps.dtype) * (along[-1] if length is None else length)
     return jnp.stack([jnp.interp(at, along, component) for component in string.T], axis=1)

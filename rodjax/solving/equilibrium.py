@@ -53,7 +53,7 @@ from rodjax.model.scene import (
 from rodjax.model.supports import Clamp
 from rodjax.notes import note
 from rodjax.programs.compilation import compiled
-from rodjax.solving.guess import Guess, beside_obstacles, hanging_guess
+from rodjax.solving.guess import Guess, beside_obstacles, other_guess
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
@@ -163,7 +163,7 @@ def solve_scene(
     result = _solve(fixed_scene, *first_state(fixed_scene, guess, options), strain_limit, options)
     if is_known(result.status):
         if guess is None and fixed_scene.obstacles and not result.converged:
-            result = _from_an_arc(result, fixed_scene, options, strain_limit)
+            result = _from_another_shape(result, fixed_scene, options, strain_limit)
         result = _looked_at(result) if rtol is None else _refined(result, options, rtol, strain_limit)
     if fixed_scene is not scene:
         result = with_ranges(fixed_scene, result)
@@ -171,17 +171,17 @@ def solve_scene(
     return result if fixed_scene is scene else differentiable(scene, result)
 
 
-def _from_an_arc(
+def _from_another_shape(
     result: Equilibrium, scene: Scene, options: Options, strain_limit: Float[Array, ""] | float
 ) -> Equilibrium:
-    """Found from an arc that hangs between the supports, where the search from the scene's own shape found nothing
-    beside its obstacles; else the result as it is.
+    """Found from another shape, where the search from the scene's own found nothing beside its obstacles; else the
+    result as it is.
     """
-    arc = None if options.planar or options.find != "minimum" else hanging_guess(scene)
-    if arc is None:
+    shape = other_guess(scene, planar=options.planar) if options.find == "minimum" else None
+    if shape is None:
         return result
-    note("solving again, from an arc that hangs between the supports")
-    other = _solve(scene, *first_state(scene, arc, options), strain_limit, options)
+    note("solving again, from another shape")
+    other = _solve(scene, *first_state(scene, shape, options), strain_limit, options)
     return _with_effort_of(other, result) if other.converged else result
 
 
@@ -663,7 +663,7 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
             return state(shape, in_parts(force, parts) if has_potential(scene) else no_force), first
         shape = first_frames(scene, s, of_joints)
         if scene.obstacles:
-            points = first_shape(scene, pieces)
+            points = first_shape(scene, pieces) if scene.rod.rest_shape is None else shape.points(pieces)
             aside = beside_obstacles(scene, points, pieces)
             is_aside = jnp.any(aside != points)
             framed = framed_through(scene, aside, of_joints)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import leaf, number_array, shown
-from rodjax.discretization.first_shape import hanging_arc
+from rodjax.discretization.first_shape import first_shape, hanging_arc
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.interpolation import resampled
-from rodjax.mechanics.taut import drawn_in
+from rodjax.mechanics.taut import drawn_in, led_out
 from rodjax.model.scene import Scene, nondimensional, scene_axes
 from rodjax.model.supports import Directed, Held
 from rodjax.model.triangle_mesh import Mesh
@@ -23,13 +23,15 @@ from rodjax.units import Units
 FOLDED = -0.99
 ASIDE = 0.05
 ARC_PIECES = 64
+# On top of an obstacle; where gravity has no part across the rod, to this side by the axes of the scene.
+UPWARDS = np.array([3e-6, 2e-6, 1e-6])
 
 
 class Guess(eqx.Module):
     """An initial shape; it need not match the supports, the length or the mesh.
 
-    Beside obstacles it tells on which side the rod passes them. Where it is longer than the rod, or lies within one, it
-    is drawn in and led out first, between two supports without clips.
+    Beside obstacles it tells on which side the rod passes them. Without clips it is led out of obstacles first, and
+    between two supports drawn in where it is longer than the rod.
 
     `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
     frames allow on this shape, the solution has the one nearest to this.
@@ -55,35 +57,55 @@ class Guess(eqx.Module):
 
 
 def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
-    """The nodes of a mesh on a shape, for a nondimensional scene; where obstacles are near, on one that is drawn in,
-    if it is longer than the rod or lies within an obstacle.
+    """The nodes of a mesh on a shape, for a nondimensional scene; where obstacles are near, on one that is drawn in or
+    led out, if it is longer than the rod between two supports or lies within an obstacle.
 
-    Not through clips, not with a free end, and not beside a `Mesh`, whose distance is dear.
+    Not through clips, and not beside a `Mesh`, whose distance is dear.
     """
     nodes = resampled(points, segments)
     start, end, radius = scene.start, scene.end, scene.rod.radius
     has_mesh = any(map(_is_mesh, jax.tree.leaves(scene.obstacles, is_leaf=_is_mesh)))
-    if not scene.obstacles or has_mesh or scene.clips or not isinstance(start, Held) or not isinstance(end, Held):
+    if not scene.obstacles or has_mesh or scene.clips:
         return nodes
-    between = points.at[0].set(start.position).at[-1].set(end.position)
     assert radius is not None, "a rod beside obstacles has a radius"
-    thickest = jnp.max(getattr(radius, "values", radius))
+    thickest, length = jnp.max(getattr(radius, "values", radius)), scene.rod.length
     first, last = (support.tangent if isinstance(support, Directed) else None for support in (start, end))
-    string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, scene.rod.length)
+    if isinstance(start, Held) and isinstance(end, Held):
+        between = points.at[0].set(start.position).at[-1].set(end.position)
+        string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, length)
+    else:
+        axes = scene_axes(scene)
+        upwards = axes @ UPWARDS - (0.0 if scene.gravity is None else _unit(scene.gravity))
+        is_held = isinstance(start, Held)
+        held, tangent = (start, first) if is_held else (end, None if last is None else -last)
+        assert isinstance(held, Held), "a scene holds at least one position"
+        from_held = (points if is_held else points[::-1]).at[0].set(held.position)
+        string, is_needed = led_out(from_held, tangent, upwards, scene.obstacles, thickest, length)
+        string = string if is_held else string[::-1]
     return jnp.where(is_needed, resampled(string, segments), nodes)
 
 
-def hanging_guess(scene: Scene) -> Guess | None:
-    """The arc that hangs between two supports, whatever tangents they hold; `None` with clips or a free end."""
-    if scene.clips or not isinstance(scene.start, Held) or not isinstance(scene.end, Held):
+def other_guess(scene: Scene, *, planar: bool) -> Guess | None:
+    """Another shape to begin with: the arc that hangs between two supports, whatever tangents they hold; a rod with a
+    free end that began in its shape at rest, straight. `None` with clips, and where there is no other.
+    """
+    has_free_end = not (isinstance(scene.start, Held) and isinstance(scene.end, Held))
+    if scene.clips or (scene.rod.rest_shape is None if has_free_end else planar):
         return None
-    return Guess(_hanging_points(scene))
+    return Guess(_other_points(scene))
 
 
 @compiled
-def _hanging_points(scene: Scene) -> Float[Array, "m 3"]:
+def _other_points(scene: Scene) -> Float[Array, "m 3"]:
     scaled, units = nondimensional(scene)
-    return units.origin[None] + units.length * hanging_arc(scaled, ARC_PIECES)
+    is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
+    points = hanging_arc(scaled, ARC_PIECES) if is_held else first_shape(scaled, ARC_PIECES)
+    return units.origin[None] + units.length * points
+
+
+def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    size = jnp.sqrt(jnp.sum(vector**2))
+    return jnp.where(size > 0, vector / jnp.where(size > 0, size, 1.0), 0.0)
 
 
 def _is_mesh(obstacle: Any) -> bool:

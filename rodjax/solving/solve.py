@@ -83,9 +83,10 @@ def solve(
         that of a guess whose mesh is kept, `"finite_difference"` for `NonlinearCG`, else `"hermite"`.
     - `solver`: `Newton` or `NonlinearCG`; `None` for `Newton()`.
     - `guess`: an earlier `Equilibrium` (a warm start, which carries turns), a `Guess`, or `None`: a shape made from the
-        supports and gravity. Where no minimum is found from that beside obstacles, one is sought from an arc that
-        hangs between the supports (not if `planar`, nor in `jit`, `vmap`, paths and batches). Of a harness an earlier
-        equilibrium, or `{name: Guess}` for some of its cables: joints begin where these end.
+        supports and gravity. Where no minimum is found from that beside obstacles, one is sought from another shape: an
+        arc that hangs between the supports (not if `planar`), a straight line where an end is free and the rod curved
+        at rest. Not in `jit`, `vmap`, paths and batches. Of a harness an earlier equilibrium, or `{name: Guess}` for
+        some of its cables: joints begin where these end.
     - `planar`: seek the rod in the plane in which supports and loads lie, with half of the unknowns. `stable` speaks of
         motions out of the plane too.
     - `find`: `"minimum"`: an equilibrium where the energy has negative curvature, such as a planar shape that is

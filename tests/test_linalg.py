@@ -284,6 +284,26 @@ def with_far_contacts(system: ChainSystem) -> ChainSystem:
     return dataclasses.replace(system, contacts=contacts)
 
 
+def with_open_contacts(system: ChainSystem, count: int) -> ChainSystem:
+    """And behind those three so many open ones, without curvature."""
+    system = with_far_contacts(system)
+    far = system.contacts.far
+    assert far is not None
+    rng = np.random.default_rng(5)
+    nodes = rng.integers(0, len(system.held), (4, count))
+    by_rotation, by_position = (np.zeros((5, size, 4, count)) for size in (2, 3))
+    by_rotation[0], by_position[0] = rng.normal(size=(2, 4, count)), rng.normal(size=(3, 4, count))
+    by_position[0] *= np.where(system.held, 0.0, 1.0)[nodes]
+    far = FarRows(
+        jnp.concatenate([far.by_rotation, jnp.asarray(by_rotation)], axis=-1),
+        jnp.concatenate([far.by_position, jnp.asarray(by_position)], axis=-1),
+        jnp.concatenate([far.nodes, jnp.asarray(nodes)], axis=-1),
+        jnp.append(far.elements, 3 + jnp.arange(count)),
+        far.row,
+    )
+    return dataclasses.replace(system, contacts=dataclasses.replace(system.contacts, far=far))
+
+
 def random_loads(elements: int) -> LoadRows:
     rng = np.random.default_rng(7)
     shapes = ((2, 3, 2, 3, elements), (3, 2, 3, elements), (2, 3, 2, 3, elements))
@@ -297,8 +317,20 @@ def random_loads(elements: int) -> LoadRows:
 def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads, others):
     """Also with loads that have no potential, without symmetry, and with contacts within and between elements."""
     system = dataclasses.replace(random_chain(elements), is_backward=is_backward, loads=loads and loads(elements))
-    if others is not None:
-        system = others(system)
+    check_chain(system if others is None else others(system))
+
+
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_of_contacts_between_elements_those_that_are_needed_are_solved_for(is_closed):
+    """Of twelve three, and all where the last one is closed."""
+    system = with_open_contacts(random_chain(14), 9)
+    closed = system.contacts.is_closed.at[2, 11].set(is_closed)
+    check_chain(system.closed_where(closed))
+
+
+def check_chain(system: ChainSystem):
+    """Against its matrix."""
+    elements, loads = system.across.shape[-1], system.loads
     pressures = system.contacts.is_closed.size
     m, multipliers = 2 * elements + 1, 1 + pressures + 3 * (elements + 1) + 3 * elements
 

@@ -22,7 +22,7 @@ are no contact: less than half a turn around the rod's own radius away, or of th
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
+from rodjax.programs.parts import traced_once
 
 # NARROW: by how much the gap of a narrow well grows half of an element from its middle [radii]. WIDE: stiffness k of a
 # wide well [1/radius], whose gap grows there by DEEPEST_WELL at most [radii]. A well is narrow where the second
@@ -50,6 +51,9 @@ STEPS = 12
 # Steps of a search by the squared distance, before these: by the distance itself Newton's steps lead beyond the nearest
 # place where that is further along the rod than the other part is away.
 FAR_STEPS = 6
+STANDS = 1e-14  # no place moves by more [L]: the search ends
+# Squares of distances are the same to rounding.
+ALIKE = 1 + 1e-12
 # Of the elements, those nearest to the rod beyond them may touch it: at most so many.
 MOST_CONTACTS = 48
 # A step leads no element nearer to what it is nearest to than this part of the distance at which they touch.
@@ -116,30 +120,41 @@ class SelfContacts(NamedTuple):
 
 def nearest(curve: Curve) -> Nearest:
     """Of each element; without derivatives."""
-    curve = jax.lax.stop_gradient(curve)
+    return _nearest(jax.lax.stop_gradient(curve))
+
+
+@traced_once
+def _nearest(curve: Curve) -> Nearest:
     s, n = curve.s, len(curve.s) - 1
     cell = jnp.arange(n)
     begin, end, least, most = _range(curve)
     samples, of_element = _samples(s)
-    differences = [c[:, None] - c[None] for c in side_at(curve, of_element, samples).x]
-    squares = functools.reduce(jnp.add, map(jnp.square, differences)).reshape(n, len(SAMPLES), -1)
-    # Of a cell those of its element, and those of the next one within it.
-    here = samples.reshape(n, -1)
-    ahead = np.minimum(np.arange(n) + 1, n - 1)
-    squares = jnp.concatenate([squares, squares[ahead, :SAMPLES_AHEAD]], axis=1)
-    here = jnp.concatenate([here, here[ahead, :SAMPLES_AHEAD]], axis=1)
+    x = jnp.stack(side_at(curve, of_element, samples).x)  # [3, k]
     allowed = (samples[None] >= least[:, None]) & (samples[None] <= most[:, None])
-    allowed = allowed[:, None] & (here <= end[:, None])[..., None]
-    squares = jnp.where(allowed, squares, jnp.inf).reshape(n, -1)
-    best = jnp.argmin(squares, axis=1)
-    exists = jnp.isfinite(jnp.min(squares, axis=1))
-    first = here[cell, best // len(samples)], samples[best % len(samples)]
+
+    def squares(rows: Int[Array, "n r"]) -> Float[Array, "n r k"]:
+        """Of the distances of these samples from all that their cells may touch."""
+        parts = (x[c][rows][..., None] - x[c][None, None] for c in range(3))
+        return jnp.where(allowed[:, None], functools.reduce(jnp.add, map(jnp.square, parts)), jnp.inf)
+
+    # Of a cell those of its element, and those of the next one within it.
+    own = np.arange(len(samples)).reshape(n, -1)
+    ahead = own[np.minimum(np.arange(n) + 1, n - 1), :SAMPLES_AHEAD]
+    of_ahead = jnp.where(samples[ahead] <= end[:, None], jnp.min(squares(ahead), axis=2), jnp.inf)
+    of_rows = jnp.concatenate([jnp.min(squares(own), axis=2), of_ahead], axis=1)
+    row = jnp.concatenate([own, ahead], axis=1)[cell, jnp.argmin(of_rows, axis=1)]
+    least_square = jnp.min(of_rows, axis=1)
+    exists = jnp.isfinite(least_square)
+    # The first that is as near, to rounding: `argmin` of many numbers takes several times as long as `min`.
+    is_nearest = squares(row[:, None])[:, 0] <= ALIKE * least_square[:, None]
+    column = jnp.min(jnp.where(is_nearest, np.arange(len(samples))[None], len(samples) - 1), axis=1)
+    first = samples[row], samples[column]
     h = jnp.diff(s)
 
     def nearer(k: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         a, b = pair
         element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
-        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b, is_far=k < FAR_STEPS)
+        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b, k < FAR_STEPS)
         bb = jnp.where(bb > 0, bb, 1.0)
         slope, growth = of_a - ab * of_b / bb, aa - ab**2 / bb
         step = jnp.where(growth > 0, -slope / jnp.where(growth > 0, growth, 1.0), -jnp.sign(slope) * h)
@@ -147,7 +162,18 @@ def nearest(curve: Curve) -> Nearest:
         along = jnp.clip(-(of_b + ab * step) / bb, -h[other] / 2, h[other] / 2)
         return a + step, jnp.clip(b + along, least, most)
 
-    a, b = jax.lax.fori_loop(0, FAR_STEPS + STEPS, nearer, first)
+    def stepped(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        k, a, b, _ = state
+        nearer_a, nearer_b = nearer(k, (a, b))
+        way = jnp.where(exists, jnp.abs(nearer_a - a) + jnp.abs(nearer_b - b), 0.0)
+        return k + 1, nearer_a, nearer_b, jnp.max(way)
+
+    def goes_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        k, _, _, way = state
+        return (k < FAR_STEPS + STEPS) & ((k <= FAR_STEPS) | (way > STANDS))
+
+    begin_here = jnp.zeros((), int), *first, jnp.zeros((), s.dtype)
+    _, a, b, _ = jax.lax.while_loop(goes_on, stepped, begin_here)
     element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
     _, _, (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b)
     is_flat = aa * bb <= ab**2
@@ -196,7 +222,7 @@ def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
     old, new = ([c[:, None] - c[None] for c in side_at(curve, of_element, begin).x] for curve in (before, after))
     squares, products = (functools.reduce(jnp.add, map(jnp.multiply, old, way)) for way in (old, new))
     is_far = allowed & (squares > 4 * reach**2)
-    return is_pierced | jnp.any(is_far & (products < reach * jnp.sqrt(squares)))
+    return is_pierced | jnp.any(is_far & ((products < 0) | (products**2 < reach**2 * squares)))
 
 
 class Exerted(NamedTuple):
@@ -235,6 +261,7 @@ def on_elements(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest | N
     return on_positions, on_tangents
 
 
+@traced_once
 def moving_gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[Array, "k"], Float[Array, "k"]]:
     """And the places, as they move with the curve: by two steps of Newton's method, which have the first three
     derivatives.
@@ -252,6 +279,7 @@ def moving_gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[
     return distance - curve.radius[found.cell] - curve.radius[found.other], a, b
 
 
+@traced_once
 def gap_vectors(
     curve: Curve, found: Nearest, pressures: Float[Array, "p"]
 ) -> tuple[Float[Array, "5 b+3 4 p"], Int[Array, "4 p"], Float[Array, "b b n+1"]]:
@@ -317,6 +345,7 @@ def gap_vectors(
     return vectors, nodes, nothing.at[:, :, nodes].add(-turn)
 
 
+@traced_once
 def side_at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> Side:
     begin, end = curve.s[element], curve.s[element + 1]
     h = end - begin
@@ -346,6 +375,7 @@ def side_at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> Sid
     )
 
 
+@traced_once
 def direction(here: Side, there: Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
     """The distance of two places, and the direction in which it grows."""
     way = here.x - there.x
@@ -359,6 +389,7 @@ def direction(here: Side, there: Side) -> tuple[Float[Array, "k"], Float[Array, 
     return distance, way / distance[None]
 
 
+@traced_once
 def seen_distance(
     curve: Curve,
     cell: Int[Array, "k"],
@@ -366,7 +397,7 @@ def seen_distance(
     other: Int[Array, "k"],
     a: Float[Array, "k"],
     b: Float[Array, "k"],
-    is_far: Any = False,
+    is_far: Array | None = None,
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
     """The distance and the well of the cell, and its derivatives by both places; `is_far`: the
     second ones as of half of the squared distance, by the distance.
@@ -377,7 +408,7 @@ def seen_distance(
     aside = a - curve.s[cell] - MIDDLE * h
     well = (narrow_wells(curve) if curve.wells is None else curve.wells)[cell]
     on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
-    across = 1.0 - jnp.asarray(is_far, d.dtype)
+    across = 1.0 if is_far is None else 1.0 - is_far.astype(d.dtype)
     aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature) + well
     bb = (dot(there.slope, there.slope) - across * on_there**2) / d - dot(normal, there.curvature)
     ab = -(dot(here.slope, there.slope) - across * on_here * on_there) / d
@@ -395,6 +426,7 @@ def with_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
     return curve._replace(wells=jnp.where(is_wide, wide, narrow_wells(curve)))
 
 
+@traced_once
 def wide_cells(curve: Curve, pressures: Float[Array, "n+1"]) -> Bool[Array, "n"]:
     """Which cells are to have wide wells, at these pressures."""
     curve = jax.lax.stop_gradient(with_wells(curve, jnp.ones_like(curve.radius, bool)))

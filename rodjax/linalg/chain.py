@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks
+from rodjax.linalg.chain_border import Border, Columns
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.programs.parts import traced_once
@@ -347,41 +348,6 @@ class _Middles(eqx.Module):
         return self.left @ of_middles
 
 
-class _Border(eqx.Module):
-    """What all of a chain has in common: the border of its system, then the columns of contacts between elements.
-
-    `by_place`: `None` where there are none of the latter; `positive`: of the columns, those of positive compliance.
-    """
-
-    by_rotation: Float[Array, "b k m"]
-    by_position: Float[Array, "k n+1 3"] | None
-    compliance: Float[Array, "k k"]
-    positive: int = eqx.field(static=True)
-
-    @staticmethod
-    def of(system: ChainSystem, contacts: ContactRows) -> "_Border":
-        """Of a system that may be mirrored, with contacts that are not."""
-        far = contacts.far
-        if far is None:
-            return _Border(system.border, None, system.compliance, len(system.compliance))
-        columns = far.columns(contacts.is_closed[far.row], contacts.contact_compliance, system.diagonal.shape[-1])
-        by_rotation, by_position, compliances = columns
-        if system.is_backward:
-            by_rotation, by_position = by_rotation[..., ::-1], by_position[:, ::-1]
-        k = len(system.compliance)
-        compliance = jnp.zeros((k + len(compliances),) * 2, compliances.dtype)
-        compliance = compliance.at[:k, :k].set(system.compliance).at[k:, k:].set(jnp.diag(compliances))
-        by_position = jnp.concatenate([jnp.zeros((k, *by_position.shape[1:]), by_position.dtype), by_position])
-        by_rotation = jnp.concatenate([system.border, by_rotation], axis=1)
-        return _Border(by_rotation, by_position, compliance, k + far.positive)
-
-    @traced_once
-    def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "k r"]:
-        """Transposed, times columns."""
-        product = jnp.einsum("ikm,irm->kr", self.by_rotation, x)
-        return product if self.by_position is None else product + jnp.einsum("knc,rnc->kr", self.by_position, u)
-
-
 class ChainFactors(eqx.Module):
     """The factorisation of a `ChainSystem`; `negative` as in `saddle_point.Factors`, 0 without symmetry.
 
@@ -396,7 +362,7 @@ class ChainFactors(eqx.Module):
     inverses: Float[Array, "n+1 c c"]
     before: Float[Array, "n c c"]  # of all nodes but the first: the inverse times the block that couples the one before
     after: Float[Array, "n c c"]
-    border: "_Border"
+    border: Border
     border_solution: tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
     bordered: Float[Array, "k k"]
     complement: Float[Array, "k k"]
@@ -433,7 +399,7 @@ class ChainFactors(eqx.Module):
         at = np.arange(k, k + len(far.elements))
         is_closed = self.contacts.is_closed[far.row, far.elements]
         harder = jnp.where(is_closed, (1 - HARD) * self.contacts.contact_compliance, 0.0)
-        return inverse_matrix(self.bordered.at[at, at].add(harder))
+        return self.border.inverse(self.bordered.at[at, at].add(harder))
 
     def solve_softly(
         self, f: Float[Array, "b m"], c: Float[Array, "j"]
@@ -586,23 +552,37 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     if is_symmetric:
         # Each force is a multiplier, and so is that of the element before the first node.
         negative += negative_count(jax.lax.stop_gradient(pivots)) - 3 * (n + 1)
-    border = _Border.of(system, contacts)
-    k = len(border.compliance)
-    nothing = jnp.zeros((k, n + 1, 3), dtype), jnp.zeros((k, n, 3), dtype)
-    blank = jnp.zeros((b, k, 2 * n + 1), dtype), *nothing
-    no_complement = jnp.zeros((k, k), dtype)
+    border = _border_of(system, contacts)
+    blank, no_complement = border.columns(), jnp.zeros((border.size, border.size), dtype)
     before = jnp.einsum("npq,nqr->npr", inverses[1:], below)
     after = jnp.einsum("npq,nqr->npr", inverses[:-1], above)
     chain = contacts, whole, system, middles, inverses, before, after
     factors = ChainFactors(*chain, border, blank, no_complement, no_complement, negative)
-    if not k:
+    if not border.size:
         return factors
-    by_position = nothing[0] if border.by_position is None else border.by_position
-    solution = factors._without_border(border.by_rotation, by_position, nothing[1])
-    matrix = -border.compliance - border.times(*solution[:2])
-    if is_symmetric:
-        negative += negative_count(jax.lax.stop_gradient(matrix)[None]) - border.positive
-    return ChainFactors(*chain, border, solution, matrix, inverse_matrix(matrix), negative)
+
+    def solved(border: Border) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
+        columns = border.columns()
+        if not border.size:
+            return columns, border.whole_compliance(), jnp.zeros_like(negative)
+        solution = factors._without_border(*columns)
+        matrix = -border.whole_compliance() - border.times(*solution[:2])
+        if not is_symmetric:
+            return solution, matrix, jnp.zeros_like(negative)
+        return solution, matrix, negative_count(jax.lax.stop_gradient(matrix)[None]) - border.positive
+
+    solution, matrix, more = border.by_need(solved)
+    return ChainFactors(*chain, border, solution, matrix, border.inverse(matrix), negative + more)
+
+
+def _border_of(system: ChainSystem, contacts: ContactRows) -> Border:
+    """Of a system that may be mirrored, with contacts that are not."""
+    far = contacts.far
+    if far is None:
+        return Border(system.border, system.compliance)
+    is_closed = contacts.is_closed[far.row, far.elements]
+    far = far.mirrored(len(system.held)) if system.is_backward else far
+    return Border(system.border, system.compliance, far, is_closed, contacts.contact_compliance)
 
 
 def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+3"], Int[Array, ""]]:

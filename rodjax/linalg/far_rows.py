@@ -5,10 +5,12 @@ Its curvature couples both elements too: it is kept as four more vectors v, the 
 stiffness, while the others add it (`SIGNS`).
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 # By what the outer product of each vector of the curvature enters the stiffness.
 SIGNS = np.array([-1.0, -1.0, 1.0, 1.0])
@@ -47,22 +49,39 @@ class FarRows(eqx.Module):
             forces += self._on_nodes(k, along, len(u))
         return moments, forces
 
+    def times(
+        self, factors: Float[Array, "5 p"], x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]
+    ) -> Float[Array, "5p r"]:
+        """All of these columns, by these factors, times others."""
+        turns, moves = x[:, :, 2 * self.nodes], u[:, self.nodes]  # [b, r, 4, p], [r, 4, p, 3]
+        product = jnp.einsum("qbkp,brkp->qpr", self.by_rotation, turns)
+        product += jnp.einsum("qckp,rkpc->qpr", self.by_position, moves)
+        return (factors[..., None] * product).reshape(factors.size, len(u))
+
     def columns(
-        self, is_closed: Bool[Array, "n+1"], contact_compliance: Float[Array, ""], points: int
-    ) -> tuple[Float[Array, "b 5p m"], Float[Array, "5p n+1 3"], Float[Array, "5p"]]:
-        """Of the border: by rotations, by positions, and compliances."""
-        p, nodes = len(self.elements), len(is_closed)
-        is_there = (self.nodes[..., None] == np.arange(nodes)[None, None]).astype(contact_compliance.dtype)
-        here = is_closed[self.elements]
-        factors = jnp.concatenate(
-            [here.astype(contact_compliance.dtype)[None], jnp.ones((4, p), contact_compliance.dtype)]
-        )
+        self, factors: Float[Array, "5 p"], points: int
+    ) -> tuple[Float[Array, "b 5p m"], Float[Array, "5p n+1 3"]]:
+        """Of the border, by these factors: by rotations and by positions."""
+        is_there = (self.nodes[..., None] == np.arange((points + 1) // 2)[None, None]).astype(factors.dtype)
         by_node = jnp.einsum("rbkp,rp,kpn->brpn", self.by_rotation, factors, is_there)
-        by_point = jnp.zeros((*by_node.shape[:-1], points), contact_compliance.dtype).at[..., ::2].set(by_node)
+        by_point = jnp.zeros((*by_node.shape[:-1], points), factors.dtype).at[..., ::2].set(by_node)
         by_position = jnp.einsum("rckp,rp,kpn->rpnc", self.by_position, factors, is_there)
-        # An open contact is a number by itself.
-        compliances = jnp.concatenate([jnp.where(here, contact_compliance, 1.0), jnp.repeat(jnp.asarray(SIGNS), p)])
-        return by_point.reshape(len(by_point), 5 * p, points), by_position.reshape(5 * p, nodes, 3), compliances
+        columns, nodes = factors.size, by_position.shape[2]
+        return by_point.reshape(len(by_point), columns, points), by_position.reshape(columns, nodes, 3)
+
+    def first(self, count: int) -> "FarRows":
+        """The first contacts alone."""
+        return FarRows(
+            self.by_rotation[..., :count],
+            self.by_position[..., :count],
+            self.nodes[:, :count],
+            self.elements[:count],
+            self.row,
+        )
+
+    def mirrored(self, nodes: int) -> "FarRows":
+        """With the nodes counted from the end."""
+        return dataclasses.replace(self, nodes=nodes - 1 - self.nodes)
 
     @property
     def positive(self) -> int:

@@ -270,7 +270,7 @@ def scatter(
         places = tuple(np.broadcast_to(place, updates.shape)[chosen] for place in places)
         updates = updates[chosen]
     if combine is None:
-        result[places] = updates
+        _put(result, places, updates)
     else:
         combine.at(result, places, updates)
     return result
@@ -280,12 +280,16 @@ def scatter_at(x: Any, updates: Any, combine: Any, region: Region, order: Sequen
     """The same where the places are known as the code is written."""
     result, updates = np.array(x), np.asarray(updates).transpose(order)
     if combine is None:
-        result[region.places] = updates
+        _put(result, region.places, updates)
     elif region.is_unique:
         result[region.places] = combine(result[region.places], updates)
     else:
         combine.at(result, region.places, updates)
     return result
+
+
+def _put(x: np.ndarray, places: tuple[Any, ...], updates: np.ndarray) -> None:
+    x[places] = updates if np.ndim(x[places]) else updates.reshape(())  # NumPy puts no array at the place of a number
 
 
 # --- sums, orders, products ------------------------------------------------------------------------------------------

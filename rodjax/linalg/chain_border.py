@@ -1,0 +1,131 @@
+"""What all of a chain has in common: the border of its system, then the columns of contacts between elements.
+
+Of these most are numbers by themselves, as they are open: a column is solved for where it is needed (`by_need`).
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rodjax.linalg.far_rows import SIGNS, FarRows
+from rodjax.linalg.small_matrices import inverse_matrix
+from rodjax.programs.parts import traced_once
+
+# A border is solved with the first so many contacts, or with all.
+FEW = (0, 8)
+# Columns by rotations, by positions, and what is solved for them.
+Columns = tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
+
+
+class Border(eqx.Module):
+    """`by_rotation`, `compliance`: of the border of the system; `far`: contacts between elements, in the order in which
+    they are needed, `None` without such; of these `is_closed` and the compliance of those that are.
+    """
+
+    by_rotation: Float[Array, "b k m"]
+    compliance: Float[Array, "k k"]
+    far: FarRows | None = None
+    is_closed: Bool[Array, "p"] | None = None
+    contact_compliance: Float[Array, ""] | None = None
+
+    @property
+    def size(self) -> int:
+        return len(self.compliance) + (0 if self.far is None else 5 * len(self.far.elements))
+
+    @property
+    def positive(self) -> int:
+        """The number of the columns whose compliance is positive."""
+        return len(self.compliance) + (0 if self.far is None else self.far.positive)
+
+    @traced_once
+    def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "k r"]:
+        """Transposed, times columns."""
+        product = jnp.einsum("ikm,irm->kr", self.by_rotation, x)
+        if self.far is None:
+            return product
+        return jnp.concatenate([product, self.far.times(self._factors, x, u)])
+
+    def whole_compliance(self) -> Float[Array, "k k"]:
+        if self.far is None:
+            return self.compliance
+        assert self.contact_compliance is not None
+        k, signs = len(self.compliance), jnp.repeat(jnp.asarray(SIGNS), len(self.far.elements))
+        # An open contact is a number by itself.
+        compliances = jnp.concatenate([jnp.where(self.is_closed, self.contact_compliance, 1.0), signs])
+        whole = jnp.zeros((self.size, self.size), compliances.dtype)
+        return whole.at[:k, :k].set(self.compliance).at[k:, k:].set(jnp.diag(compliances))
+
+    def columns(self) -> Columns:
+        """All, each as a right side."""
+        points = self.by_rotation.shape[-1]
+        nodes, dtype = (points + 1) // 2, self.by_rotation.dtype
+        by_rotation, by_position = self.by_rotation, jnp.zeros((len(self.compliance), nodes, 3), dtype)
+        if self.far is not None:
+            of_far = self.far.columns(self._factors, points)
+            by_rotation = jnp.concatenate([by_rotation, of_far[0]], axis=1)
+            by_position = jnp.concatenate([by_position, of_far[1]])
+        return by_rotation, by_position, jnp.zeros((len(by_position), nodes - 1, 3), dtype)
+
+    def by_need(
+        self, solved: Callable[["Border"], tuple[Columns, Float[Array, "k k"], Int[Array, ""]]]
+    ) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
+        """Solutions, matrix of the border and a count, of the border with the contacts that are needed."""
+
+        def spread(part: "Border", at: np.ndarray) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
+            (x, u, force), matrix, count = solved(part)
+            nothing, k = jnp.zeros_like, self.size
+            wide = (
+                nothing(x, shape=(len(x), k, x.shape[-1])).at[:, at].set(x),
+                nothing(u, shape=(k, *u.shape[1:])).at[at].set(u),
+                nothing(force, shape=(k, *force.shape[1:])).at[at].set(force),
+            )
+            return wide, (-self.whole_compliance()).at[np.ix_(at, at)].set(matrix), count
+
+        return self._by_need(solved, spread)
+
+    def inverse(self, matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
+        """Of a matrix as `by_need` has it."""
+
+        def spread(part: "Border", at: np.ndarray) -> Float[Array, "k k"]:
+            alone = jnp.diag(1 / jnp.diagonal(matrix))
+            return alone.at[np.ix_(at, at)].set(inverse_matrix(matrix[np.ix_(at, at)]))
+
+        return self._by_need(lambda part: inverse_matrix(matrix), spread)
+
+    def _by_need(self, whole: Callable, spread: Callable) -> Array:
+        if self.far is None:
+            return whole(self)
+        p, k = len(self.far.elements), len(self.compliance)
+        few = [count for count in FEW if count < p]
+        branches: list[Callable] = []
+        for count in few:
+            places = k + np.arange(5)[:, None] * p + np.arange(count)[None]
+            at = np.concatenate([np.arange(k), places.reshape(-1)])
+            branches.append(lambda count=count, at=at: spread(self._with_first(count), at))
+        level = jnp.sum(jnp.asarray(self._needed) > np.array(few)) if few else 0
+        return jax.lax.switch(level, [*branches, lambda: whole(self)])
+
+    @property
+    def _needed(self) -> Int[Array, ""]:
+        """From the first contact on, to the last one that is closed or has curvature."""
+        assert self.far is not None
+        assert self.is_closed is not None
+        curves = (self.far.by_rotation[1:] != 0).any((0, 1, 2)) | (self.far.by_position[1:] != 0).any((0, 1, 2))
+        return jnp.max(jnp.where(self.is_closed | curves, np.arange(1, len(self.is_closed) + 1), 0))
+
+    def _with_first(self, count: int) -> "Border":
+        assert self.far is not None
+        assert self.is_closed is not None
+        return dataclasses.replace(self, far=self.far.first(count), is_closed=self.is_closed[:count])
+
+    @property
+    def _factors(self) -> Float[Array, "5 p"]:
+        """Of each column, 0 where there is none, as the contact is open."""
+        assert self.is_closed is not None
+        closed = self.is_closed.astype(self.by_rotation.dtype)
+        return jnp.concatenate([closed[None], jnp.ones((4, len(closed)), closed.dtype)])

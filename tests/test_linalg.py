@@ -322,9 +322,9 @@ def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads,
 
 @pytest.mark.parametrize("is_closed", [False, True])
 def test_of_contacts_between_elements_those_that_are_needed_are_solved_for(is_closed):
-    """Of twelve three, and all where the last one is closed."""
-    system = with_open_contacts(random_chain(14), 9)
-    closed = system.contacts.is_closed.at[2, 11].set(is_closed)
+    """Of twenty three, with the first sixteen, and all where the last one is closed."""
+    system = with_open_contacts(random_chain(20), 17)
+    closed = system.contacts.is_closed.at[2, 19].set(is_closed)
     check_chain(system.closed_where(closed))
 
 

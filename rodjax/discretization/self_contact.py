@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.checks import Numbers
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
 from rodjax.programs.parts import traced_once
@@ -132,7 +133,7 @@ def _nearest(curve: Curve) -> Nearest:
     x = jnp.stack(side_at(curve, of_element, samples).x)  # [3, k]
     allowed = (samples[None] >= least[:, None]) & (samples[None] <= most[:, None])
 
-    def squares(rows: Int[Array, "n r"]) -> Float[Array, "n r k"]:
+    def squares(rows: Int[Numbers, "n r"]) -> Float[Array, "n r k"]:
         """Of the distances of these samples from all that their cells may touch."""
         parts = (x[c][rows][..., None] - x[c][None, None] for c in range(3))
         return jnp.where(allowed[:, None], functools.reduce(jnp.add, map(jnp.square, parts)), jnp.inf)

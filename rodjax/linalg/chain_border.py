@@ -5,6 +5,7 @@ Of these most are numbers by themselves, as they are open: a column is solved fo
 
 import dataclasses
 from collections.abc import Callable
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -17,7 +18,8 @@ from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.programs.parts import traced_once
 
 # A border is solved with the first so many contacts, or with all.
-FEW = (0, 8)
+FEW = (0, 16)
+T = TypeVar("T")
 # Columns by rotations, by positions, and what is solved for them.
 Columns = tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
 
@@ -53,6 +55,7 @@ class Border(eqx.Module):
     def whole_compliance(self) -> Float[Array, "k k"]:
         if self.far is None:
             return self.compliance
+        assert self.is_closed is not None
         assert self.contact_compliance is not None
         k, signs = len(self.compliance), jnp.repeat(jnp.asarray(SIGNS), len(self.far.elements))
         # An open contact is a number by itself.
@@ -97,7 +100,7 @@ class Border(eqx.Module):
 
         return self._by_need(lambda part: inverse_matrix(matrix), spread)
 
-    def _by_need(self, whole: Callable, spread: Callable) -> Array:
+    def _by_need(self, whole: Callable[["Border"], T], spread: Callable[["Border", np.ndarray], T]) -> T:
         if self.far is None:
             return whole(self)
         p, k = len(self.far.elements), len(self.compliance)

@@ -173,8 +173,7 @@ def _nearest(curve: Curve) -> Nearest:
         k, _, _, way = state
         return (k < FAR_STEPS + STEPS) & ((k <= FAR_STEPS) | (way > STANDS))
 
-    begin_here = jnp.zeros((), int), *first, jnp.zeros((), s.dtype)
-    _, a, b, _ = jax.lax.while_loop(goes_on, stepped, begin_here)
+    _, a, b, _ = jax.lax.while_loop(goes_on, stepped, (jnp.zeros((), int), *first, jnp.zeros((), s.dtype)))
     element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
     _, _, (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b)
     is_flat = aa * bb <= ab**2
@@ -400,8 +399,8 @@ def seen_distance(
     b: Float[Array, "k"],
     is_far: Array | None = None,
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array, Array]]:
-    """The distance and the well of the cell, and its derivatives by both places; `is_far`: the
-    second ones as of half of the squared distance, by the distance.
+    """The distance and the well of the cell, and its derivatives by both places; `is_far`: the second ones as of half
+    of the squared distance, by the distance.
     """
     here, there = side_at(curve, element, a), side_at(curve, other, b)
     d, normal = direction(here, there)

@@ -25,8 +25,8 @@ Columns = tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k 
 
 
 class Border(eqx.Module):
-    """`by_rotation`, `compliance`: of the border of the system; `far`: contacts between elements, in the order in which
-    they are needed, `None` without such; of these `is_closed` and the compliance of those that are.
+    """`by_rotation`, `compliance`: of the border of the system. `far`: contacts between elements, first those that are
+    likely to be needed, `None` without such; `is_closed`, `contact_compliance`: of these.
     """
 
     by_rotation: Float[Array, "b k m"]
@@ -81,13 +81,12 @@ class Border(eqx.Module):
 
         def spread(part: "Border", at: np.ndarray) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
             (x, u, force), matrix, count = solved(part)
-            nothing, k = jnp.zeros_like, self.size
-            wide = (
-                nothing(x, shape=(len(x), k, x.shape[-1])).at[:, at].set(x),
-                nothing(u, shape=(k, *u.shape[1:])).at[at].set(u),
-                nothing(force, shape=(k, *force.shape[1:])).at[at].set(force),
-            )
-            return wide, (-self.whole_compliance()).at[np.ix_(at, at)].set(matrix), count
+
+            def wide(columns: Float[Array, "j *c"]) -> Float[Array, "k *c"]:
+                return jnp.zeros_like(columns, shape=(self.size, *columns.shape[1:])).at[at].set(columns)
+
+            solutions = jnp.swapaxes(wide(jnp.swapaxes(x, 0, 1)), 0, 1), wide(u), wide(force)
+            return solutions, (-self.whole_compliance()).at[np.ix_(at, at)].set(matrix), count
 
         return self._by_need(solved, spread)
 

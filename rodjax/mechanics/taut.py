@@ -135,9 +135,9 @@ def led_out(
     radius: Float[Array, ""],
     length: Float[Array, ""],
 ) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
-    """A string held at its first place alone that begins as `points` and is led out of the obstacles, `length` long;
-    and whether that was needed. It goes straight on beyond what it lies on, and has the tangent that a support holds.
-    Where each side is as near it takes that of `first_side`.
+    """A string held at its first place alone, led out of the obstacles from `points` and cut at `length`; and whether
+    that was needed. It goes straight on beyond what it lies on, and has the tangent that the support holds.
+    `first_side`: the direction in which it is led out where others are as near.
     """
     begin = resampled(points, DRAWN_PIECES)
     nearest = jnp.min(jax.vmap(_distance(obstacles))(begin[1:]))

@@ -23,7 +23,7 @@ from rodjax.units import Units
 FOLDED = -0.99
 ASIDE = 0.05
 ARC_PIECES = 64
-# On top of an obstacle; where gravity has no part across the rod, to this side by the axes of the scene.
+# A free end is led out against gravity; where that has no part across the rod, to this side of the scene's axes.
 UPWARDS = np.array([3e-6, 2e-6, 1e-6])
 
 
@@ -74,8 +74,7 @@ def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -
         between = points.at[0].set(start.position).at[-1].set(end.position)
         string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, length)
     else:
-        axes = scene_axes(scene)
-        upwards = axes @ UPWARDS - (0.0 if scene.gravity is None else _unit(scene.gravity))
+        upwards = scene_axes(scene) @ UPWARDS - (0.0 if scene.gravity is None else scene.gravity)
         is_held = isinstance(start, Held)
         held, tangent = (start, first) if is_held else (end, None if last is None else -last)
         assert isinstance(held, Held), "a scene holds at least one position"
@@ -101,11 +100,6 @@ def _other_points(scene: Scene) -> Float[Array, "m 3"]:
     is_held = isinstance(scene.start, Held) and isinstance(scene.end, Held)
     points = hanging_arc(scaled, ARC_PIECES) if is_held else first_shape(scaled, ARC_PIECES)
     return units.origin[None] + units.length * points
-
-
-def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    size = jnp.sqrt(jnp.sum(vector**2))
-    return jnp.where(size > 0, vector / jnp.where(size > 0, size, 1.0), 0.0)
 
 
 def _is_mesh(obstacle: Any) -> bool:

@@ -162,7 +162,7 @@ def solved(names: dict[str, str]) -> rj.Equilibrium:
     return result
 
 
-# What the rods of harnesses do not have yet, each in one line: loads without a potential, and sliding clips.
+# What the rods of harnesses do not have yet, in one line: loads without a potential.
 NOT_IN_HARNESSES = {
     "must have no load without a potential": [
         "follower force along",
@@ -172,7 +172,6 @@ NOT_IN_HARNESSES = {
         "end moment",
         "follower end force",
     ],
-    "must not slide": ["sliding", "sliding tangent", "sliding frame"],
 }
 
 

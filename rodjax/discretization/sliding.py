@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import Polyline
-from rodjax.discretization.form import NEUTRAL, Form
+from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.forms import form_of, form_on
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.nodes import LEAST_ELEMENT, varying
@@ -33,6 +33,7 @@ from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
 from rodjax.model.along import Along
 from rodjax.model.scene import Scene, has_contacts, slid, sliding_arclengths
+from rodjax.model.supports import Support
 
 # The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
 # pass, as it then has a node of its own no more.
@@ -85,9 +86,18 @@ class SlidingForm(Form):
         assert isinstance(self.first, PositionForm)
         return dataclasses.replace(form, closed=self.first.closed)
 
+    def between(self, ends: tuple[Support, Support]) -> "SlidingForm":
+        """Of the rod between other supports of the same kinds."""
+
+        def with_ends(scene: Scene) -> Scene:
+            return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, ends)
+
+        first = eqx.tree_at(lambda form: form.scene, self.first, with_ends(self.first.scene))
+        return dataclasses.replace(self, scene=with_ends(self.scene), made=with_ends(self.made), first=first)
+
     def _fixed(self, arclengths: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
         """Arclengths that have nodes, in turn, and how far those go along."""
-        at, change = self._clips, self._spread(arclengths - self._begin)
+        at, change = self._clips, self._spread(arclengths - self.made_at)
         ends = jnp.array([0.0, 1.0], at.dtype)
         loads, beside = self._loads
         # A load so near to a clip that it shares its node goes along.
@@ -102,7 +112,8 @@ class SlidingForm(Form):
         return jnp.stack([clip.at for clip in self.made.clips])
 
     @property
-    def _begin(self) -> Float[Array, "j"]:
+    def made_at(self) -> Float[Array, "j"]:
+        """The arclengths to which the mesh of the shape belongs."""
         arclengths = sliding_arclengths(self.made)
         assert arclengths is not None
         return arclengths
@@ -133,14 +144,14 @@ class SlidingForm(Form):
         loads, beside = self._loads
         if not len(loads):
             return None
-        now = self._clips + self._spread(point.arclengths - self._begin)
+        now = self._clips + self._spread(point.arclengths - self.made_at)
         return jnp.any(self._is_near(loads, now[beside]) & ~self._is_near(loads, self._clips[beside]))
 
     def is_misplaced(self, point: SlidingPoint) -> Bool[Array, ""]:
         """Whether the mesh is not, or should not be, the one that belongs to these arclengths."""
         form = self.at(point.arclengths)
         ends = jnp.array([0.0, 1.0], point.arclengths.dtype)
-        now = self._clips + self._spread(point.arclengths - self._begin)
+        now = self._clips + self._spread(point.arclengths - self.made_at)
         before, after = (jnp.diff(jnp.concatenate([ends[:1], at, ends[1:]])) for at in (self._clips, now))
         is_stretched = jnp.any(jnp.maximum(before / after, after / before) > STRETCHED)
         anew = form_of(slid(self.made, point.arclengths), self.shape.reached(form, point.inner))
@@ -239,7 +250,7 @@ class SlidingForm(Form):
     def longest_step(self, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
         change = self._spread(others.arclengths)
         ends = jnp.array([0.0, 1.0], change.dtype)
-        clips = jnp.concatenate([ends[:1], self._clips + self._spread(point.arclengths - self._begin), ends[1:]])
+        clips = jnp.concatenate([ends[:1], self._clips + self._spread(point.arclengths - self.made_at), ends[1:]])
         gaps = LARGEST_STEP * jnp.minimum(jnp.diff(clips)[:-1], jnp.diff(clips)[1:])
         loads, beside = self._loads
         if len(loads):
@@ -275,8 +286,11 @@ class SlidingForm(Form):
         return gradient, jnp.concatenate([axial, constraint_residual])
 
     def linearized(self, point: SlidingPoint) -> SlidingLinearization:
+        return self.with_arclengths(point, self.at(point.arclengths).linearized(point.inner))
+
+    def with_arclengths(self, point: SlidingPoint, here: Linearization) -> SlidingLinearization:
+        """From the linearisation of the form at fixed arclengths."""
         form, inner, arclengths = self.at(point.arclengths), point.inner, point.arclengths
-        here = form.linearized(inner)
 
         def by_arclength(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
             return jax.jvp(lambda arclengths: self._rows(inner, arclengths), (arclengths,), (direction,))[1]
@@ -325,7 +339,10 @@ class SlidingForm(Form):
 
     def objective(self, here: Any, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
         of_inner = self.at(here.arclengths).objective(here.at_arclengths, point.inner, others.others)
-        return of_inner - jnp.sum(point.excess * (here.arclengths - point.arclengths))
+        return of_inner - point.excess_at(here.arclengths)
+
+    def lagrangian(self, point: SlidingPoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
+        return self.at(point.arclengths).lagrangian(point.inner)
 
     def half_square(self, here: Any) -> Float[Array, ""]:
         axial = here.constraint_residual[: len(here.arclengths)]
@@ -335,25 +352,36 @@ class SlidingForm(Form):
     def sought(
         self, here: Any, point: SlidingPoint, system: AnySystem, push: Float[Array, "b m"]
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
-        assert isinstance(system, BorderedSystem)
-        descends = self.descends and self.has_potential
-        system = dataclasses.replace(system.held_unless(here.slides), descends=descends)
+        system, constraint_residual = self.sliding(here, system)
         j = len(point.arclengths)
-        axial = jnp.where(here.slides, here.constraint_residual[:j], 0.0)
         if has_contacts(self.scene):
             # Which contacts are closed is sought at given arclengths; those go along with the ones that were.
             is_minimum, x, y = self.at(point.arclengths).sought(here.at_arclengths, point.inner, system.inner, push)
             factors = factor(system)
             assert isinstance(factors, BorderedFactors)
-            x, y = factors.joined(x, y, -axial)
-        else:
-            constraint_residual = jnp.concatenate([axial, here.constraint_residual[j:]])
-            factors, x, y = factor_and_solve(system, push - here.gradient, -constraint_residual, is_regularized=True)
-            assert isinstance(factors, BorderedFactors)
-            is_minimum = factors.inner.is_minimum
-        # What pulls along the rod leads away from a largest energy, and no shift is needed.
-        is_steady = factors.is_steady | (jnp.max(jnp.abs(y[:j])) > LEAST_SLIDE if descends else False)
-        return is_minimum & is_steady, x, y
+            x, y = factors.joined(x, y, -constraint_residual[:j])
+            return is_minimum & self.goes_down(factors, y), x, y
+        factors, x, y = factor_and_solve(system, push - here.gradient, -constraint_residual, is_regularized=True)
+        return self.goes_down(factors, y) & factors.inner.is_minimum, x, y
+
+    def sliding(self, here: Any, system: AnySystem) -> tuple[BorderedSystem, Float[Array, "k"]]:
+        """The system of a step and its constraint residual, at fixed arclengths unless the rod slides already."""
+        assert isinstance(system, BorderedSystem)
+        j = len(here.arclengths)
+        axial = jnp.where(here.slides, here.constraint_residual[:j], 0.0)
+        constraint_residual = jnp.concatenate([axial, here.constraint_residual[j:]])
+        system = dataclasses.replace(system.held_unless(here.slides), descends=self.descends and self.has_potential)
+        return system, constraint_residual
+
+    def goes_down(self, factors: Any, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
+        """Whether a step leads to less energy by the arclengths: what pulls along the rod leads away from a largest
+        one, and no shift is needed.
+        """
+        assert isinstance(factors, BorderedFactors)
+        if not factors.descends:
+            return factors.is_steady
+        j = len(factors.complement)
+        return factors.is_steady | (jnp.max(jnp.abs(multipliers[:j])) > LEAST_SLIDE)
 
     def under_force(
         self,

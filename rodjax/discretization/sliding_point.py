@@ -28,6 +28,10 @@ class SlidingPoint(eqx.Module):
         """The point of an equilibrium at these arclengths."""
         return SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
 
+    def excess_at(self, arclengths: Float[Array, "j"]) -> Float[Array, ""]:
+        """What the mesh adds to the energy from the arclengths of this point to others."""
+        return jnp.sum(self.excess * (arclengths - self.arclengths))
+
     @property
     def tangents(self) -> Float[Array, "3 m"]:
         return self.inner.tangents

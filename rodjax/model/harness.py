@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, sequence, vector
 from rodjax.geometry.rotations import rotation_vector
 from rodjax.model.along import largest_beside
-from rodjax.model.scene import Scene, between, has_friction, has_potential, slides, support_between
+from rodjax.model.scene import Scene, between, has_friction, has_node_positions, has_potential, slides, support_between
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -60,7 +60,8 @@ class Harness(eqx.Module):
     unless a support of its own holds it in a direction. Without contact between rods one end must be a `Joint`.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with friction, a sliding clip or a load without a potential.
+    and for a scene with friction, self-contact or a load without a potential, or with a sliding clip beside obstacles,
+    in a field of forces or in contact with other rods.
     """
 
     # In the place of a scene.
@@ -149,6 +150,8 @@ def _checked_contact(contact: Any, cables: Mapping[str, Scene]) -> tuple[tuple[i
         scene, name = cables[names[number]], f"cables[{names[number]!r}]"
         if scene.rod.radius is None:
             raise ValueError(f"{name}.rod must have a radius, as it may touch another cable, got None")
+        if slides(scene):
+            raise ValueError(f"{name}.clips must not slide, as it may touch another cable: leave it out of contact")
     return pairs
 
 
@@ -192,8 +195,10 @@ def check_movable(scene: Scene, name: str) -> None:
         raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
     if scene.self_contact:
         raise ValueError(f"{name}.self_contact must be False where ends of the rod have unknown poses")
-    if slides(scene):
-        raise ValueError(f"{name}.clips must not slide where ends of the rod have unknown poses")
+    if slides(scene) and has_node_positions(scene):
+        raise ValueError(
+            f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles or fields act on it"
+        )
     if not has_potential(scene):
         raise ValueError(f"{name} must have no load without a potential where ends of the rod have unknown poses")
     if scene.rod.length.dtype != jnp.float64:

@@ -123,8 +123,8 @@ def follow(
     corner, and may turn back.
 
     Eager only. Raises `ValueError` or `TypeError` for arguments that make no sense, for loads without a potential,
-    friction and `self_contact`, and for harnesses beside obstacles. Keller, "Numerical solution of bifurcation and
-    nonlinear eigenvalue problems" (1977).
+    friction and `self_contact`, and for harnesses with obstacles, contact or sliding clips. Keller, "Numerical
+    solution of bifurcation and nonlinear eigenvalue problems" (1977).
     """
     stacked = _checked(scenes, "follow")
     steps = _checked_steps(step, max_step, max_points)

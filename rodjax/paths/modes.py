@@ -17,7 +17,7 @@ from rodjax.discretization.nodal_forms import NodalFrames
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
-from rodjax.model.scene import nondimensional
+from rodjax.model.scene import nondimensional, slides
 from rodjax.paths.harness_modes import HarnessMode, harness_mode
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
@@ -52,7 +52,7 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
     linearised equilibrium.
 
     Raises `TypeError` for anything but an equilibrium, `ValueError` for one of the continuum or under loads without a
-    potential, and for several of a harness.
+    potential, and for several of a harness, or one with contact between rods or sliding clips.
     """
     instance(equilibrium, "equilibrium", (Equilibrium, HarnessEquilibrium))
     if isinstance(equilibrium, HarnessEquilibrium):
@@ -62,6 +62,10 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
             raise ValueError("equilibrium must have a potential: a dead moment on a joint has none")
         if equilibrium.harness.contact:
             raise ValueError("equilibrium must be of a harness with contact=False: with it no softest motion is sought")
+        if any(map(slides, equilibrium.harness.scenes)):
+            raise ValueError(
+                "equilibrium must be of a harness without sliding clips: with them no softest motion is sought"
+            )
         return harness_mode(equilibrium)
     if equilibrium.discretization == "continuum":
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")

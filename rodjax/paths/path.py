@@ -18,7 +18,15 @@ from rodjax.checks import instance, is_known, leaf, namespace, one_of, sequence
 from rodjax.discretization.first_twist import FirstTwist, Last, last_of
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, between, has_friction, has_node_positions, has_potential, nondimensional
+from rodjax.model.scene import (
+    Scene,
+    between,
+    has_friction,
+    has_node_positions,
+    has_potential,
+    nondimensional,
+    slides,
+)
 from rodjax.notes import note
 from rodjax.paths.branch import count_of
 from rodjax.paths.harness_path import are_harnesses, harness_path, stack_harnesses
@@ -165,7 +173,7 @@ def _check_stop(scenes: Scene | Harness) -> None:
 
 def not_followed(scenes: Scene | Harness) -> str | None:
     """What keeps branches of scenes from being followed: "potential", where loads have none, "friction",
-    "self_contact", and of the rods of a harness "obstacles" or "contact"; `None` where nothing does.
+    "self_contact", and of the rods of a harness "obstacles", "contact" or "sliding clips"; `None` where nothing does.
     """
     each = scenes.scenes if isinstance(scenes, Harness) else (scenes,)
     if not all(map(has_potential, each)) or (isinstance(scenes, Harness) and not scenes.has_potential):
@@ -174,6 +182,8 @@ def not_followed(scenes: Scene | Harness) -> str | None:
         return "friction"
     if isinstance(scenes, Harness) and (scenes.contact or any(scene.obstacles for scene in each)):
         return "contact" if scenes.contact else "obstacles"
+    if isinstance(scenes, Harness) and any(map(slides, each)):
+        return "sliding clips"
     return "self_contact" if any(scene.self_contact for scene in each) else None
 
 

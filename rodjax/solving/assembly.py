@@ -29,6 +29,8 @@ from rodjax.discretization.joints import generic_field
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.self_contact import Curve
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding import SETTLED, SlidingForm
+from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.geometry.vectors import components
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
@@ -145,6 +147,8 @@ class RodStep(NamedTuple):
         there = form.holding(form.retract(self.point, self.bases, part * self.rotation, self.force_change, others))
         value, constraint_residual = form.lagrangian(there)
         scene = form.scene
+        if isinstance(form, SlidingForm):
+            value -= self.point.excess_at(there.arclengths)
         if self.at_ends is not None:
             assert isinstance(form, NodalForm)
             assert self.at_ends_change is not None
@@ -166,12 +170,20 @@ class Eliminated(NamedTuple):
     multipliers_by_motions: Float[Array, "k 12"]
 
 
-def eliminated(here: Linearization, coupling: Coupling, shift: Float[Array, ""], push: Float[Array, "b m"]):
+def eliminated(
+    form: Form, here: Linearization, coupling: Coupling, shift: Float[Array, ""], push: Float[Array, "b m"]
+) -> Eliminated:
     h = 1 / here.gradient.shape[1]
-    factors = factor(here.system.shifted(h * shift), is_regularized=True)
-    rotation, multipliers = factors.solve(push - here.gradient, -here.constraint_residual)
+    system, constraint_residual = here.system.shifted(h * shift), here.constraint_residual
+    if isinstance(form, SlidingForm):
+        system, constraint_residual = form.sliding(here, system)
+    factors = factor(system, is_regularized=True)
+    rotation, multipliers = factors.solve(push - here.gradient, -constraint_residual)
     by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_constraints)
-    return Eliminated(factors.is_minimum, factors.negative, rotation, multipliers, *by_motions)
+    is_minimum = factors.is_minimum
+    if isinstance(form, SlidingForm):
+        is_minimum = factors.inner.is_minimum & form.goes_down(factors, multipliers)
+    return Eliminated(is_minimum, factors.negative, rotation, multipliers, *by_motions)
 
 
 class State(NamedTuple):
@@ -319,6 +331,9 @@ class Assembly(eqx.Module):
     def begin(
         self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], pairs: tuple[Array, ...], poses: Poses
     ) -> State:
+        """A search from points of the rods, pressures of the bodies where these end, and of contacts between rods, and
+        poses of the bodies.
+        """
         dtype = poses.positions.dtype
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
         nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
@@ -326,19 +341,8 @@ class Assembly(eqx.Module):
         return State(points, at_ends, pairs, poses, nothing, zero, zero, nothing, count, count, count, status, count)
 
 
-def find_assembly(
-    assembly: Assembly,
-    points: tuple[Any, ...],
-    at_ends: tuple[Float[Array, "k o 2"] | None, ...],
-    pairs: tuple[Float[Array, "p n"], ...],
-    poses: Poses,
-    solver: Newton,
-    find: Find,
-) -> State:
-    """The equilibrium reached from points of the rods, pressures of the bodies where these end, and of contacts between
-    rods, and poses of the bodies.
-    """
-    begin = assembly.begin(points, at_ends, pairs, poses)
+def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find) -> State:
+    """The equilibrium that is reached."""
     return jax.lax.while_loop(
         lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
     )
@@ -358,7 +362,7 @@ class _Here(NamedTuple):
 
 class _Balance(NamedTuple):
     """What is out of balance: of the bodies before their supports, `gradient`, and the largest of all; `balanced`: the
-    status with which the search may end, else RUNNING.
+    status with which the search may end, else RUNNING; `is_settled`: near an equilibrium, sliding apart.
     """
 
     gradient: Float[Array, "j 6"]
@@ -368,6 +372,7 @@ class _Balance(NamedTuple):
     floor: Float[Array, ""]
     balanced: Int[Array, ""]
     is_balanced: Bool[Array, ""]
+    is_settled: Bool[Array, ""]
 
 
 class _Rods(NamedTuple):
@@ -422,6 +427,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         rods = assembly.rods(group, state.poses)
         all_here.append(_Here(rods, *jax.vmap(_linearized)(rods, points, pressures)))
     balance = _balance(assembly, all_here, touching, state, solver)
+    all_here = _sliding(all_here, state, balance)
     rods = _eliminated_rods(all_here, state, balance, find)
     if all(here.at_ends is None for here in all_here):
         bodies, contacts = _condensed(assembly, all_here, rods, state, balance, find), None
@@ -433,6 +439,10 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     is_unjudged = is_pushed | (find != "minimum")
     trial = _searched(assembly, all_here, touching, state, steps, balance, is_unjudged, is_sought)
     status = _status(state, balance, trial, steps, is_sought, solver)
+    for group, here in zip(assembly.groups, all_here, strict=True):
+        is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
+        if is_blocked is not None:
+            status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
     # Forces and pressures change as the merit has them.
@@ -498,9 +508,11 @@ def _balance(
     forces = tuple(here.coupling.first for here in all_here)
     gradient, stiffness = assembly.body_derivatives(state.poses)
     gradient, residual = assembly.balance_of_bodies(gradient, forces)
+    is_settled = residual <= SETTLED
     floor, is_closed = jnp.zeros_like(residual), jnp.array(True)
     for group, here in zip(assembly.groups, all_here, strict=True):
         residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
+        is_settled &= jnp.all(_is_settled(here.linearization))
         floor = jnp.maximum(floor, jnp.max(here.floor))
         closed = jax.vmap(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
         is_closed &= jnp.all(closed(group.form, here.linearization.constraint_residual))
@@ -512,7 +524,26 @@ def _balance(
     balanced = jnp.where(stagnates & (balanced == Status.RUNNING), Status.ROUNDING_FLOOR, balanced)
     is_balanced = is_closed & (balanced != Status.RUNNING)
     residuals = tuple(here.linearization.residual for here in all_here)
-    return _Balance(gradient, stiffness, residuals, residual, floor, balanced, is_balanced)
+    return _Balance(gradient, stiffness, residuals, residual, floor, balanced, is_balanced, is_settled)
+
+
+def _is_settled(here: Linearization) -> Bool[Array, "k"]:
+    return here.slides if isinstance(here, SlidingLinearization) else here.residual <= SETTLED
+
+
+def _sliding(all_here: list[_Here], state: State, balance: _Balance) -> list[_Here]:
+    """Rods slide through clips once all of the harness is near its equilibrium at the arclengths where they are."""
+    found = []
+    for here, last in zip(all_here, state.points, strict=True):
+        linearization = here.linearization
+        if isinstance(linearization, SlidingLinearization):
+            slides = last.slides | balance.is_settled
+            here = here._replace(
+                points=dataclasses.replace(here.points, slides=slides),
+                linearization=dataclasses.replace(linearization, slides=slides),
+            )
+        found.append(here)
+    return found
 
 
 # --- the rods eliminated ---------------------------------------------------------------------------------------------
@@ -543,9 +574,10 @@ def _eliminated(
     least = jnp.asarray(NEUTRAL, last.dtype)
     h = 1 / here.linearization.gradient.shape[2]
     nothing = jnp.zeros_like(here.aside)
+    systems = here.rods.form, here.linearization, here.coupling
     if find == "equilibrium":
         shift = jnp.full_like(last, least)
-        found = jax.vmap(eliminated)(here.linearization, here.coupling, shift, nothing)
+        found = jax.vmap(eliminated)(*systems, shift, nothing)
         return found, shift, jnp.array(False)
     shift = _first_shift(last, state, balance)
 
@@ -557,9 +589,9 @@ def _eliminated(
         larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
         shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
         push = pushes(shift)[:, None, None] * here.aside
-        return shift, tries + 1, jax.vmap(eliminated)(here.linearization, here.coupling, shift, push)
+        return shift, tries + 1, jax.vmap(eliminated)(*systems, shift, push)
 
-    kinds = jax.eval_shape(jax.vmap(eliminated), here.linearization, here.coupling, shift, nothing)
+    kinds = jax.eval_shape(jax.vmap(eliminated), *systems, shift, nothing)
     blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
     shift, _, found = jax.lax.while_loop(
         lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
@@ -599,6 +631,11 @@ def _condensed(
         aside = jnp.where(is_pushed & is_below, PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
         stiffness = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
         coordinates = vectors @ ((vectors.T @ right + aside) / stiffness)
+        if any(here.coupling.of_multipliers is not None for here in all_here):
+            # The matrix is not symmetric: a step is exact once that of the nearest symmetric one goes down.
+            damped = matrix + state.damping * jnp.eye(len(values), dtype=dtype)
+            exact = jnp.linalg.solve(damped, right)
+            coordinates = jnp.where(jnp.min(values, initial=1.0) > LEAST_STIFFNESS, exact, coordinates)
     else:
         is_pushed = jnp.array(False)
         stiffness = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
@@ -622,9 +659,10 @@ def _condensed_system(
             right = right.at[group.body].add(of_ends)
             continue
         condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
-        condensed -= jnp.einsum("kci,kcj->kij", couple.of_constraints, found.multipliers_by_motions)
+        by_multipliers = couple.by_multipliers
+        condensed -= jnp.einsum("kci,kcj->kij", by_multipliers, found.multipliers_by_motions)
         loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
-        loads += jnp.einsum("kci,kc->ki", couple.of_constraints, found.multipliers)
+        loads += jnp.einsum("kci,kc->ki", by_multipliers, found.multipliers)
         condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
         loads = (shares[:, None] * loads).reshape(-1, 2, 6)
         for a in range(2):
@@ -714,7 +752,7 @@ def _steps(
 ) -> _Steps:
     largest = jnp.max(jnp.sum(bodies.motions[:, 3:] ** 2, axis=1), initial=0.0)
     padded = jnp.pad(bodies.motions, ((0, 1), (0, 0)))
-    steps, ends = [], []
+    steps, ends, limits = [], [], []
     in_contact = iter(() if contacts is None else contacts.motions)
     at_ends_changes = iter(() if contacts is None else contacts.at_ends)
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
@@ -732,7 +770,11 @@ def _steps(
         steps.append(RodStep(here.points, bases, rotation, change, others, here.at_ends, at_ends_change))
         ends.append(of_ends)
         largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
+        longest = jax.vmap(lambda form, *parts: form.longest_step(*parts))(group.form, here.points, others)
+        limits += [] if longest is None else [jnp.min(longest)]
     part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
+    for limit in limits:
+        part = jnp.minimum(part, limit)
     steps = [
         step._replace(
             force_change=part * step.force_change,
@@ -821,7 +863,7 @@ def _slopes(
     slope, rate = jnp.sum(gradient * steps.bodies), jnp.zeros((), gradient.dtype)
     for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
         shares = assembly.shares(group)
-        if isinstance(group.form, NodalForm):
+        if isinstance(group.form, NodalForm | SlidingForm):
             (_, closing), (along, rates) = _rates(here, step, of_ends)
             # What the motions of the ends do without contacts is in the gradient of the bodies.
             known = jnp.sum(here.coupling.first * of_ends.reshape(-1, 12), axis=1)
@@ -851,8 +893,8 @@ def _slopes(
 
 
 def _rates(here: _Here, step: RodStep, of_ends: Float[Array, "k 2 6"]) -> tuple[Any, Any]:
-    """L of rods with positions of nodes and what they lack of their spans, and how fast these change as a step begins
-    under the new forces.
+    """L of rods that slide or have positions of nodes, and what they lack of their spans, and how fast these change as
+    a step begins under the new forces.
     """
 
     def of_rod(step: RodStep, rod: RodInBodies, of_ends: Float[Array, "2 6"]) -> tuple[Any, Any]:

@@ -20,6 +20,8 @@ from rodjax.discretization.form import EndTurn, Form, Linearization
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
+from rodjax.discretization.sliding import SlidingForm
+from rodjax.discretization.sliding_point import SlidingPoint
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
 from rodjax.model.supports import Clamp, rotate
@@ -45,7 +47,7 @@ class RodInBodies(NamedTuple):
 
     def form_at(self, motions: Float[Array, "2 6"] | None = None) -> Form:
         """The form with its ends at the poses of the bodies after these motions."""
-        scene = self.form.scene
+        scene, form = self.form.scene, self.form
         ends = []
         for end, support in enumerate((scene.start, scene.end)):
             if isinstance(support, Clamp):
@@ -58,8 +60,10 @@ class RodInBodies(NamedTuple):
                 frame = jnp.where(self.is_joint[end], frame @ self.frame[end], support.frame)
                 support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
             ends.append(support)
+        if isinstance(form, SlidingForm):
+            return form.between((ends[0], ends[1]))
         scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
-        form = eqx.tree_at(lambda form: form.scene, self.form, scene)
+        form = eqx.tree_at(lambda form: form.scene, form, scene)
         return dataclasses.replace(form, pushed=self.touches) if isinstance(form, NodalForm) else form
 
     def arm(self, end: int) -> Float[Array, "3"]:
@@ -78,7 +82,8 @@ class RodInBodies(NamedTuple):
 class Coupling(NamedTuple):
     """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and constraint residual;
     those of the gaps of contacts apart, `None` without obstacles. `of_nodes`: how rotation and position of the node at
-    each end follow, `None` where nodes have no positions.
+    each end follow, `None` where nodes have no positions. `of_multipliers`: the derivatives of the first ones by the
+    multipliers, where these are not `of_constraints`.
     """
 
     first: Float[Array, "12"]
@@ -87,6 +92,11 @@ class Coupling(NamedTuple):
     of_constraints: Float[Array, "k 12"]
     of_gaps: Float[Array, "r n+1 12"] | None
     of_nodes: Float[Array, "2 b+3 6"] | None
+    of_multipliers: Float[Array, "k 12"] | None = None
+
+    @property
+    def by_multipliers(self) -> Float[Array, "k 12"]:
+        return self.of_constraints if self.of_multipliers is None else self.of_multipliers
 
 
 class EndContacts(NamedTuple):
@@ -166,8 +176,29 @@ def lifted(pull: Float[Array, "3"], arm: Float[Array, "3"]) -> Float[Array, "3 3
 
 def linearized_with_ends(rod: RodInBodies, form: Form, point: Any) -> tuple[Linearization, Coupling]:
     """The linearisation of a rod, whose form has its ends where they are, and what couples it to these."""
+    if isinstance(form, SlidingForm):
+        here, coupled = linearized_with_ends(rod, form.at(point.arclengths), point.inner)
+        return form.with_arclengths(point, here), _with_arclengths(rod, point, coupled)
     released = form.released(point)
     return held(form, released), coupling(rod, form, point, released)
+
+
+def _with_arclengths(rod: RodInBodies, point: SlidingPoint, coupled: Coupling) -> Coupling:
+    """Where the rod slides through clips. What these apply along the rod knows of the ends by forces and rotations
+    alone, but the mesh goes along with the clips, and what is left at the ends with it: no symmetry.
+    """
+
+    def energy(motions: Float[Array, "12"], arclengths: Float[Array, "j"]) -> Float[Array, ""]:
+        form = rod.form_at(motions.reshape(2, 6))
+        return form.lagrangian(form.holding(dataclasses.replace(point, arclengths=arclengths)))[0]
+
+    nowhere = jnp.zeros_like(coupled.first)
+    by_arclengths = jax.jacfwd(lambda arclengths: jax.grad(energy)(nowhere, arclengths))(point.arclengths)
+    before = jnp.zeros_like(by_arclengths.T)
+    return coupled._replace(
+        of_constraints=jnp.concatenate([before, coupled.of_constraints]),
+        of_multipliers=jnp.concatenate([by_arclengths.T, coupled.of_constraints]),
+    )
 
 
 def held(form: Form, released: Linearization) -> Linearization:
@@ -181,7 +212,7 @@ def held(form: Form, released: Linearization) -> Linearization:
         first, contacts, balance, gaps = system.split(released.constraint_residual)
         parts = [part.reshape(-1) for part in (first, contacts, balance * nodes[:, None], gaps)]
         return dataclasses.replace(released, system=system, constraint_residual=jnp.concatenate(parts))
-    assert isinstance(system, SaddlePointSystem), "rods whose ends move do not slide"
+    assert isinstance(system, SaddlePointSystem), "rods that slide have forms at fixed arclengths"
     identity = np.eye(len(system.diagonal), dtype=free.dtype)[..., None]
     blocks = free[None, None]
     across = system.across

@@ -835,12 +835,7 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
     The mesh goes along with them. Where it was stretched by that, or another one belongs to where they have come, the
     search goes on from there on a mesh that is made anew.
     """
-    assert guess.arclengths is not None
-    shape, point = _first_point(form_of(slid(scene, guess.arclengths), guess.shape), guess, first)
-    if scene.turns is not None:
-        # They are those of the first shape.
-        guess = dataclasses.replace(guess, shape=shape.with_unknowns(point))
-        scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
+    scene, guess, point = _with_first_turns(scene, guess, first)
 
     def search(last: _Sliding) -> _Sliding:
         state = last.found.state
@@ -866,6 +861,16 @@ def _slid(scene: Scene, guess: SolverState, first: FirstTwist, options: Options)
     return jax.lax.while_loop(lambda last: last.goes_on & (last.count < MOST_MESHES), search, begin).found
 
 
+def _with_first_turns(scene: Scene, guess: SolverState, first: FirstTwist) -> tuple[Scene, SolverState, Point]:
+    """A scene without turns, which are those of the first shape, that shape, and the point there."""
+    assert guess.arclengths is not None
+    shape, point = _first_point(form_of(slid(scene, guess.arclengths), guess.shape), guess, first)
+    if scene.turns is not None:
+        guess = dataclasses.replace(guess, shape=shape.with_unknowns(point))
+        scene = eqx.tree_at(lambda scene: scene.turns, scene, None)
+    return scene, guess, point
+
+
 class _Sliding(eqx.Module):
     """What has been found on so many meshes, and whether another one is needed."""
 
@@ -877,12 +882,8 @@ class _Sliding(eqx.Module):
 def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> tuple[Found, Bool[Array, ""]]:
     """What a search finds on one mesh, and whether it is to go on on another one."""
     assert isinstance(options.solver, Newton)
-    assert guess.arclengths is not None
     search = Search.of(scene, guess, first, options)
-    descends = options.find == "minimum"
-    form = SlidingForm(scene=scene, made=scene, shape=search.shape, first=search.form, descends=descends)  # pyright: ignore
-    is_warm = jnp.any(guess.end_force != 0)
-    point = SlidingPoint(search.point, guess.arclengths, is_warm, jnp.zeros_like(guess.arclengths))
+    form, point = _with_arclengths(search, scene, guess, options)
     end = _sought(form, point, guess, options.solver, options.find)
     assert isinstance(end.point, SlidingPoint)
     reached = dataclasses.replace(search, form=form.at(end.point.arclengths))
@@ -892,6 +893,27 @@ def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Opt
     goes_on = is_converged(end.outcome.status) & form.is_misplaced(end.point)
     is_blocked = form.is_blocked(end.point)
     return found, goes_on if is_blocked is None else goes_on | is_blocked
+
+
+def sliding_search(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Search:
+    """Where a search begins whose unknowns are the arclengths of sliding clips too."""
+    assert guess.arclengths is not None
+    scene, guess, point = _with_first_turns(scene, guess, first)
+    scene = slid(scene, guess.arclengths)
+    search = Search.of(scene, guess, FirstTwist(point.total_twist), options)
+    form, point = _with_arclengths(search, scene, guess, options)
+    return dataclasses.replace(search, form=form, point=point)
+
+
+def _with_arclengths(
+    search: Search, scene: Scene, guess: SolverState, options: Options
+) -> tuple[SlidingForm, SlidingPoint]:
+    """The form and point of a search with the arclengths of sliding clips, from a scene with its clips at those."""
+    assert guess.arclengths is not None
+    descends = options.find == "minimum"
+    form = SlidingForm(scene=scene, made=scene, shape=search.shape, first=search.form, descends=descends)  # pyright: ignore
+    is_warm = jnp.any(guess.end_force != 0)
+    return form, SlidingPoint(search.point, guess.arclengths, is_warm, jnp.zeros_like(guess.arclengths))
 
 
 def on_mesh_of(scene: Scene, shape: Shape, other: Shape) -> Shape:

@@ -14,6 +14,9 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.discretization.forms import form_of
+from rodjax.discretization.shape import Shape
+from rodjax.discretization.sliding import SlidingForm
+from rodjax.discretization.sliding_point import SlidingPoint
 from rodjax.model.harness import (
     Bodies,
     Harness,
@@ -23,12 +26,13 @@ from rodjax.model.harness import (
     of_one_rod,
 )
 from rodjax.model.loads import ContactLoads
-from rodjax.model.scene import Scene, nondimensional, under_contact
+from rodjax.model.scene import Scene, nondimensional, slid, slides, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
 from rodjax.solving.equilibrium import (
     DEFAULT_RTOL,
+    MOST_MESHES,
     Options,
     Search,
     _finer,
@@ -40,7 +44,9 @@ from rodjax.solving.equilibrium import (
     in_units_of,
     is_here,
     last_twist,
+    on_mesh_of,
     on_one_side,
+    sliding_search,
 )
 from rodjax.solving.first_poses import Shapes, first_poses
 from rodjax.solving.guess import Guess
@@ -71,7 +77,8 @@ from rodjax.solving.result import (
     warn_of_outcome,
 )
 from rodjax.solving.rod_contact import Members, in_contact, pairs_of
-from rodjax.solving.status import Outcome, is_converged
+from rodjax.solving.status import Outcome, Status, is_converged
+from rodjax.units import Units
 from rodjax.warn import warn
 
 
@@ -355,7 +362,9 @@ def _solve(
         )
 
         def begin(scene: Scene, state: SolverState, first: FirstTwist, option: Options = option) -> Search:
-            return Search.of(*in_units_of(scene, state), first, option)
+            scaled, state = in_units_of(scene, state)
+            of_kind = sliding_search if slides(scene) else Search.of
+            return of_kind(scaled, state, first, option)
 
         searches = jax.vmap(begin)(scenes, states, firsts)
         body, frame, offset = ends_of(harness, numbers)
@@ -369,8 +378,60 @@ def _solve(
     between = split_rod_pressures(pairs, counts, rod_pressures / assembly.force)
     solver = options[0].solver
     assert isinstance(solver, Newton)
-    end = find_assembly(assembly, tuple(points), tuple(at_ends), between, poses, solver, options[0].find)
+    begin = assembly.begin(tuple(points), tuple(at_ends), between, poses)
+    if any(isinstance(group.form, SlidingForm) for group in groups):
+        assembly, end = _slid(assembly, begin, solver, options)
+    else:
+        end = find_assembly(assembly, begin, solver, options[0].find)
     return harness_equilibrium(harness, members, assembly, end, end_pressures, strain_limit, tuple(all_searches))
+
+
+def _slid(assembly: Assembly, begin: State, solver: Newton, options: tuple[Options, ...]) -> tuple[Assembly, State]:
+    """What is found where rods slide through clips. Their meshes go along with these; where one was stretched by that,
+    or another one belongs to where the clips have come, the search goes on from there on meshes that are made anew.
+    """
+    first = [group.shape for group in assembly.groups]
+
+    def anew(groups: tuple[Rods, ...], state: State) -> tuple[tuple[Rods, ...], State]:
+        made, points = list(groups), list(state.points)
+        forms = dataclasses.replace(assembly, groups=groups).forms(state.poses)
+        for number, form in enumerate(forms):
+            if isinstance(form, SlidingForm):
+                parts = form, state.points[number], groups[number].units, first[number]
+                found = jax.vmap(lambda *parts, option=options[number]: _made_anew(*parts, option))(*parts)
+                made[number] = dataclasses.replace(groups[number], form=found.form, shape=found.shape)
+                points[number] = found.point
+        return tuple(made), state._replace(points=tuple(points))
+
+    def search(last: tuple[tuple[Rods, ...], State, Array, Array]) -> tuple[tuple[Rods, ...], State, Array, Array]:
+        groups, state, count, _ = last
+        made = anew(groups, state)
+        groups, state = jax.tree.map(lambda old, new: jnp.where(count == 0, old, new), (groups, state), made)
+        here = dataclasses.replace(assembly, groups=groups)
+        again = here.begin(state.points, state.at_ends, state.pairs, state.poses)
+        begin = again._replace(iterations=state.iterations, evaluations=state.evaluations)
+        end = find_assembly(here, begin, solver, options[0].find)
+        goes_on = jnp.array(False)
+        for form, points in zip(here.forms(end.poses), end.points, strict=True):
+            if isinstance(form, SlidingForm):
+                misplaced = jax.vmap(lambda form, point: form.is_misplaced(point))(form, points)
+                goes_on |= is_converged(end.status) & jnp.any(misplaced)
+                is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(form, points)
+                goes_on |= False if is_blocked is None else jnp.any(is_blocked)
+        status = jnp.where(goes_on & (count == MOST_MESHES - 1), Status.MAX_ITERATIONS, end.status)
+        return groups, end._replace(status=status), count + 1, goes_on
+
+    start = assembly.groups, begin, jnp.zeros((), int), jnp.array(True)
+    groups, end, _, _ = jax.lax.while_loop(lambda last: last[3] & (last[2] < MOST_MESHES), search, start)
+    return dataclasses.replace(assembly, groups=groups), end
+
+
+def _made_anew(form: SlidingForm, point: SlidingPoint, units: Units, mesh: Shape, options: Options) -> Search:
+    """On a mesh like that of a shape, for a rod with its ends where the bodies are."""
+    scene, reached = slid(form.scene, point.arclengths), form.at(point.arclengths)
+    shape = on_mesh_of(scene, form.shape.reached(reached, reached.settled(point.inner)), mesh)
+    state = SolverState(shape, point.end_force, units, point.arclengths)
+    return sliding_search(scene, state, FirstTwist(point.total_twist), options)
 
 
 def harness_equilibrium(
@@ -438,14 +499,20 @@ def _equilibria(
         scene: Scene, rod: Rods, search: Search | None, begin: SolverState | None, point: Any, residual: Array
     ) -> Equilibrium:
         scaled, units = nondimensional(scene)
-        form = form_of(scaled, rod.shape)
+        arclengths = None
+        if isinstance(rod.form, SlidingForm):
+            arclengths, made = point.arclengths, slid(scaled, rod.form.made_at)
+            form, point = SlidingForm.of(made, rod.shape).at(arclengths), point.inner
+        else:
+            form = form_of(scaled, rod.shape)
         if point.nodal is not None:
             # From the units of the search, whose origin is where the rod began.
             positions = point.nodal.positions + (rod.units.origin - units.origin)[None] / units.length
             point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, positions=positions))
         point = form.settled(form.holding(point))
         pressures = point.nodal.pressures if scene.obstacles else None
-        state = SolverState(rod.shape.reached(form, point), point.end_force, units, pressures=pressures)
+        shape = rod.shape.reached(form, point)
+        state = SolverState(shape, point.end_force, units, arclengths, pressures=pressures)
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
         found = Found(state, point, outcome, is_stable)
         if scene.obstacles:

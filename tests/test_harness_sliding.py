@@ -1,0 +1,122 @@
+"""Rods of harnesses that slide through clips, against the rod that is not cut."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rodjax
+from rodjax import Body, Clamp, Clip, Free, Harness, Joint, Newton, Plane, PointForce, Rod, Scene, Spring
+
+GRAVITY = (0.0, 3.0, -9.81)
+START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
+END = Clamp((0.5, 0.2, 0), rodjax.frame((1, 1, 1)))
+JOINT = Joint("cut", rodjax.frame((0, 1, 0), (0, 0, 1)), (0.1, 0, 0.02))
+PLACE = (0.12, 0.02, -0.25)
+TIGHT = Newton(tolerance=1e-11)
+
+
+def plain(length: float) -> Rod:
+    return Rod.circular(length, 0.005, 1e7, shear_modulus=1e7 / 3, density=1200.0)
+
+
+def bent(length: float) -> Rod:
+    rod = plain(length)
+    stiffnesses = (rod.EI, 1.5 * rod.EI), rod.GJ, rod.EA
+    return Rod(length, *stiffnesses, rod.mass_per_length, rest_curvature=(1.0, 0.5), rest_twist=0.3)
+
+
+def cut(rod, clip, length=0.5, gravity=GRAVITY, **loads) -> Harness:
+    first = Scene(rod(length), START, JOINT, gravity=gravity, clips=[clip], **loads)
+    return Harness({"a": first, "b": Scene(rod(1.0 - length), JOINT, END, gravity=gravity)})
+
+
+# A clip by frames turns the rod that slides through it, one by tangents holds its direction.
+@pytest.mark.parametrize(("rod", "direction"), [(plain, None), (bent, (0.6, 0.1, -0.8))], ids=["plain", "bent"])
+def test_a_cut_rod_slides_as_the_rod(rod, direction):
+    def scene(at: float) -> Scene:
+        return Scene(rod(1.0), START, END, GRAVITY, clips=[Clip(at, PLACE, direction, sliding=True)])
+
+    # Cut at a node, on meshes made where the clip is found in the end: the same nodes.
+    at = 0.25
+    for _ in range(3):
+        whole = rodjax.solve(scene(at), segments=16, solver=TIGHT)
+        at = float(whole.scene.clips[0].at)
+    clip = Clip(at, PLACE, direction, sliding=True)
+    shapes = {"a": rodjax.Guess(whole.nodes[:9]), "b": rodjax.Guess(whole.nodes[8:])}
+    parts = rodjax.solve(cut(rod, clip, length=whole.s[8]), segments=8, solver=TIGHT, guess=shapes)
+    assert parts.converged
+    assert parts.stable
+    assert abs(parts["a"].scene.clips[0].at - at) < 1e-9
+    nodes = jnp.concatenate([parts["a"].nodes, parts["b"].nodes[1:]])
+    np.testing.assert_allclose(nodes, whole.nodes, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(parts["b"].end_moment, whole.end_moment, rtol=0, atol=1e-9)
+    # Nothing pulls along the rod in the clip.
+    along = parts["a"].clip_forces[0] @ parts["a"].tangents[jnp.argmin(jnp.abs(parts["a"].s - at))]
+    assert abs(along) < 1e-8 * jnp.linalg.norm(parts["a"].clip_forces[0])
+
+
+def test_meshes_are_made_anew_as_a_rod_slides():
+    """From a clip that begins far from where it is found, past a point force whose node it may not share."""
+    load = PointForce(0.35, (0.0, 0.0, -0.02))
+
+    def found(at: float):
+        clip = Clip(at, PLACE, sliding=True)
+        return rodjax.solve(cut(plain, clip, point_forces=[load]), segments=16)
+
+    far, near = found(0.4), found(0.28)
+    assert far.converged
+    assert near.converged
+    places = [float(each["a"].scene.clips[0].at) for each in (far, near)]
+    assert abs(places[0] - places[1]) < 1e-4
+    lengths = np.diff(np.asarray(far["a"].s))
+    # Made anew where elements beside the clip are stretched by a quarter.
+    assert np.max(lengths) < 1.6 * np.min(lengths[lengths > 0.01])
+
+
+def test_derivatives_are_those_of_the_rod_that_slides():
+    clip = Clip(0.25, PLACE, sliding=True)
+
+    def place(scale):
+        parts = rodjax.solve(cut(plain, clip, gravity=scale * jnp.array(GRAVITY)), segments=8, solver=TIGHT)
+        return jnp.stack([parts["a"].scene.clips[0].at, parts.positions[0, 2], parts.energy])
+
+    one, step = jnp.array(1.0), 1e-4
+    _, change = jax.jvp(place, (one,), (one,))
+    differences = (place(one + step) - place(one - step)) / (2 * step)
+    # Differences have errors of step^2 and of roundings by step.
+    np.testing.assert_allclose(change, differences, rtol=1e-6, atol=1e-9)
+
+
+def test_an_end_on_a_spring_slides():
+    spring = Spring(END, translation=20.0, rotation=0.05)
+    found = rodjax.solve(Scene(plain(1.0), START, spring, GRAVITY, clips=[Clip(0.5, PLACE, sliding=True)]), segments=16)
+    assert found.converged
+    pulled = found.nodes[-1] - END.position
+    np.testing.assert_allclose(found.end_force, -20.0 * pulled, rtol=0, atol=1e-8)
+
+
+def test_paths_carry_where_the_rod_passes_its_clips():
+    clip = Clip(0.25, PLACE, sliding=True)
+    harnesses = [cut(plain, clip, gravity=(0.0, 3.0 * scale, -9.81 * scale)) for scale in (1.0, 1.2)]
+    path = rodjax.solve_path(harnesses, segments=8)
+    assert np.all(path.converged)
+    alone = rodjax.solve(harnesses[1], segments=8)
+    # Meshes differ by where the clips were when they were made.
+    assert abs(path["a"].scene.clips[0].at[1] - alone["a"].scene.clips[0].at) < 1e-6
+    assert path.iterations[1] < alone.iterations
+
+
+def test_what_does_not_slide_in_a_harness_is_told():
+    clip = Clip(0.25, PLACE, sliding=True)
+    with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide .* obstacles or fields"):
+        cut(plain, clip, obstacles=[Plane((0, 0, -1), (0, 0, 1))])
+    other = Scene(plain(1.0), Clamp((0, 0.5, 0), rodjax.frame((1, 0, 0))), Free())
+    scenes = cut(plain, clip)
+    with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide, as it may touch another cable"):
+        Harness(dict(zip("abc", [*scenes.scenes, other], strict=True)), {"cut": Body()}, contact=True)
+    found = rodjax.solve(scenes, segments=8)
+    with pytest.raises(ValueError, match="without sliding clips"):
+        rodjax.lowest_mode(found)
+    with pytest.raises(ValueError, match="without sliding clips"):
+        rodjax.follow([scenes, scenes])

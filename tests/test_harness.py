@@ -10,7 +10,7 @@ import pytest
 from planar_frames import PlanarRod, solve_frame
 
 import rodjax
-from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Rod, Scene, Slider, Spring, plot
+from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Plane, Rod, Scene, Slider, Spring, plot
 from rodjax.solving.first_poses import first_poses
 
 GRAVITY = (0.0, 3.0, -9.81)
@@ -27,7 +27,8 @@ def plain(length: float) -> Rod:
 def bent(length: float) -> Rod:
     rod = plain(length)
     stiffnesses = (rod.EI, 1.5 * rod.EI), rod.GJ, rod.EA
-    return Rod(length, *stiffnesses, rod.mass_per_length, rest_curvature=(1.0, 0.5), rest_twist=0.3)
+    shape = {"rest_curvature": (1.0, 0.5), "rest_twist": 0.3}
+    return Rod(length, *stiffnesses, rod.mass_per_length, radius=0.005, **shape)
 
 
 def cut(rod, end=END) -> Harness:
@@ -96,6 +97,22 @@ def test_cables_and_joints_begin_with_the_shapes_that_are_given(side):
     # The joint begins where the shape ends, turned as the shape: all else follows.
     one = rodjax.solve(parts, segments=4, guess={"a": shapes["a"]})
     assert side * one["b"].nodes[0, 2] > 0.25
+
+
+@pytest.mark.parametrize("obstacles", [[], [Plane((0, 0, -0.35), (0, 0, 1))]], ids=["in space", "on a floor"])
+def test_a_dead_moment_on_a_joint_is_that_on_a_free_end(obstacles):
+    """4 EI/L about an axis along nothing."""
+    rod, tight = bent(1.0), Newton(tolerance=1e-10)
+    moment = 4 * rod.EI[0] / rod.length * np.array([0.2, -0.6, 0.7])
+    scenes = [Scene(rod, START, end, GRAVITY, obstacles=obstacles) for end in (Free(moment=moment), Joint("tip"))]
+    whole = rodjax.solve(scenes[0], segments=12, solver=tight)
+    tip = rodjax.solve(Harness({"a": scenes[1]}, {"tip": Body(moment=moment)}), segments=12, solver=tight)
+    assert tip.converged
+    assert not tip.stable
+    assert jnp.max(jnp.abs(tip["a"].nodes - whole.nodes)) < 1e-8
+    # By steps of the symmetric part alone 64 and 34.
+    assert tip.iterations < 25
+    assert bool(obstacles) == bool(jnp.any(jnp.linalg.norm(whole.contact_forces, axis=-1) > 1e-3))
 
 
 def test_derivatives_of_a_cut_rod_are_those_of_the_rod():

@@ -359,6 +359,15 @@ class Bodies(eqx.Module):
         each = each.at[j, :3, j, :3].set(self.translations).at[j, 3:, j, 3:].set(self.rotations)
         return each.reshape(6 * count, 6 * count)[:, np.array(self.columns, int)]
 
+    @property
+    def under_moments(self) -> Float[Array, "j 3 3"]:
+        """What dead moments M add to the stiffness against rotation vectors r: -M x r / 2. What potentials apply to a
+        body changes by their second derivatives with respect to r and, where it is not zero, by half of its cross
+        product with r; at equilibrium it is -M, which stays as it is.
+        """
+        assert self.moment is not None
+        return jax.vmap(lambda moment: jnp.cross(moment[None], jnp.eye(3, dtype=moment.dtype)).T / -2)(self.moment)
+
     def energies(
         self, positions: Float[Array, "j 3"], frames: Float[Array, "j 3 3"], turns: Float[Array, "j 3"]
     ) -> Float[Array, "j"]:

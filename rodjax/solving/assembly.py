@@ -631,16 +631,19 @@ def _condensed(
         aside = jnp.where(is_pushed & is_below, PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
         stiffness = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
         coordinates = vectors @ ((vectors.T @ right + aside) / stiffness)
-        if any(here.coupling.of_multipliers is not None for here in all_here):
-            # The matrix is not symmetric: a step is exact once that of the nearest symmetric one goes down.
-            damped = matrix + state.damping * jnp.eye(len(values), dtype=dtype)
-            exact = jnp.linalg.solve(damped, right)
+        if not _is_symmetric(assembly, all_here):
+            exact = jnp.linalg.solve(matrix + state.damping * jnp.eye(len(values), dtype=dtype), right)
             coordinates = jnp.where(jnp.min(values, initial=1.0) > LEAST_STIFFNESS, exact, coordinates)
     else:
         is_pushed = jnp.array(False)
         stiffness = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
         coordinates = vectors @ ((vectors.T @ right) / stiffness)
     return _Bodies((motions @ coordinates).reshape(assembly.count, 6), below, is_pushed)
+
+
+def _is_symmetric(assembly: Assembly, all_here: list[_Here]) -> bool:
+    """Whether S is: else steps are those of its symmetric part until that is positive, and then its own."""
+    return assembly.bodies.moment is None and all(here.coupling.of_multipliers is None for here in all_here)
 
 
 def _condensed_system(
@@ -651,6 +654,8 @@ def _condensed_system(
     full = jnp.zeros((count + 1, 6, count + 1, 6), dtype)
     number = np.arange(count)
     full = full.at[number, :, number, :].add(balance.stiffness)
+    if assembly.bodies.moment is not None:
+        full = full.at[number, 3:, number, 3:].add(assembly.bodies.under_moments / assembly.energy)
     right = -jnp.pad(balance.gradient, ((0, 1), (0, 0)))
     for group, here, found in zip(assembly.groups, all_here, rods.found, strict=True):
         shares, couple = assembly.shares(group), here.coupling
@@ -714,7 +719,8 @@ def _with_contacts(
     pattern = jnp.asarray(_generic(len(force), dtype))
     motions = assembly.bodies.motions
     parts = motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"
-    found = contact_step(ContactModel(tuple(groups), *parts, together), tuple(shifts), state.damping)
+    model = ContactModel(tuple(groups), *parts, together, _is_symmetric(assembly, all_here))
+    found = contact_step(model, tuple(shifts), state.damping)
     is_definite = rods.is_definite & found.is_found
     for shift in found.shifts:
         is_definite &= jnp.all(shift <= least)

@@ -239,7 +239,7 @@ class ContactModel(eqx.Module):
 
     `push`: by how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
     negative; `may_reverse`: whether a minimum is sought; `between`: the contacts of rods with one another, `None`
-    without such.
+    without such; `is_symmetric`: else steps are exact once the symmetric part of the stiffness is positive.
     """
 
     groups: tuple[RodsInContact, ...]
@@ -251,8 +251,7 @@ class ContactModel(eqx.Module):
     least: float = eqx.field(static=True)
     may_reverse: bool = eqx.field(static=True)
     between: Between | None = None
-
-    is_symmetric = True
+    is_symmetric: bool = eqx.field(static=True, default=True)
 
     def begin(self, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> Memory:
         size = len(self.force)
@@ -343,6 +342,9 @@ class ContactModel(eqx.Module):
             regularized = jnp.where(jnp.abs(values) < self.least, self.least, values)
             is_minimum &= ~jnp.any(is_below)
         q = vectors @ ((vectors.T @ force) / regularized)
+        if not self.is_symmetric:
+            exact = jnp.linalg.solve(stiffness, force)
+            q = jnp.where(jnp.min(values, initial=1.0) > self.least, exact, q)
         bodies, motions = self.bodies(q), []
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):

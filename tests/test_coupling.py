@@ -15,7 +15,7 @@ from rodjax.discretization.nodal_point import NodalChange
 from rodjax.linalg.chain import ChainSystem
 from rodjax.solving.assembly import RodStep
 from rodjax.solving.coupling import RodInBodies, linearized_with_ends
-from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of
+from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of, sliding_search
 
 START = Clamp((0.1, 0, 0.2), frame((1, 0, -1)))
 END = Clamp((0.7, 0.2, 0.1), frame((1, 1, 1)))
@@ -37,6 +37,14 @@ CASES = [
 ]
 
 
+def in_bodies(form, units, ends, frames, offsets) -> RodInBodies:
+    """With bodies under which the clamps are where they are."""
+    of_body = jnp.stack([end.frame @ own.T for end, own in zip(ends, frames, strict=True)])
+    positions = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
+    poses, joints = (frames, offsets, jnp.stack(positions), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
+    return RodInBodies(form, units, joints, *poses, joints)
+
+
 @pytest.mark.parametrize("kind", CASES)
 def test_coupling_is_that_of_automatic_derivatives(kind):
     """Along one motion of both bodies that has all components, away from equilibrium."""
@@ -50,11 +58,7 @@ def test_coupling_is_that_of_automatic_derivatives(kind):
         search = Search.of(*in_units_of(scene, state), first, options)
         form, units = search.form, search.units
         ends = [end if isinstance(end, Clamp) else END for end in (scene.start, scene.end)]
-        # Bodies under which the clamps are where they are.
-        of_body = jnp.stack([end.frame @ own.T for end, own in zip(ends, frames, strict=True)])
-        positions = [end.position - turn @ off for end, turn, off in zip(ends, of_body, offsets, strict=True)]
-        poses, joints = (frames, offsets, jnp.stack(positions), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
-        rod = RodInBodies(form, units, joints, *poses, joints)
+        rod = in_bodies(form, units, ends, frames, offsets)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
         point = form.holding(form.retract(search.point, bases, 0.3 * rotation, 3.0 * force))
@@ -113,10 +117,7 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
     def found_and_expected(scene, state, first, frames, offsets, shift, pressures):
         search = Search.of(*in_units_of(scene, state), first, options)
         form, units = search.form, search.units
-        of_body = jnp.stack([end.frame @ own.T for end, own in zip((START, END), frames, strict=True)])
-        positions = [end.position - turn @ off for end, turn, off in zip((START, END), of_body, offsets, strict=True)]
-        poses, joints = (frames, offsets, jnp.stack(positions), of_body, jnp.asarray(0.8)), jnp.ones(2, bool)
-        rod = RodInBodies(form, units, joints, *poses, joints)
+        rod = in_bodies(form, units, (START, END), frames, offsets)
         bases = form.bases_at(search.point)
         rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
         point = form.holding(form.retract(search.point, bases, 0.3 * rotation, 3.0 * force))
@@ -174,3 +175,38 @@ def test_coupling_of_rods_with_places_of_nodes(kind):
         # Roundings of second derivatives up to 1e3.
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
         assert np.any(np.abs(other) > 0.1)
+
+
+def test_bodies_feel_the_mesh_that_goes_along_with_a_clip():
+    """The derivatives of what a rod gives its ends by the arclength where it passes a clip, against differences."""
+    random = np.random.default_rng(0)
+    scene = Scene(Rod(*STRIP), START, END, clips=[Clip(0.4, (0.3, 0, 0.1), sliding=True)], gravity=LOADS["gravity"])
+    options, _ = checked_options(scene, 4, None, "hermite", None)
+    state, first = first_state(scene, None, options)
+    axes = jnp.stack([frame((0.2, -1, 0.4)), frame((0.5, 1, 0.3))])
+    step = 1e-4
+
+    @by_numpy
+    def at(scene, state, first, frames, offsets, shift, change):
+        search = sliding_search(*in_units_of(scene, state), first, options)
+        form, bases = search.form, search.form.bases_at(search.point)
+        rod = in_bodies(form, search.units, (START, END), frames, offsets)
+        rotation, force = shift[: bases[0].size].reshape(bases.shape[1:]), form.layout.forces(shift[: form.layout.size])
+        others = form.no_others(search.point)._replace(arclengths=jnp.full(1, change))
+        point = form.holding(form.retract(search.point, bases, 0.3 * rotation, 3.0 * force, others))
+        _, coupling = linearized_with_ends(rod, form, point)
+        return coupling.first, coupling.of_multipliers[0]
+
+    given = (
+        scene,
+        state,
+        first,
+        axes,
+        jnp.asarray(random.normal(size=(2, 3))) / 10,
+        jnp.asarray(random.normal(size=100)),
+    )
+    _, found = at(*given, jnp.asarray(0.0))
+    expected = (at(*given, jnp.asarray(step))[0] - at(*given, jnp.asarray(-step))[0]) / (2 * step)
+    assert jnp.max(jnp.abs(expected)) > 1
+    # Differences have errors of step^2.
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)

@@ -9,7 +9,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.optimize import brentq
 
 import rodjax
-from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, PointForce, Rod, Scene, plot
+from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, Plane, PointForce, Rod, Scene, plot
 from rodjax.analysis.sensitivity import moved
 from rodjax.solving.rod_contact_results import touching_rods
 
@@ -111,6 +111,22 @@ def test_beams_that_do_not_reach_one_another_do_not_touch():
     assert jnp.all(apart.rod_pressures == 0)
     assert float(apart.rod_contacts["upper", "lower"].gaps.min()) == pytest.approx(0.001, rel=1e-4)
     assert "no rods touch one another" in rodjax.describe(apart)
+
+
+@pytest.mark.slow
+def test_a_rod_on_a_floor_that_touches_no_other_is_as_alone(pressed):
+    """Of another structure than those that touch."""
+    heavy = Rod.circular(LENGTH, RADIUS, YOUNGS_MODULUS, poisson_ratio=0.5, density=3000.0)
+    ends = Clamp((0, 1, 0), ALONG), Clamp((0.99, 1, 0), ALONG)
+    aside = Scene(heavy, *ends, (0, 0, -9.81), obstacles=[Plane((0, 0, -0.03), (0, 0, 1))])
+    cables = dict(zip(pressed.names, pressed.harness.scenes, strict=True))
+    all_three = Harness({**cables, "aside": aside}, contact=[pressed.names])
+    found = rodjax.solve(all_three, segments=8, solver=TIGHT)
+    alone = rodjax.solve(aside, segments=8, solver=TIGHT)
+    assert found.converged
+    assert jnp.max(jnp.linalg.norm(alone.contact_forces, axis=1)) > 0.1
+    np.testing.assert_allclose(found["aside"].nodes, alone.nodes, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["upper"].nodes, pressed["upper"].nodes, rtol=0, atol=1e-12)
 
 
 def test_derivatives_are_those_of_differences(pressed):

@@ -349,7 +349,8 @@ class ContactModel(eqx.Module):
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):
             of_ends = rods.of_ends(bodies)
-            if between is not None:
+            if rods.columns is not None:
+                assert between is not None
                 of_ends = jnp.concatenate([of_ends, jnp.tile(between[None], (len(of_ends), 1))], axis=1)
             by_ends = (jnp.einsum("k...i,ki->k...", by, of_ends) for by in found.by_motions)
             motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_ends))))

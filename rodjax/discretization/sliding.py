@@ -360,9 +360,9 @@ class SlidingForm(Form):
             factors = factor(system)
             assert isinstance(factors, BorderedFactors)
             x, y = factors.joined(x, y, -constraint_residual[:j])
-            return is_minimum & self.goes_down(factors, y), x, y
+            return is_minimum & _goes_down(factors, y), x, y
         factors, x, y = factor_and_solve(system, push - here.gradient, -constraint_residual, is_regularized=True)
-        return self.goes_down(factors, y) & factors.inner.is_minimum, x, y
+        return self.has_minimum(factors, y), x, y
 
     def sliding(self, here: Any, system: AnySystem) -> tuple[BorderedSystem, Float[Array, "k"]]:
         """The system of a step and its constraint residual, at fixed arclengths unless the rod slides already."""
@@ -373,15 +373,10 @@ class SlidingForm(Form):
         system = dataclasses.replace(system.held_unless(here.slides), descends=self.descends and self.has_potential)
         return system, constraint_residual
 
-    def goes_down(self, factors: Any, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
-        """Whether a step leads to less energy by the arclengths: what pulls along the rod leads away from a largest
-        one, and no shift is needed.
-        """
+    def has_minimum(self, factors: Any, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
+        """Whether a step leads to a minimum, from the factors of its system and its multipliers."""
         assert isinstance(factors, BorderedFactors)
-        if not factors.descends:
-            return factors.is_steady
-        j = len(factors.complement)
-        return factors.is_steady | (jnp.max(jnp.abs(multipliers[:j])) > LEAST_SLIDE)
+        return factors.inner.is_minimum & _goes_down(factors, multipliers)
 
     def under_force(
         self,
@@ -402,6 +397,16 @@ class SlidingForm(Form):
             more,
             along + jnp.sum(slope * others.arclengths),
         )
+
+
+def _goes_down(factors: BorderedFactors, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
+    """Whether a step leads to less energy by the arclengths: what pulls along the rod leads away from a largest one,
+    and no shift is needed.
+    """
+    if not factors.descends:
+        return factors.is_steady
+    j = len(factors.complement)
+    return factors.is_steady | (jnp.max(jnp.abs(multipliers[:j])) > LEAST_SLIDE)
 
 
 def _axial_stiffness(scene: Scene) -> Float[Array, ""]:

@@ -180,9 +180,8 @@ def eliminated(
     factors = factor(system, is_regularized=True)
     rotation, multipliers = factors.solve(push - here.gradient, -constraint_residual)
     by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_constraints)
-    is_minimum = factors.is_minimum
-    if isinstance(form, SlidingForm):
-        is_minimum = factors.inner.is_minimum & form.goes_down(factors, multipliers)
+    is_sliding = isinstance(form, SlidingForm)
+    is_minimum = form.has_minimum(factors, multipliers) if is_sliding else factors.is_minimum
     return Eliminated(is_minimum, factors.negative, rotation, multipliers, *by_motions)
 
 

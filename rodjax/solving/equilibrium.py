@@ -897,8 +897,8 @@ def _slid_once(scene: Scene, guess: SolverState, first: FirstTwist, options: Opt
 
 def sliding_search(scene: Scene, guess: SolverState, first: FirstTwist, options: Options) -> Search:
     """Where a search begins whose unknowns are the arclengths of sliding clips too."""
-    assert guess.arclengths is not None
     scene, guess, point = _with_first_turns(scene, guess, first)
+    assert guess.arclengths is not None
     scene = slid(scene, guess.arclengths)
     search = Search.of(scene, guess, FirstTwist(point.total_twist), options)
     form, point = _with_arclengths(search, scene, guess, options)

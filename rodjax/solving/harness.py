@@ -378,11 +378,11 @@ def _solve(
     between = split_rod_pressures(pairs, counts, rod_pressures / assembly.force)
     solver = options[0].solver
     assert isinstance(solver, Newton)
-    begin = assembly.begin(tuple(points), tuple(at_ends), between, poses)
+    start = assembly.begin(tuple(points), tuple(at_ends), between, poses)
     if any(isinstance(group.form, SlidingForm) for group in groups):
-        assembly, end = _slid(assembly, begin, solver, options)
+        assembly, end = _slid(assembly, start, solver, options)
     else:
-        end = find_assembly(assembly, begin, solver, options[0].find)
+        end = find_assembly(assembly, start, solver, options[0].find)
     return harness_equilibrium(harness, members, assembly, end, end_pressures, strain_limit, tuple(all_searches))
 
 
@@ -398,7 +398,7 @@ def _slid(assembly: Assembly, begin: State, solver: Newton, options: tuple[Optio
         for number, form in enumerate(forms):
             if isinstance(form, SlidingForm):
                 parts = form, state.points[number], groups[number].units, first[number]
-                found = jax.vmap(lambda *parts, option=options[number]: _made_anew(*parts, option))(*parts)
+                found = jax.vmap(functools.partial(_made_anew, options=options[number]))(*parts)
                 made[number] = dataclasses.replace(groups[number], form=found.form, shape=found.shape)
                 points[number] = found.point
         return tuple(made), state._replace(points=tuple(points))

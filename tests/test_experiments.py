@@ -385,6 +385,14 @@ def test_stress(monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_random_harnesses(capsys):
+    outcomes = script("random_harnesses").main(["--count", "1", "--seed", "3"])
+    outcomes += script("random_harnesses").main(["--count", "1", "--seed", "3", "--sliding"])
+    assert all(outcome.converged for outcome in outcomes)
+    assert capsys.readouterr().out.count("1 of 1 converge") == 2
+
+
+@pytest.mark.slow
 def test_float32(monkeypatch, capsys):
     monkeypatch.setenv("XLA_FLAGS", "")
     float32 = script("float32")

@@ -103,8 +103,15 @@ def test_paths_carry_where_the_rod_passes_its_clips():
     assert np.all(path.converged)
     alone = rodjax.solve(harnesses[1], segments=8)
     # Meshes differ by where the clips were when they were made.
-    assert abs(path["a"].scene.clips[0].at[1] - alone["a"].scene.clips[0].at) < 1e-6
+    at = float(alone["a"].scene.clips[0].at)
+    assert abs(path["a"].scene.clips[0].at[1] - at) < 1e-6
     assert path.iterations[1] < alone.iterations
+    # Not only minima: as the last step of the path.
+    before = rodjax.solve(harnesses[0], segments=8)
+    any_kind = rodjax.solve(harnesses[1], segments=8, guess=before, find="equilibrium")
+    assert any_kind.converged
+    assert any_kind.iterations <= 6
+    assert abs(any_kind["a"].scene.clips[0].at - at) < 1e-6
 
 
 def test_what_does_not_slide_in_a_harness_is_told():

@@ -630,13 +630,14 @@ def _condensed(
         aside = jnp.where(is_pushed & is_below, PUSH * jnp.abs(values) * sides.astype(dtype), 0.0)
         stiffness = jnp.maximum(jnp.abs(values), LEAST_STIFFNESS) + state.damping
         coordinates = vectors @ ((vectors.T @ right + aside) / stiffness)
-        if not _is_symmetric(assembly, all_here):
-            exact = jnp.linalg.solve(matrix + state.damping * jnp.eye(len(values), dtype=dtype), right)
-            coordinates = jnp.where(jnp.min(values, initial=1.0) > LEAST_STIFFNESS, exact, coordinates)
     else:
         is_pushed = jnp.array(False)
         stiffness = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
         coordinates = vectors @ ((vectors.T @ right) / stiffness)
+    if not _is_symmetric(assembly, all_here):
+        exact = jnp.linalg.solve(matrix + state.damping * jnp.eye(len(values), dtype=dtype), right)
+        least = jnp.min(values if find == "minimum" else jnp.abs(values), initial=1.0)
+        coordinates = jnp.where(least > LEAST_STIFFNESS, exact, coordinates)
     return _Bodies((motions @ coordinates).reshape(assembly.count, 6), below, is_pushed)
 
 

@@ -344,7 +344,8 @@ class ContactModel(eqx.Module):
         q = vectors @ ((vectors.T @ force) / regularized)
         if not self.is_symmetric:
             exact = jnp.linalg.solve(stiffness, force)
-            q = jnp.where(jnp.min(values, initial=1.0) > self.least, exact, q)
+            least = jnp.min(values if self.may_reverse else jnp.abs(values), initial=1.0)
+            q = jnp.where(least > self.least, exact, q)
         bodies, motions = self.bodies(q), []
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):

@@ -1,0 +1,201 @@
+"""Does a harness come to rest, whatever it is made of, as a user would solve it: without mesh, guess or options?
+
+Random harnesses: stars, trees, loops, rods with a branch that hangs freely, single rods to a supported body. Rods are
+round, flat, curved at rest or twisted at rest, 2 to some 50 % longer than their chords, w L^3/EI 1 to 300; joints have
+offsets, masses, forces, dead moments, and supports of every kind; some rods have a clip; a quarter of the harnesses
+lie over a floor, half of these over a pipe too; in some all rods may touch. With `--sliding` more rods have clips,
+through which they slide, and nothing is touched. Prints a line a harness, and how many converge.
+"""
+
+import argparse
+import time
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import rodjax as rj
+
+UP, ACROSS, LEVEL = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+GRAVITY = -9.81 * UP
+KINDS = ("round", "flat", "curved", "twisted")
+SUPPORTS = ("hinge", "line", "plane", "spring", "pin", "pin on a spring")
+
+
+class Outcome(NamedTuple):
+    """`seconds`: of the processor, with all tracing and compiling."""
+
+    seed: int
+    name: str
+    converged: bool
+    iterations: int
+    segments: list[int]
+    seconds: float
+
+
+class Drawn:
+    """Random numbers of one harness, in units of a metre and of the bending stiffness `EI`."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+        self.EI = 10 ** self.random.uniform(-2.5, 0.0)
+
+    def chance(self, probability: float) -> bool:
+        return self.random.random() < probability
+
+    def near(self, direction: Any, spread: float) -> np.ndarray:
+        """A unit vector."""
+        found = direction / np.linalg.norm(direction) + spread * self.random.normal(size=3)
+        return found / np.linalg.norm(found)
+
+    def place(self) -> np.ndarray:
+        return self.random.uniform(size=3) * (1.0, 1.0, 0.6)
+
+    def frame(self, tangent: np.ndarray) -> Any:
+        return rj.frame(tangent, np.cross(tangent, self.near(np.cross(tangent, UP + 0.1 * LEVEL), 0.3)))
+
+    def rod(self, length: float) -> tuple[str, rj.Rod]:
+        radius, EI = self.random.uniform(0.002, 0.01), self.EI * 10 ** self.random.uniform(-0.5, 0.5)
+        kind, shape = str(self.random.choice(KINDS, p=[0.55, 0.15, 0.2, 0.1])), {}
+        both = (EI, EI * self.random.uniform(1, 5)) if kind in ("flat", "twisted") else EI
+        if kind == "curved":
+            shape["rest_curvature"] = tuple(self.random.uniform(-3, 3, 2) / length)
+        if kind == "twisted":
+            shape["rest_twist"] = self.random.uniform(-6, 6) / length
+        weight = EI / length**3 * 10 ** self.random.uniform(0, 2.5)
+        return kind, rj.Rod(length, both, 0.8 * EI, 4 * EI / radius**2, weight / 9.81, radius=radius, **shape)
+
+    def support(self, kind: str, position: np.ndarray) -> Any:
+        level = np.eye(3)
+        if kind == "hinge":
+            return rj.Hinge(position, level, self.near(ACROSS, 0.5))
+        if kind == "line":
+            return rj.Slider(position, [self.near(LEVEL, 0.3)], level)
+        if kind == "plane":
+            return rj.Slider(position, [self.near(LEVEL, 0.3), self.near(ACROSS, 0.3)])
+        if kind == "pin":
+            return rj.Pin(position)
+        stiffness = self.EI * 10 ** self.random.uniform(0, 4)
+        if kind == "pin on a spring":
+            return rj.Spring(rj.Pin(position), translation=stiffness)
+        rotation = self.EI * 10 ** self.random.uniform(-1, 2)
+        return rj.Spring(rj.Clamp(position, level), translation=stiffness, rotation=rotation)
+
+    def body(self, position: np.ndarray, support: str | None) -> rj.Body:
+        loads: dict[str, Any] = {}
+        if self.chance(0.4):
+            loads["mass"] = self.EI / 9.81 * 10 ** self.random.uniform(-1, 1.5)
+        if self.chance(0.3):
+            loads["force"] = self.EI * self.random.normal(size=3) * 10 ** self.random.uniform(-0.5, 0.7)
+        if self.chance(0.2):
+            loads["moment"] = self.EI * self.random.normal(size=3)
+        return rj.Body(**loads, support=None if support is None else self.support(support, position))
+
+
+def places(drawn: Drawn, shape: str) -> tuple[dict[str, np.ndarray], list[tuple[str, str]]]:
+    """Joints "y", "z", "w", supports "s0", ... and a free end "f", and the rods between them."""
+    near, random = drawn.near, drawn.random
+    if shape == "star":
+        ends = {f"s{k}": drawn.place() for k in range(random.integers(2, 5))}
+        return {"y": drawn.place(), **ends}, [(name, "y") for name in ends]
+    if shape == "tree":
+        at = {"y": np.array([0.4, 0.5, 0.4]), "z": np.array([0.8, 0.5, 0.3]) + 0.1 * random.normal(size=3)}
+        at |= {"s0": np.array([0.0, 0.5, 0.4]), "s1": drawn.place() + 0.6 * LEVEL, "s2": drawn.place() + 0.6 * LEVEL}
+        return at, [("y", "z"), ("s0", "y"), ("s1", "z"), ("s2", "z")]
+    if shape == "loop":
+        middle = np.array([0.5, 0.5, 0.3])
+        turns = [np.array([np.cos(2.1 * k), np.sin(2.1 * k), 0.0]) for k in range(3)]
+        at = {n: middle + 0.3 * t + 0.05 * random.normal(size=3) for n, t in zip("yzw", turns, strict=True)}
+        held = list("yzw")[: random.integers(1, 4)]
+        ends = {f"s{k}": at[name] + 0.5 * near(at[name] - middle, 0.4) for k, name in enumerate(held)}
+        return {**at, **ends}, [("y", "z"), ("z", "w"), ("w", "y"), *zip(ends, held, strict=True)]
+    if shape == "branch":
+        middle = np.array([0.5, 0.5, 0.4])
+        at = {"y": middle, "s0": middle - 0.5 * LEVEL, "s1": middle + 0.5 * LEVEL + 0.2 * random.normal(size=3)}
+        return {**at, "f": middle + 0.4 * near(-UP, 0.5)}, [("s0", "y"), ("y", "s1"), ("y", "f")]
+    return {"s0": np.zeros(3), "y": 0.8 * near(LEVEL, 0.3)}, [("s0", "y")]
+
+
+def harness_of(seed: int, *, slides: bool) -> tuple[str, rj.Harness]:
+    drawn = Drawn(seed)
+    random = drawn.random
+    shape = str(random.choice(["star", "tree", "loop", "branch", "single"], p=[0.3, 0.2, 0.2, 0.15, 0.15]))
+    at, edges = places(drawn, shape)
+    joints, told = {}, [shape]
+    for name in filter(lambda name: name in "yzw", at):
+        support = str(random.choice(SUPPORTS)) if shape == "single" or drawn.chance(0.15) else None
+        joints[name] = drawn.body(at[name], support)
+        told += [] if support is None else [support]
+    obstacles: list[Any] = []
+    if not slides and drawn.chance(0.25):
+        obstacles = [rj.Plane((min(place[2] for place in at.values()) - 0.02 - random.uniform(0, 0.1)) * UP, UP)]
+        middle, half = np.array([0.5, 0.5, 0.0]) + 0.1 * random.normal(size=3), 0.6 * drawn.near(ACROSS, 0.3)
+        pipe = rj.Capsule(middle - half, middle + half, random.uniform(0.01, 0.05))
+        if drawn.chance(0.5) and min(float(pipe.distance(place)) for place in at.values()) > 0.03:
+            obstacles.append(pipe)
+        told += [type(obstacle).__name__ for obstacle in obstacles]
+    cables, spread = {}, random.choice([0.15, 0.6])
+    for first, last in edges:
+        chord = at[last] - at[first]
+        length = float(np.linalg.norm(chord) * (1.02 + random.exponential(0.2)))
+        kind, rod = drawn.rod(length)
+        ends = [_end(drawn, name, at[name], drawn.near(chord, spread)) for name in (first, last)]
+        clips = []
+        if last != "f" and drawn.chance(0.4 if slides else 0.15):
+            part, aside = random.uniform(0.3, 0.7), np.sqrt(1 - np.linalg.norm(chord) / length)
+            place = at[first] + part * chord + 0.1 * length * aside * random.normal(size=3)
+            tangent = {} if drawn.chance(0.6) else {"tangent": drawn.near(chord, 0.3)}
+            clips = [rj.Clip(part * length, place, sliding=slides, **tangent)]
+            kind += " in a clip"
+        cables[f"{first}{last}"] = rj.Scene(rod, ends[0], ends[1], GRAVITY, obstacles=obstacles, clips=clips)
+        told.append(kind)
+    share_none = any(not set(one) & set(other) & set("yzw") for one in edges for other in edges)
+    contact = not slides and drawn.chance(0.1) and share_none
+    return ", ".join(told + ["contact"] * contact), rj.Harness(cables, joints, contact=contact)
+
+
+def _end(drawn: Drawn, name: str, position: np.ndarray, tangent: np.ndarray) -> Any:
+    if name == "f":
+        return rj.Free()
+    frame = drawn.frame(tangent)
+    if name in "yzw":
+        return rj.Joint(name, frame, 0.02 * drawn.random.normal(size=3) * drawn.chance(0.5))
+    kind = drawn.random.choice(["clamp", "swivel", "pin"], p=[0.7, 0.15, 0.15])
+    if kind == "pin":
+        return rj.Pin(position)
+    return rj.Clamp(position, frame) if kind == "clamp" else rj.Swivel(position, tangent)
+
+
+def main(argv: Sequence[str] | None = None) -> list[Outcome]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0, help="of the first")
+    parser.add_argument("--sliding", action="store_true")
+    arguments = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    found = []
+    for seed in range(arguments.seed, arguments.seed + arguments.count):
+        name, harness = harness_of(seed, slides=arguments.sliding)
+        begin = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = rj.solve(harness)
+        seconds = time.process_time() - begin
+        outcome = Outcome(seed, name, bool(result.converged), int(result.iterations), result.segments, seconds)
+        found.append(outcome)
+        told = "converges" if outcome.converged else f"does not converge, residual {float(result.residual):.1e}"
+        print(
+            f"{seed}: {told}, {outcome.iterations} iterations, {outcome.segments}, {seconds:.1f} s: {name}", flush=True
+        )
+    iterations = [outcome.iterations for outcome in found if outcome.converged]
+    print(
+        f"{len(iterations)} of {len(found)} converge, in {np.median(iterations):.0f} iterations in the median, "
+        f"{np.quantile(iterations, 0.9):.0f} in 90 %, {max(iterations)} at most"
+    )
+    return found
+
+
+if __name__ == "__main__":
+    main()

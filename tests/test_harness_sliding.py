@@ -4,26 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_harness import ASIDE, END, GRAVITY, START, bent, plain
 
 import rodjax
-from rodjax import Body, Clamp, Clip, Free, Harness, Joint, Newton, Plane, PointForce, Rod, Scene, Spring
+from rodjax import Body, Clamp, Clip, Free, Harness, Joint, Newton, Plane, PointForce, Scene, Spring
 
-GRAVITY = (0.0, 3.0, -9.81)
-START = Clamp((0, 0, 0), rodjax.frame((1, 0, -1)))
-END = Clamp((0.5, 0.2, 0), rodjax.frame((1, 1, 1)))
-JOINT = Joint("cut", rodjax.frame((0, 1, 0), (0, 0, 1)), (0.1, 0, 0.02))
+JOINT = Joint("cut", **ASIDE)
 PLACE = (0.12, 0.02, -0.25)
 TIGHT = Newton(tolerance=1e-11)
-
-
-def plain(length: float) -> Rod:
-    return Rod.circular(length, 0.005, 1e7, shear_modulus=1e7 / 3, density=1200.0)
-
-
-def bent(length: float) -> Rod:
-    rod = plain(length)
-    stiffnesses = (rod.EI, 1.5 * rod.EI), rod.GJ, rod.EA
-    return Rod(length, *stiffnesses, rod.mass_per_length, rest_curvature=(1.0, 0.5), rest_twist=0.3)
 
 
 def cut(rod, clip, length=0.5, gravity=GRAVITY, **loads) -> Harness:
@@ -96,7 +84,7 @@ def test_an_end_on_a_spring_slides():
     np.testing.assert_allclose(found.end_force, -20.0 * pulled, rtol=0, atol=1e-8)
 
 
-def test_paths_carry_where_the_rod_passes_its_clips():
+def test_paths_batches_and_files_have_where_the_rod_passes_its_clips(tmp_path):
     clip = Clip(0.25, PLACE, sliding=True)
     harnesses = [cut(plain, clip, gravity=(0.0, 3.0 * scale, -9.81 * scale)) for scale in (1.0, 1.2)]
     path = rodjax.solve_path(harnesses, segments=8)
@@ -106,6 +94,10 @@ def test_paths_carry_where_the_rod_passes_its_clips():
     at = float(alone["a"].scene.clips[0].at)
     assert abs(path["a"].scene.clips[0].at[1] - at) < 1e-6
     assert path.iterations[1] < alone.iterations
+    batch = rodjax.solve_batch(harnesses, segments=8)
+    assert abs(batch["a"].scene.clips[0].at[1] - at) < 1e-9
+    rodjax.save(alone, tmp_path / "sliding.vtkhdf")
+    assert rodjax.solve(harnesses[1], segments=8, guess=rodjax.load(tmp_path / "sliding.vtkhdf")).iterations == 0
     # Not only minima: as the last step of the path.
     before = rodjax.solve(harnesses[0], segments=8)
     any_kind = rodjax.solve(harnesses[1], segments=8, guess=before, find="equilibrium")

@@ -2,7 +2,7 @@
 
 `jnp.linalg.inv` is some ten operations, and six functions more for its derivatives: of elimination from node to node
 they are most of what is traced, and of what it takes as NumPy code. Here each is one operation, which is written out
-where a program is compiled, and is one call of NumPy's.
+where a program is compiled, and is one call of NumPy's. And solutions for matrices that need not be symmetric.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,6 +26,19 @@ def inverse_matrix(matrices: Float[Array, "*m c c"]) -> Float[Array, "*m c c"]:
 def negative_count(matrices: Float[Array, "m c c"]) -> Int[Array, ""]:
     """How many negative eigenvalues symmetric matrices of any small size have together."""
     return jnp.sum(_negative_counts.bind(matrices))
+
+
+def solved_where_regular(
+    matrix: Float[Array, "k k"],
+    right: Float[Array, "k"],
+    values: Float[Array, "k"],
+    least: float,
+    otherwise: Float[Array, "k"],
+) -> Float[Array, "k"]:
+    """The solution for a matrix without symmetry where all of `values` are above `least`: eigenvalues of its symmetric
+    part, or their sizes.
+    """
+    return jnp.where(jnp.min(values, initial=1.0) > least, jnp.linalg.solve(matrix, right), otherwise)
 
 
 def _by_elimination(matrices: Float[Array, "*m c c"]) -> Float[Array, "*m c c"]:

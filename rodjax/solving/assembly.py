@@ -34,6 +34,7 @@ from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.geometry.vectors import components
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
+from rodjax.linalg.small_matrices import solved_where_regular
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.harness import Bodies, rotated
 from rodjax.model.loads import ContactLoads
@@ -635,9 +636,9 @@ def _condensed(
         stiffness = jnp.where(jnp.abs(values) < LEAST_STIFFNESS, LEAST_STIFFNESS, values)
         coordinates = vectors @ ((vectors.T @ right) / stiffness)
     if not _is_symmetric(assembly, all_here):
-        exact = jnp.linalg.solve(matrix + state.damping * jnp.eye(len(values), dtype=dtype), right)
-        least = jnp.min(values if find == "minimum" else jnp.abs(values), initial=1.0)
-        coordinates = jnp.where(least > LEAST_STIFFNESS, exact, coordinates)
+        damped = matrix + state.damping * jnp.eye(len(values), dtype=dtype)
+        values = values if find == "minimum" else jnp.abs(values)
+        coordinates = solved_where_regular(damped, right, values, LEAST_STIFFNESS, coordinates)
     return _Bodies((motions @ coordinates).reshape(assembly.count, 6), below, is_pushed)
 
 

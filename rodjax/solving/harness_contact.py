@@ -25,7 +25,7 @@ from rodjax.discretization.form import Linearization
 from rodjax.discretization.nodal import NodalForm, held_back
 from rodjax.discretization.node_contacts import contact_model
 from rodjax.linalg.chain import ChainSystem, factor_chain
-from rodjax.linalg.small_matrices import inverse_matrix
+from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
 from rodjax.solving.coupling import Coupling, EndContacts
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
@@ -343,9 +343,8 @@ class ContactModel(eqx.Module):
             is_minimum &= ~jnp.any(is_below)
         q = vectors @ ((vectors.T @ force) / regularized)
         if not self.is_symmetric:
-            exact = jnp.linalg.solve(stiffness, force)
-            least = jnp.min(values if self.may_reverse else jnp.abs(values), initial=1.0)
-            q = jnp.where(least > self.least, exact, q)
+            values = values if self.may_reverse else jnp.abs(values)
+            q = solved_where_regular(stiffness, force, values, self.least, q)
         bodies, motions = self.bodies(q), []
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):

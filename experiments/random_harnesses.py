@@ -4,7 +4,8 @@ Random harnesses: stars, trees, loops, rods with a branch that hangs freely, sin
 round, flat, curved at rest or twisted at rest, 2 to some 50 % longer than their chords, w L^3/EI 1 to 300; joints have
 offsets, masses, forces, dead moments, and supports of every kind; some rods have a clip; a quarter of the harnesses
 lie over a floor, half of these over a pipe too; in some all rods may touch. With `--sliding` more rods have clips,
-through which they slide, and nothing is touched. Prints a line a harness, and how many converge.
+through which they slide, and nothing is touched; with `--follower` half of the rods bear forces that follow them or
+couples. Prints a line a harness, and how many converge.
 """
 
 import argparse
@@ -83,6 +84,13 @@ class Drawn:
         rotation = self.EI * 10 ** self.random.uniform(-1, 2)
         return rj.Spring(rj.Clamp(position, level), translation=stiffness, rotation=rotation)
 
+    def loads(self, length: float) -> list[Any]:
+        """Without a potential, along a rod: up to some 8 EI/L^2 and EI/L in all."""
+        size = self.EI / length * 10 ** self.random.uniform(-0.5, 0.7) * self.near(UP, 1.0)
+        if self.chance(0.5):
+            return [rj.DistributedForce(size / length**2, follower=True)]
+        return [rj.DistributedCouple(size / length, follower=self.chance(0.5))]
+
     def body(self, position: np.ndarray, support: str | None) -> rj.Body:
         loads: dict[str, Any] = {}
         if self.chance(0.4):
@@ -118,7 +126,7 @@ def places(drawn: Drawn, shape: str) -> tuple[dict[str, np.ndarray], list[tuple[
     return {"s0": np.zeros(3), "y": 0.8 * near(LEVEL, 0.3)}, [("s0", "y")]
 
 
-def harness_of(seed: int, *, slides: bool) -> tuple[str, rj.Harness]:
+def harness_of(seed: int, *, slides: bool, follower: bool = False) -> tuple[str, rj.Harness]:
     drawn = Drawn(seed)
     random = drawn.random
     shape = str(random.choice(["star", "tree", "loop", "branch", "single"], p=[0.3, 0.2, 0.2, 0.15, 0.15]))
@@ -149,7 +157,10 @@ def harness_of(seed: int, *, slides: bool) -> tuple[str, rj.Harness]:
             tangent = {} if drawn.chance(0.6) else {"tangent": drawn.near(chord, 0.3)}
             clips = [rj.Clip(part * length, place, sliding=slides, **tangent)]
             kind += " in a clip"
-        cables[f"{first}{last}"] = rj.Scene(rod, ends[0], ends[1], GRAVITY, obstacles=obstacles, clips=clips)
+        loads = drawn.loads(length) if follower and drawn.chance(0.5) else []
+        kind += "".join(f" under a {type(load).__name__}" for load in loads)
+        others = {"distributed": loads, "obstacles": obstacles, "clips": clips}
+        cables[f"{first}{last}"] = rj.Scene(rod, ends[0], ends[1], GRAVITY, **others)
         told.append(kind)
     share_none = any(not set(one) & set(other) & set("yzw") for one in edges for other in edges)
     contact = not slides and drawn.chance(0.1) and share_none
@@ -172,12 +183,14 @@ def main(argv: Sequence[str] | None = None) -> list[Outcome]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0, help="of the first")
-    parser.add_argument("--sliding", action="store_true")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--sliding", action="store_true")
+    kind.add_argument("--follower", action="store_true")
     arguments = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     found = []
     for seed in range(arguments.seed, arguments.seed + arguments.count):
-        name, harness = harness_of(seed, slides=arguments.sliding)
+        name, harness = harness_of(seed, slides=arguments.sliding, follower=arguments.follower)
         begin = time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -162,17 +162,9 @@ def solved(names: dict[str, str]) -> rj.Equilibrium:
     return result
 
 
-# What the rods of harnesses do not have yet, in one line: loads without a potential.
-NOT_IN_HARNESSES = {
-    "must have no load without a potential": [
-        "follower force along",
-        "couple along",
-        "point couple",
-        "follower point force",
-        "end moment",
-        "follower end force",
-    ],
-}
+# What the rods of harnesses do not have, in one line: a plain rod, by tangents, does not tell what a dead moment on its
+# end does where its other end turns; on a joint it is known.
+NOT_IN_HARNESSES = {"make that end a Joint of a Harness, and give its Body the moment": ["end moment"]}
 
 
 def harness_of(names: dict[str, str]) -> rj.Harness:

@@ -108,7 +108,7 @@ def test_paths_batches_and_files_have_where_the_rod_passes_its_clips(tmp_path):
 
 def test_what_does_not_slide_in_a_harness_is_told():
     clip = Clip(0.25, PLACE, sliding=True)
-    with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide .* obstacles or fields"):
+    with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide .* obstacles, fields or loads"):
         cut(plain, clip, obstacles=[Plane((0, 0, -1), (0, 0, 1))])
     other = Scene(plain(1.0), Clamp((0, 0.5, 0), rodjax.frame((1, 0, 0))), Free())
     scenes = cut(plain, clip)

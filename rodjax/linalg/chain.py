@@ -148,6 +148,15 @@ class LoadRows(eqx.Module):
     segment_vectors: Float[Array, "3 b 3 n"]
     balance: Float[Array, "2 3 b 3 n"]
 
+    def holding(self, turns: Float[Array, "3 n"], moves: Float[Array, "2 n"]) -> "LoadRows":
+        """With the rotations of points, and the positions of nodes at both ends, held where these are 0, else 1."""
+        columns = turns[None]
+        return LoadRows(
+            self.rotation * turns[None, :, None, None] * columns[None, None],
+            self.segment_vectors * columns[None],
+            self.balance * moves[:, None, None, None] * columns[None, None],
+        )
+
     def mirrored(self) -> "LoadRows":
         return LoadRows(
             self.rotation[:, ::-1, :, ::-1, ::-1],
@@ -217,7 +226,9 @@ class ChainSystem(eqx.Module):
         of_nodes = jnp.concatenate([jnp.tile(turns[None, ::2], (b, 1)), jnp.tile(moves[None], (3, 1))])
         if contacts.inner is not None:
             contacts = dataclasses.replace(contacts, inner=contacts.inner.holding(turns[::2], moves))
-        between, turning = self.between, self.turning
+        between, turning, loads = self.between, self.turning, self.loads
+        if loads is not None:
+            loads = loads.holding(of_elements, jnp.stack([moves[:-1], moves[1:]]))
         if between is not None:
             between = of_nodes[:, None, 1:] * between * of_nodes[None, :, :-1]
         if turning is not None:
@@ -231,6 +242,7 @@ class ChainSystem(eqx.Module):
             by_force=self.by_force * of_elements[None, None],
             held=self.held | (moves == 0),
             contacts=contacts,
+            loads=loads,
             turning=turning,
             between=between,
         )

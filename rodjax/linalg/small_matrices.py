@@ -38,6 +38,8 @@ def solved_where_regular(
     """The solution for a matrix without symmetry where all of `values` are above `least`: eigenvalues of its symmetric
     part, or their sizes.
     """
+    if not len(right):  # LAPACK complains of matrices without rows
+        return right
     return jnp.where(jnp.min(values, initial=1.0) > least, jnp.linalg.solve(matrix, right), otherwise)
 
 

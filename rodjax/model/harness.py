@@ -13,7 +13,17 @@ from jaxtyping import Array, Float
 from rodjax.checks import instance, is_known, leaf, namespace, not_negative, sequence, vector
 from rodjax.geometry.rotations import rotation_vector
 from rodjax.model.along import largest_beside
-from rodjax.model.scene import Scene, between, has_friction, has_node_positions, has_potential, slides, support_between
+from rodjax.model.scene import (
+    Scene,
+    between,
+    dead_end_moment,
+    has_friction,
+    has_node_positions,
+    has_potential,
+    needs_frames,
+    slides,
+    support_between,
+)
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -60,8 +70,8 @@ class Harness(eqx.Module):
     unless a support of its own holds it in a direction. Without contact between rods one end must be a `Joint`.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with friction, self-contact or a load without a potential, or with a sliding clip beside obstacles,
-    in a field of forces or in contact with other rods.
+    and for a scene with friction or self-contact, with a dead moment on the free end of a plain rod, or with a sliding
+    clip beside obstacles, in a field of forces, under loads without a potential or in contact with other rods.
     """
 
     # In the place of a scene.
@@ -126,8 +136,11 @@ class Harness(eqx.Module):
 
     @property
     def has_potential(self) -> bool:
-        """Whether all loads have one: a dead moment has none on a body that may turn about more than one axis."""
-        return all(body.moment is None or _motions(body.support).rotations.shape[1] < 2 for body in self.bodies)
+        """Whether all loads have one: a dead moment has none on a body that may turn about more than one axis, nor
+        have those of `rodjax.model.scene.has_potential`.
+        """
+        turn = [_motions(body.support).rotations.shape[1] > 1 for body in self.bodies if body.moment is not None]
+        return all(map(has_potential, self.scenes)) and not any(turn)
 
 
 def _checked_contact(contact: Any, cables: Mapping[str, Scene]) -> tuple[tuple[int, int], ...]:
@@ -197,10 +210,14 @@ def check_movable(scene: Scene, name: str) -> None:
         raise ValueError(f"{name}.self_contact must be False where ends of the rod have unknown poses")
     if slides(scene) and has_node_positions(scene):
         raise ValueError(
-            f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles or fields act on it"
+            f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles, fields or loads "
+            "without a potential act on it"
         )
-    if not has_potential(scene):
-        raise ValueError(f"{name} must have no load without a potential where ends of the rod have unknown poses")
+    if dead_end_moment(scene) is not None and not needs_frames(scene):
+        raise ValueError(
+            f"{name} must have no dead moment on the free end of a plain rod where its other end has an unknown pose: "
+            "make that end a Joint of a Harness, and give its Body the moment"
+        )
     if scene.rod.length.dtype != jnp.float64:
         raise ValueError(f"{name} must be in double precision: jax.config.update('jax_enable_x64', True) before")
 

@@ -59,7 +59,9 @@ def lowest_mode(equilibrium: Equilibrium | HarnessEquilibrium) -> Mode | Harness
         if equilibrium.energy.ndim:
             raise ValueError(f"equilibrium must be a single one, got a stack of shape {equilibrium.energy.shape}")
         if not equilibrium.harness.has_potential:
-            raise ValueError("equilibrium must have a potential: a dead moment on a joint has none")
+            raise ValueError(
+                "equilibrium must have a potential: dead moments, couples along a rod and follower loads have none"
+            )
         if equilibrium.harness.contact:
             raise ValueError("equilibrium must be of a harness with contact=False: with it no softest motion is sought")
         if any(map(slides, equilibrium.harness.scenes)):

@@ -49,6 +49,7 @@ from rodjax.solving.coupling import (
     linearized_with_ends,
 )
 from rodjax.solving.harness_contact import BetweenStep, ContactModel, ContactStep, RodsInContact, contact_step
+from rodjax.solving.loading import bearing, put_on
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
     ENERGY_ROUNDING,
@@ -64,6 +65,7 @@ from rodjax.solving.newton import (
     SUFFICIENT_DECREASE,
     Find,
     Newton,
+    NewtonEnd,
 )
 from rodjax.solving.rod_contact import (
     Columns,
@@ -78,11 +80,13 @@ from rodjax.solving.rod_contact import (
     loads_of,
     passes,
 )
-from rodjax.solving.status import Status
+from rodjax.solving.status import Outcome, Status
 from rodjax.units import Units
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
 LEAST_STIFFNESS = NEUTRAL
+# Iterations after which a search under loads without a potential is given up: those that end take 5 to 30.
+MOST_UNJUDGED = 40
 
 
 class Poses(NamedTuple):
@@ -224,6 +228,23 @@ class Assembly(eqx.Module):
         return Assembly(groups, bodies, jnp.max(energies), jnp.mean(lengths), pairs)
 
     @property
+    def has_potential(self) -> bool:
+        """Whether the loads on all rods have one."""
+        return all(group.form.has_potential for group in self.groups)
+
+    def bearing(self, part: Float[Array, ""] | None) -> "Assembly":
+        """With a part of the loads without a potential on rods, or without them."""
+
+        def borne(form: Form) -> Form:
+            return eqx.tree_at(lambda form: form.scene, form, bearing(form.scene, part))
+
+        groups = (
+            group if group.form.has_potential else dataclasses.replace(group, form=jax.vmap(borne)(group.form))
+            for group in self.groups
+        )
+        return dataclasses.replace(self, groups=tuple(groups))
+
+    @property
     def force(self) -> Float[Array, ""]:
         """The unit of pressures between rods."""
         return self.energy / self.length
@@ -341,8 +362,28 @@ class Assembly(eqx.Module):
         return State(points, at_ends, pairs, poses, nothing, zero, zero, nothing, count, count, count, status, count)
 
 
-def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find) -> State:
-    """The equilibrium that is reached."""
+def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> State:
+    """The equilibrium that is reached; `is_cold`: whether the search begins where there is none of other loads."""
+    if assembly.has_potential:
+        return _found(assembly, begin, solver, find)
+
+    def search(part: Float[Array, ""] | None, begin: State) -> NewtonEnd:
+        here = assembly.bearing(part)
+        end = _found(here, here.begin(begin.points, begin.at_ends, begin.pairs, begin.poses), solver, find)
+        outcome = Outcome(end.residual, end.iterations, end.evaluations, end.status)
+        return NewtonEnd(end, outcome, end.negative == 0)
+
+    end = put_on(search, begin, is_cold)
+    outcome, found = end.outcome, end.point
+    return found._replace(iterations=outcome.iterations, evaluations=outcome.evaluations, status=outcome.status)
+
+
+def _found(assembly: Assembly, begin: State, solver: Newton, find: Find) -> State:
+    if not assembly.has_potential:
+        # Steps are not judged: what they lead to is near, or parts of the loads are.
+        find = "equilibrium"
+        fewer = jnp.minimum(solver.max_iterations, MOST_UNJUDGED)
+        solver = eqx.tree_at(lambda solver: solver.max_iterations, solver, fewer)
     return jax.lax.while_loop(
         lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
     )
@@ -644,7 +685,7 @@ def _condensed(
 
 def _is_symmetric(assembly: Assembly, all_here: list[_Here]) -> bool:
     """Whether S is: else steps are those of its symmetric part until that is positive, and then its own."""
-    return assembly.bodies.moment is None and all(here.coupling.of_multipliers is None for here in all_here)
+    return assembly.bodies.moment is None and all(here.coupling.is_symmetric for here in all_here)
 
 
 def _condensed_system(
@@ -664,10 +705,10 @@ def _condensed_system(
             of_ends = shares[:, None, None] * couple.first.reshape(-1, 2, 6)
             right = right.at[group.body].add(of_ends)
             continue
-        condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", couple.of_gradient, found.rotations)
-        by_multipliers = couple.by_multipliers
+        by_rotations, by_multipliers = couple.by_rotations, couple.by_multipliers
+        condensed = couple.second - jnp.einsum("kbmi,kbmj->kij", by_rotations, found.rotations)
         condensed -= jnp.einsum("kci,kcj->kij", by_multipliers, found.multipliers_by_motions)
-        loads = jnp.einsum("kbmi,kbm->ki", couple.of_gradient, found.rotation)
+        loads = jnp.einsum("kbmi,kbm->ki", by_rotations, found.rotation)
         loads += jnp.einsum("kci,kc->ki", by_multipliers, found.multipliers)
         condensed = (shares[:, None, None] * condensed).reshape(-1, 2, 6, 2, 6)
         loads = (shares[:, None] * loads).reshape(-1, 2, 6)

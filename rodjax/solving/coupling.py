@@ -82,8 +82,8 @@ class RodInBodies(NamedTuple):
 class Coupling(NamedTuple):
     """Derivatives of a rod's L by the motions of its ends: first, second, and of its gradient and constraint residual;
     those of the gaps of contacts apart, `None` without obstacles. `of_nodes`: how rotation and position of the node at
-    each end follow, `None` where nodes have no positions. `of_multipliers`: the derivatives of the first ones by the
-    multipliers, where these are not `of_constraints`.
+    each end follow, `None` where nodes have no positions. `of_rotations`, `of_multipliers`: the derivatives of the
+    first ones by rotations and multipliers, where these are not `of_gradient` and `of_constraints`.
     """
 
     first: Float[Array, "12"]
@@ -93,6 +93,15 @@ class Coupling(NamedTuple):
     of_gaps: Float[Array, "r n+1 12"] | None
     of_nodes: Float[Array, "2 b+3 6"] | None
     of_multipliers: Float[Array, "k 12"] | None = None
+    of_rotations: Float[Array, "b m 12"] | None = None
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.of_multipliers is None and self.of_rotations is None
+
+    @property
+    def by_rotations(self) -> Float[Array, "b m 12"]:
+        return self.of_gradient if self.of_rotations is None else self.of_rotations
 
     @property
     def by_multipliers(self) -> Float[Array, "k 12"]:
@@ -258,11 +267,16 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         for number, _, turn in ends:
             of_nodes = of_nodes.at[number, :b, 3:].set(turn.rotation).at[number, b:].set(rod.carried(number))
     columns, others = columns.reshape(b, m, 2 * width), others.reshape(-1, 2 * width)
-    turned, lacking = jax.vmap(released.system.times, (-1, -1), -1)(columns, others)
+    turned, lacking = jax.vmap(system.times, (-1, -1), -1)(columns, others)
     bent = jnp.einsum("bmk,bml->kl", columns, turned)
-    of_gaps = None
+    of_gaps = of_rotations = of_multipliers = None
     if isinstance(system, ChainSystem):
         bent += others.T @ lacking
+        if system.loads is not None:
+            transposed = jax.linear_transpose(system.times, columns[..., 0], others[..., 0])
+            of_rotations, of_multipliers = jax.vmap(lambda *parts: transposed(parts), (-1, -1), -1)(columns, others)
+            of_rotations = of_rotations * free_points(form, released)[None, :, None]
+            of_multipliers, _ = _without_gaps(system, ends, columns, others, of_multipliers)
         lacking, of_gaps = _without_gaps(system, ends, columns, others, lacking)
     bent = bent.reshape(2, width, 2, width)
     turned = turned * free_points(form, released)[None, :, None]
@@ -289,6 +303,8 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
         of_constraints.reshape(-1, 12),
         of_gaps,
         of_nodes,
+        of_multipliers,
+        of_rotations,
     )
 
 

@@ -379,14 +379,17 @@ def _solve(
     solver = options[0].solver
     assert isinstance(solver, Newton)
     start = assembly.begin(tuple(points), tuple(at_ends), between, poses)
+    is_cold = functools.reduce(jnp.logical_and, [jnp.all(states.end_force == 0) for states, _ in starts])
     if any(isinstance(group.form, SlidingForm) for group in groups):
-        assembly, end = _slid(assembly, start, solver, options)
+        assembly, end = _slid(assembly, start, solver, options, is_cold)
     else:
-        end = find_assembly(assembly, start, solver, options[0].find)
+        end = find_assembly(assembly, start, solver, options[0].find, is_cold)
     return harness_equilibrium(harness, members, assembly, end, end_pressures, strain_limit, tuple(all_searches))
 
 
-def _slid(assembly: Assembly, begin: State, solver: Newton, options: tuple[Options, ...]) -> tuple[Assembly, State]:
+def _slid(
+    assembly: Assembly, begin: State, solver: Newton, options: tuple[Options, ...], is_cold: Array
+) -> tuple[Assembly, State]:
     """What is found where rods slide through clips. Their meshes go along with these; where one was stretched by that,
     or another one belongs to where the clips have come, the search goes on from there on meshes that are made anew.
     """
@@ -410,7 +413,7 @@ def _slid(assembly: Assembly, begin: State, solver: Newton, options: tuple[Optio
         here = dataclasses.replace(assembly, groups=groups)
         again = here.begin(state.points, state.at_ends, state.pairs, state.poses)
         begin = again._replace(iterations=state.iterations, evaluations=state.evaluations)
-        end = find_assembly(here, begin, solver, options[0].find)
+        end = find_assembly(here, begin, solver, options[0].find, is_cold & (count == 0))
         goes_on = jnp.array(False)
         for form, points in zip(here.forms(end.poses), end.points, strict=True):
             if isinstance(form, SlidingForm):
@@ -473,7 +476,7 @@ def harness_equilibrium(
         energy=energy_of(rods, bodies, end.poses),
         converged=is_converged(status),
         stable=is_stable,
-        index=end.negative,
+        index=end.negative if harness.has_potential else jnp.full_like(end.negative, -1),
         status=status,
         iterations=end.iterations,
         evaluations=end.evaluations,

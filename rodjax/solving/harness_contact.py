@@ -162,19 +162,24 @@ def _eliminated(
         rates = jnp.where(is_closed[..., None], _of_gaps(system, coupling), 0.0)
         size = len(system.compliance)
         of_gradient, second = coupling.of_gradient, coupling.second
-        of_constraints = coupling.of_constraints.at[size : size + is_closed.size].add(-rates.reshape(-1, 12))
+        contacts = slice(size, size + is_closed.size)
+        of_constraints = coupling.of_constraints.at[contacts].add(-rates.reshape(-1, 12))
+        by_rotations, by_multipliers = coupling.by_rotations, coupling.by_multipliers
+        by_multipliers = by_multipliers.at[contacts].add(-rates.reshape(-1, 12))
         force = jnp.einsum("rni,rn->i", rates, rod.contacts.pressures) - rod.first
         if rod.columns is not None:
             of_gradient = jnp.concatenate([of_gradient, rod.columns.rotation], axis=2)
             of_constraints = jnp.concatenate([of_constraints, rod.columns.rows], axis=1)
+            by_rotations = jnp.concatenate([by_rotations, rod.columns.rotation], axis=2)
+            by_multipliers = jnp.concatenate([by_multipliers, rod.columns.rows], axis=1)
             count = rod.columns.ends.shape[1]
             force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
             second = second.at[:12, 12:].set(rod.columns.ends).at[12:, :12].set(rod.columns.ends.T)
         x, y = factors.solve_softly(f, c)
         by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(of_gradient, of_constraints)
-        stiffness = second - jnp.einsum("bmi,bmj->ij", of_gradient, by_motions[0])
-        stiffness -= of_constraints.T @ by_motions[1]
-        force -= jnp.einsum("bmi,bm->i", of_gradient, x) + of_constraints.T @ y
+        stiffness = second - jnp.einsum("bmi,bmj->ij", by_rotations, by_motions[0])
+        stiffness -= by_multipliers.T @ by_motions[1]
+        force -= jnp.einsum("bmi,bm->i", by_rotations, x) + by_multipliers.T @ y
         # Contacts of the bodies have no unknowns of the rod.
         rates = jnp.where(closed_end[..., None], at_ends.rates, 0.0)
         pressures = at_ends.pressures - at_ends.gaps / contact_compliance

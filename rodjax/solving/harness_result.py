@@ -36,9 +36,9 @@ class HarnessEquilibrium(Described):
 
     - `energy` [...] J: of rods, springs and dead loads, zero of height at the origin, without the work of dead moments
     - `converged` [...] bool, `status` [...] code, in words by `rodjax.describe`
-    - `stable` [...] bool: converged, and no motion of rods and bodies lowers the energy; False with a dead moment on a
-      body that may turn about several axes
-    - `index` [...] int: how many independent motions lower it
+    - `stable` [...] bool: converged, and no motion of rods and bodies lowers the energy; not examined and False under
+      loads without a potential, as a dead moment on a body that may turn about several axes, or follower loads
+    - `index` [...] int: how many independent motions lower it, -1 where it is not examined
     - `iterations`, `evaluations` [...] of the solver; `residual` [...] largest component of the gradient, in EI/L^2 of
       each rod, of a body in that of its stiffest rod
     - `end_pressures` [..., c] N: of the contacts of bodies, of each stack of `groups` by rod, obstacle and end
@@ -131,7 +131,7 @@ class HarnessEquilibrium(Described):
         if bool(self.converged) and int(self.index) > 0:
             lines[0] += f"; a saddle: {int(self.index)} motions lower the energy"
         if bool(self.converged) and not self.harness.has_potential:
-            lines[0] += "; under a dead moment without a potential, so that no energy tells whether it is stable"
+            lines[0] += "; under loads without a potential, so that no energy tells whether it is stable"
         return "\n".join(lines + self._contacts_told() + [f"{name}: {describe(rod)}" for name, rod in self.items()])
 
     def _contacts_told(self) -> list[str]:

@@ -6,6 +6,7 @@ these loads; where it fails from there, it goes on with a half of them, a quarte
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.form import Form, Point
 from rodjax.discretization.nonconservative import conservative, scaled
+from rodjax.model.scene import Scene
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium
 from rodjax.solving.status import Outcome, is_converged
 
@@ -25,7 +27,7 @@ LEAST_PART = 1 / 64
 class _State(eqx.Module):
     """The part of the loads that the point bears, by how much it is to grow, and the last search under all of them."""
 
-    point: Point
+    point: Any
     part: Float[Array, ""]
     step: Float[Array, ""]
     end: NewtonEnd
@@ -36,19 +38,30 @@ def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_co
     """The equilibrium of a form with node positions or sliding clips, from a point that is one under other loads if it
     is not cold.
     """
-    without: Form = dataclasses.replace(form, scene=conservative(form.scene))
-    count = jnp.zeros((), int)
-    outcome = Outcome(jnp.zeros_like(point.total_twist), count, count, count)
-    begin = jax.lax.cond(
-        is_cold,
-        lambda: find_equilibrium(without, point, solver, find),
-        lambda: NewtonEnd(point, outcome, jnp.array(False)),
-    )
+
+    def search(part: Float[Array, ""] | None, point: Point) -> NewtonEnd:
+        here: Form = dataclasses.replace(form, scene=bearing(form.scene, part))
+        return find_equilibrium(here, point, solver, find)
+
+    return put_on(search, point, is_cold)
+
+
+def bearing(scene: Scene, part: Float[Array, ""] | None) -> Scene:
+    """A scene with a part of its loads without a potential, or without them."""
+    return conservative(scene) if part is None else scaled(scene, part)
+
+
+def put_on(
+    search: Callable[[Float[Array, ""] | None, Any], NewtonEnd], point: Any, is_cold: Bool[Array, ""]
+) -> NewtonEnd:
+    """The same by a search under a part of these loads, or without them, from a point."""
+    count, zero = jnp.zeros((), int), jnp.zeros((), jnp.result_type(float))
+    outcome = Outcome(zero, count, count, count)
+    begin = jax.lax.cond(is_cold, lambda: search(None, point), lambda: NewtonEnd(point, outcome, jnp.array(False)))
 
     def grown(state: _State) -> _State:
         part = jnp.minimum(state.part + state.step, 1.0)
-        here = dataclasses.replace(form, scene=scaled(form.scene, part))
-        end = find_equilibrium(here, state.point, solver, find)
+        end = search(part, state.point)
         bears = is_converged(end.outcome.status)
         of_all = part == 1.0
         outcome = _sum(state.outcome, end.outcome)
@@ -60,8 +73,7 @@ def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_co
             outcome,
         )
 
-    one = jnp.ones((), point.total_twist.dtype)
-    state = _State(begin.point, 0 * one, one, begin, begin.outcome)
+    state = _State(begin.point, zero, zero + 1, begin, begin.outcome)
     state = jax.lax.while_loop(lambda state: (state.part < 1) & (state.step >= LEAST_PART), grown, state)
     last = state.end.outcome
     outcome = Outcome(last.residual, state.outcome.iterations, state.outcome.evaluations, last.status)

@@ -70,7 +70,7 @@ STAGNATION = 10.0
 class NewtonEnd(eqx.Module):
     """Where the method stopped. `is_stable`: whether the energy has no negative curvature there."""
 
-    point: Point
+    point: Any
     outcome: Outcome
     is_stable: Bool[Array, ""]
 

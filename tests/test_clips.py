@@ -1,5 +1,6 @@
 """Clips: supports between the ends, beside the theory of continuous beams, differences, and rods without them."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -244,6 +245,20 @@ def lifted(at: float, *, sliding: bool) -> Scene:
     """A slack cable in a clip above the middle between its clamps."""
     ends = Clamp(ORIGIN, LEVEL), Clamp((0.8, 0, 0), LEVEL)
     return Scene(problems.cable(100.0), *ends, (0, 0, -9.81), clips=[Clip(at, (0.4, 0, 0.1), None, sliding)])
+
+
+@pytest.mark.parametrize("end", [Free(), rj.Joint("tip")], ids=["free", "joint"])
+def test_a_rod_that_slides_out_of_a_clip_is_told(end):
+    """A clip above the clamp, near to the end of a cable that hangs to the clamp's side: it is drawn down."""
+    scene = Scene(Rod(1.0, 0.1, 0.08, 1e3, 0.5), Clamp(ORIGIN, LEVEL), end, (0, 0, -9.81))
+    scene = eqx.tree_at(lambda scene: scene.clips, scene, (Clip(0.9, (0.5, 0, 0.3), sliding=True),))
+    with pytest.warns(rj.NotConvergedWarning, match="a rod slides out of a clip"):
+        result = rj.solve(rj.Harness({"a": scene}) if isinstance(end, rj.Joint) else scene, segments=8)
+    assert result.status == rj.Status.SLID_OUT
+    assert not result.converged
+    # Each step goes at most 0.3 of the way that is left to the end, of 1e-4.
+    assert result.iterations < 50
+    assert "clips[0], which has come to 0.9999 of 1 m" in rj.describe(result)
 
 
 def test_a_sliding_clip_is_where_the_energy_is_least():

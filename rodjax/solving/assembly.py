@@ -484,6 +484,9 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
+        has_slid_out = jax.vmap(lambda form, point: form.has_slid_out(point))(group.form, here.points)
+        if has_slid_out is not None:
+            status = jnp.where(jnp.any(has_slid_out) & (status == Status.RUNNING), Status.SLID_OUT, status)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
     # Forces and pressures change as the merit has them.

@@ -254,6 +254,9 @@ def _advanced(
     is_blocked = form.is_blocked(point)
     if is_blocked is not None:
         status = jnp.where(is_blocked & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
+    has_slid_out = form.has_slid_out(point)
+    if has_slid_out is not None:
+        status = jnp.where(has_slid_out & (status == Status.RUNNING), Status.SLID_OUT, status)
     return NewtonState(
         point=point,
         bases=here.bases,

@@ -24,6 +24,7 @@ class Status(enum.IntEnum):
     OVERSTRETCHED = 9
     PASSED_THROUGH = 10
     OUT_OF_RANGE = 12
+    SLID_OUT = 13
 
     @property
     def message(self) -> str:
@@ -40,6 +41,7 @@ class Status(enum.IntEnum):
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
             Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
             "positive, an arclength beyond the rod, or jumps of `Steps` too near to one another for the mesh",
+            Status.SLID_OUT: "not converged: a rod slides out of a clip",
             Status.PASSED_THROUGH: "not converged: from its start the rod came through an obstacle, or lies within one",
         }[self]
 

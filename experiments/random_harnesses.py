@@ -198,7 +198,8 @@ def main(argv: Sequence[str] | None = None) -> list[Outcome]:
         seconds = time.process_time() - begin
         outcome = Outcome(seed, name, bool(result.converged), int(result.iterations), result.segments, seconds)
         found.append(outcome)
-        told = "converges" if outcome.converged else f"does not converge, residual {float(result.residual):.1e}"
+        why = rj.Status(int(result.status)).message.partition(":")[2]
+        told = "converges" if outcome.converged else f"does not converge:{why}, residual {float(result.residual):.1e}"
         print(
             f"{seed}: {told}, {outcome.iterations} iterations, {outcome.segments}, {seconds:.1f} s: {name}", flush=True
         )

@@ -153,8 +153,10 @@ class Form(eqx.Module):
         """Whether the search can go on with another form only; `None` where that cannot happen."""
         return None
 
-    def has_slid_out(self, point: Any) -> Bool[Array, ""] | None:
-        """Whether the rod has slid out of a clip; `None` where it slides through none."""
+    def has_slid_out(self, point: Any, is_given_up: Bool[Array, ""]) -> Bool[Array, ""] | None:
+        """Whether the rod has slid out of a clip, or where the search is given up is about to; `None` where it slides
+        through none.
+        """
         return None
 
     def nodal_held(self, nodal: Any) -> Any:

@@ -47,8 +47,10 @@ SETTLED = 0.1
 LEAST_SLIDE = 1e-7
 # Elements beside a clip that have become longer or shorter by this factor are made anew.
 STRETCHED = 1.25
-# A rod has slid out of a clip that is nearer to an end, or to the next clip [L].
+# A rod has slid out of a clip that is nearer to an end, or to the next clip [L]; and where no equilibrium is found, is
+# about to with one that is so near.
 SLID_OUT = 1e-4
+NEARLY_OUT = 1e-2
 # Nodes that lie apart by less [L] are the same.
 SAME_NODE = 1e-9
 
@@ -149,11 +151,12 @@ class SlidingForm(Form):
         now = self._clips + self._spread(point.arclengths - self.made_at)
         return jnp.any(self._is_near(loads, now[beside]) & ~self._is_near(loads, self._clips[beside]))
 
-    def has_slid_out(self, point: SlidingPoint) -> Bool[Array, ""]:
+    def has_slid_out(self, point: SlidingPoint, is_given_up: Bool[Array, ""]) -> Bool[Array, ""]:
         """Or two clips have come together along it."""
         ends = jnp.array([0.0, 1.0], point.arclengths.dtype)
         now = self._clips + self._spread(point.arclengths - self.made_at)
-        return jnp.any(jnp.diff(jnp.concatenate([ends[:1], now, ends[1:]])) < SLID_OUT)
+        nearest = jnp.where(is_given_up, NEARLY_OUT, SLID_OUT)
+        return jnp.any(jnp.diff(jnp.concatenate([ends[:1], now, ends[1:]])) < nearest)
 
     def is_misplaced(self, point: SlidingPoint) -> Bool[Array, ""]:
         """Whether the mesh is not, or should not be, the one that belongs to these arclengths."""

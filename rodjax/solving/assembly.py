@@ -481,12 +481,15 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     trial = _searched(assembly, all_here, touching, state, steps, balance, is_unjudged, is_sought)
     status = _status(state, balance, trial, steps, is_sought, solver)
     for group, here in zip(assembly.groups, all_here, strict=True):
+        is_given_up = (status == Status.MAX_ITERATIONS) | (status == Status.LINE_SEARCH_FAILED)
+        slid_out = jax.vmap(lambda form, point, ends: form.has_slid_out(point, ends), (0, 0, None))
+        has_slid_out = slid_out(group.form, here.points, is_given_up)
+        if has_slid_out is not None:
+            is_open = is_given_up | (status == Status.RUNNING)
+            status = jnp.where(jnp.any(has_slid_out) & is_open, Status.SLID_OUT, status)
         is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
-        has_slid_out = jax.vmap(lambda form, point: form.has_slid_out(point))(group.form, here.points)
-        if has_slid_out is not None:
-            status = jnp.where(jnp.any(has_slid_out) & (status == Status.RUNNING), Status.SLID_OUT, status)
     goes = (status == Status.RUNNING) & trial.is_better
     taken = jnp.where(goes, trial.part, 0.0)
     # Forces and pressures change as the merit has them.

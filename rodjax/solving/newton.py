@@ -251,12 +251,14 @@ def _advanced(
         is_lost |= changes
     again |= is_lost
     status = jnp.where(again, Status.RUNNING, status)
+    is_given_up = status == Status.MAX_ITERATIONS
+    has_slid_out = form.has_slid_out(point, is_given_up)
+    if has_slid_out is not None:
+        is_open = is_given_up | (status == Status.RUNNING)
+        status = jnp.where(has_slid_out & is_open, Status.SLID_OUT, status)
     is_blocked = form.is_blocked(point)
     if is_blocked is not None:
         status = jnp.where(is_blocked & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
-    has_slid_out = form.has_slid_out(point)
-    if has_slid_out is not None:
-        status = jnp.where(has_slid_out & (status == Status.RUNNING), Status.SLID_OUT, status)
     return NewtonState(
         point=point,
         bases=here.bases,

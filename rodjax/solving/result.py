@@ -42,7 +42,7 @@ from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.node_contacts import SLIPS, STICKS, exerted_by_itself, exerted_by_obstacles, shares
 from rodjax.discretization.potentials import at_both
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.sliding import SLID_OUT
+from rodjax.discretization.sliding import NEARLY_OUT
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
@@ -830,7 +830,7 @@ def _last_clips(scene: Scene) -> str:
     """Which clips hold nothing any more, or have come to the next one."""
     length = float(scene.rod.length)
     places = np.array([0.0, *(float(clip.at) for clip in scene.clips), length])
-    near = np.diff(places) < SLID_OUT * length
+    near = np.diff(places) < NEARLY_OUT * length
     which = [k for k, clip in enumerate(scene.clips) if clip.sliding and (near[k] or near[k + 1])]
     return "".join(f", clips[{k}], which has come to {places[k + 1]:.4g} of {length:.4g} m" for k in which)
 

@@ -388,8 +388,17 @@ def test_stress(monkeypatch, capsys):
 def test_random_harnesses(capsys):
     outcomes = script("random_harnesses").main(["--count", "1", "--seed", "3"])
     outcomes += script("random_harnesses").main(["--count", "1", "--seed", "3", "--sliding"])
+    outcomes += script("random_harnesses").main(["--count", "1", "--seed", "7", "--follower"])
     assert all(outcome.converged for outcome in outcomes)
-    assert capsys.readouterr().out.count("1 of 1 converge") == 2
+    assert capsys.readouterr().out.count("1 of 1 converge") == 3
+
+
+@pytest.mark.slow
+def test_cut_rods(capsys):
+    (row,) = script("cut_rods").main(["--count", "1", "--seed", "602", "--size", "6"])
+    assert row.converged == (True, True)
+    assert row.distance < 1e-9
+    assert "1 of 1 converge both ways" in capsys.readouterr().out
 
 
 @pytest.mark.slow

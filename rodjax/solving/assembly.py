@@ -373,9 +373,13 @@ def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, 
         outcome = Outcome(end.residual, end.iterations, end.evaluations, end.status)
         return NewtonEnd(end, outcome, end.negative == 0)
 
-    end = put_on(search, begin, is_cold)
+    end = put_on(search, begin, is_cold, begin.residual.dtype)
     outcome, found = end.outcome, end.point
-    return found._replace(iterations=outcome.iterations, evaluations=outcome.evaluations, status=outcome.status)
+    return found._replace(
+        iterations=begin.iterations + outcome.iterations,
+        evaluations=begin.evaluations + outcome.evaluations,
+        status=outcome.status,
+    )
 
 
 def _found(assembly: Assembly, begin: State, solver: Newton, find: Find) -> State:

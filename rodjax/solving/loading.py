@@ -43,7 +43,7 @@ def found_under_loads(form: Any, point: Point, solver: Newton, find: Find, is_co
         here: Form = dataclasses.replace(form, scene=bearing(form.scene, part))
         return find_equilibrium(here, point, solver, find)
 
-    return put_on(search, point, is_cold)
+    return put_on(search, point, is_cold, point.total_twist.dtype)
 
 
 def bearing(scene: Scene, part: Float[Array, ""] | None) -> Scene:
@@ -52,10 +52,10 @@ def bearing(scene: Scene, part: Float[Array, ""] | None) -> Scene:
 
 
 def put_on(
-    search: Callable[[Float[Array, ""] | None, Any], NewtonEnd], point: Any, is_cold: Bool[Array, ""]
+    search: Callable[[Float[Array, ""] | None, Any], NewtonEnd], point: Any, is_cold: Bool[Array, ""], dtype: Any
 ) -> NewtonEnd:
     """The same by a search under a part of these loads, or without them, from a point."""
-    count, zero = jnp.zeros((), int), jnp.zeros((), jnp.result_type(float))
+    count, zero = jnp.zeros((), int), jnp.zeros((), dtype)
     outcome = Outcome(zero, count, count, count)
     begin = jax.lax.cond(is_cold, lambda: search(None, point), lambda: NewtonEnd(point, outcome, jnp.array(False)))
 

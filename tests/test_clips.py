@@ -261,6 +261,16 @@ def test_a_rod_that_slides_out_of_a_clip_is_told(end):
     assert "clips[0], which has come to 0.9999 of 1 m" in rj.describe(result)
 
 
+def test_clips_that_hold_the_rod_may_be_near_to_one_another():
+    """No rod slides out of one beside them, also where a search is given up."""
+    places = (0.3, (0.25, 0, 0.05), False), (0.305, (0.255, 0, 0.05), False), (0.7, (0.6, 0, 0.1), True)
+    clips = [Clip(at, place, None, sliding) for at, place, sliding in places]
+    scene = Scene(Rod(1.0, 0.1, 0.08, 1e3, 0.5), Clamp(ORIGIN, LEVEL), Free(), (0, 0, -9.81), clips=clips)
+    with pytest.warns(rj.NotConvergedWarning):
+        result = rj.solve(scene, segments=32, solver=rj.Newton(max_iterations=1))
+    assert result.status == rj.Status.MAX_ITERATIONS
+
+
 def test_a_sliding_clip_is_where_the_energy_is_least():
     """Clips that hold the rod beside that place cost more; half way, by symmetry, most: the rod slides away."""
     options = {"segments": 32, "solver": TIGHT}

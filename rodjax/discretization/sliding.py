@@ -155,8 +155,10 @@ class SlidingForm(Form):
         """Or two clips have come together along it."""
         ends = jnp.array([0.0, 1.0], point.arclengths.dtype)
         now = self._clips + self._spread(point.arclengths - self.made_at)
-        nearest = jnp.where(is_given_up, NEARLY_OUT, SLID_OUT)
-        return jnp.any(jnp.diff(jnp.concatenate([ends[:1], now, ends[1:]])) < nearest)
+        lengths = jnp.diff(jnp.concatenate([ends[:1], now, ends[1:]]))
+        # Clips that hold the rod may be as near to one another as they like.
+        beside = np.union1d(self._numbers, self._numbers + 1)
+        return jnp.any(lengths[beside] < jnp.where(is_given_up, NEARLY_OUT, SLID_OUT))
 
     def is_misplaced(self, point: SlidingPoint) -> Bool[Array, ""]:
         """Whether the mesh is not, or should not be, the one that belongs to these arclengths."""

@@ -20,8 +20,7 @@ class RodjaxSolver:
     """The equilibrium between ends that do not move: the first frame is the given shape, all others are it.
 
     `scenario` and what `run` returns are a `Scenario` and a `Trajectory` of cosseratbench. Its runner reports as
-    unsupported what raises `NotImplementedError` here: dynamics, driven ends, rods that nothing holds, friction, and
-    several rods that may touch themselves.
+    unsupported what raises `NotImplementedError` here: dynamics, driven ends, rods that nothing holds, and friction.
     """
 
     name = "rodjax"
@@ -73,8 +72,6 @@ class RodjaxSolver:
         scenes = [scene(scenario, rod, segments) for rod in scenario.rods]
         if len(scenes) == 1:
             return scenes[0]
-        if scenario.self_contact:
-            raise NotImplementedError("several rods that may touch themselves")
         return rodjax.Harness({f"rod{k}": each for k, each in enumerate(scenes)}, contact=True)
 
 
@@ -95,7 +92,7 @@ def scene(scenario: Any, rod: Any, segments: int) -> rodjax.Scene:
         end,
         gravity=scenario.gravity if any(scenario.gravity) else None,
         obstacles=tuple(map(obstacle, scenario.obstacles)),
-        self_contact=scenario.self_contact and len(scenario.rods) == 1,
+        self_contact=scenario.self_contact,
     )
 
 

@@ -11,6 +11,7 @@ from scipy.optimize import fsolve
 import rodjax
 from rodjax.discretization import self_contact
 from rodjax.discretization.self_contact import Curve
+from rodjax.solving.harness import solve_harness
 
 LENGTH, RADIUS = 1.0, 0.02
 # The ends of a hairpin: this far from its axis, with tangents that lean so much towards it [rad].
@@ -239,6 +240,48 @@ def test_derivatives_are_those_of_tight_solves(pressed):
         np.testing.assert_allclose(gradient[k], difference, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_a_hairpin_cut_beside_its_contact_is_the_hairpin():
+    """In a body beside it: one leg touches within the last element before the joint."""
+    elements, beyond = 32, 2
+    tight = rodjax.Newton(tolerance=1e-11)
+    joint = rodjax.Joint("cut", frame=rodjax.frame((0, 1, 0), (0, 0, 1)), offset=(0.1, 0, 0.02))
+    scene = hairpin()
+
+    def cut(EI):
+        lengths = LENGTH * (elements - beyond) / elements, LENGTH * beyond / elements
+        long, short = (rodjax.Rod(length, EI, 1.0, 1e6, radius=RADIUS) for length in lengths)
+        first = rodjax.Scene(long, scene.start, joint, self_contact=True)
+        return rodjax.Harness({"long": first, "short": rodjax.Scene(short, joint, scene.end)})
+
+    whole = rodjax.solve(scene, segments=elements, guess=guess(), solver=tight)
+    parts = (whole.nodes[: elements - beyond + 1], whole.nodes[elements - beyond :])
+    shapes = [rodjax.Guess(nodes, whole.total_twist * (len(nodes) - 1) / elements) for nodes in parts]
+    options = {"segments": [elements - beyond, beyond], "solver": tight}
+    found = solve_harness(cut(1.0), guess=dict(zip(("long", "short"), shapes, strict=True)), **options)
+    assert found.stable
+    assert found.iterations < 15
+    nodes = jnp.concatenate([found["long"].nodes, found["short"].nodes[1:]])
+    # Residuals of 1e-11 EI/L^2.
+    assert jnp.max(jnp.abs(nodes - whole.nodes)) < 1e-9
+    forces = found["long"].self_contacts.forces
+    np.testing.assert_allclose(forces, whole.self_contacts.forces[: len(forces)], atol=1e-9 * jnp.max(forces))
+    assert jnp.max(jnp.abs(forces)) > 10
+
+    def of_whole(EI):
+        result = rodjax.solve(hairpin(EI=EI), segments=elements, guess=whole, solver=tight)
+        return jnp.concatenate([result.end_moment, result.nodes[elements - beyond]])
+
+    def of_parts(EI):
+        result = solve_harness(cut(EI), guess=found, **options)
+        return jnp.concatenate([result["short"].end_moment, result["long"].nodes[-1]])
+
+    one = jnp.asarray(1.0)
+    expected, rates = (by_numpy(lambda EI, of=of: jax.jvp(of, (EI,), (one,))[1])(one) for of in (of_whole, of_parts))
+    # Contacts of a linearised system are rigid to about 1e-9.
+    np.testing.assert_allclose(rates, expected, atol=1e-7 * np.max(np.abs(expected)))
+
+
 def test_results_are_saved_and_told(pressed, tmp_path):
     rodjax.save(pressed, tmp_path / "pressed.vtkhdf")
     again = rodjax.load(tmp_path / "pressed.vtkhdf")
@@ -264,7 +307,3 @@ def test_what_makes_no_sense_is_refused():
         rodjax.follow([hairpin(), hairpin(aside=0.05)])
     with pytest.raises(ValueError, match="at_critical must be 'jump' for scenes with self_contact"):
         rodjax.solve_path([hairpin(), hairpin(aside=0.05)], segments=8, at_critical="stop")
-    part = hairpin()
-    part = rodjax.Scene(part.rod, part.start, rodjax.Joint("j", rodjax.frame((1, 0, 0))), self_contact=True)
-    with pytest.raises(ValueError, match=r"cables\['a'\].self_contact must be False where ends of"):
-        rodjax.Harness({"a": part}, {"j": rodjax.Body(support=rodjax.Pin((0.5, 0, 0)))})

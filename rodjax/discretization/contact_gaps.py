@@ -149,7 +149,7 @@ def has_wells(scene: Scene) -> bool:
 def curve(form: PositionForm, point: Any) -> Curve:
     """What self-contact needs of the rod at a point."""
     s = form.field.s
-    free = jnp.where(form.is_at_support, 0.0, 1.0).astype(s.dtype)
+    free = jnp.where(form.is_held, 0.0, 1.0).astype(s.dtype)
     radius = form.radius_in_elements(jnp.full(1, 0.5, s.dtype))[:, 0]
     found = Curve(s, point.nodal.positions, point.tangents[:, ::2], form.node_axes(point), free, radius, form.normal)
     if not has_wells(form.scene):

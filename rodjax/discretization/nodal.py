@@ -156,12 +156,9 @@ class NodalForm(PositionForm):
         # Files until format 12 have those at nodes only.
         known = jnp.concatenate([known, nothing[len(known) :] + jnp.nan])
         pressures = jnp.where(jnp.isnan(known), pushing, known)
-        _, _, inner_gaps = within_elements(self, point)
-        gaps = jnp.concatenate([gaps, inner_gaps])
-        if self.scene.self_contact:
-            far = contacts_with_itself(self, point, pressures[-1])
-            gaps = jnp.concatenate([gaps, far.gaps[None]])
-        nodal = dataclasses.replace(nodal, pressures=pressures, relaxed=relaxation(self, gaps))
+        nodal = dataclasses.replace(nodal, pressures=pressures)
+        point = dataclasses.replace(point, nodal=nodal)
+        nodal = dataclasses.replace(nodal, relaxed=relaxation(self, self.gaps(point)))
         return dataclasses.replace(point, nodal=nodal)
 
     # --- fields along the elements -----------------------------------------------------------------------------------
@@ -213,9 +210,14 @@ class NodalForm(PositionForm):
         return self._merit_of_contacts(contact_model(self, point, self.gaps(there), None), others)
 
     def gaps(self, point: Any) -> Float[Array, "k n+1"]:
-        """Between rod and obstacles, in the rows of pressures."""
+        """In the rows of pressures."""
         gaps, _ = gaps_and_normals(self, point.nodal.positions)
-        return jnp.concatenate([gaps, within_elements(self, point)[2]]) if smooth_obstacles(self.scene) else gaps
+        _, _, inner_gaps = within_elements(self, point)
+        gaps = jnp.concatenate([gaps, inner_gaps])
+        if not self.scene.self_contact:
+            return gaps
+        far = contacts_with_itself(self, point, point.nodal.pressures[-1])
+        return jnp.concatenate([gaps, far.gaps[None]])
 
     def _merit_of_contacts(self, model: Unilateral, others: NodalChange) -> Float[Array, ""]:
         pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE

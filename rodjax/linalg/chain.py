@@ -226,6 +226,8 @@ class ChainSystem(eqx.Module):
         of_nodes = jnp.concatenate([jnp.tile(turns[None, ::2], (b, 1)), jnp.tile(moves[None], (3, 1))])
         if contacts.inner is not None:
             contacts = dataclasses.replace(contacts, inner=contacts.inner.holding(turns[::2], moves))
+        if contacts.far is not None:
+            contacts = dataclasses.replace(contacts, far=contacts.far.holding(turns[::2], moves))
         between, turning, loads = self.between, self.turning, self.loads
         if loads is not None:
             loads = loads.holding(of_elements, jnp.stack([moves[:-1], moves[1:]]))

@@ -83,6 +83,14 @@ class FarRows(eqx.Module):
         """With the nodes counted from the end."""
         return dataclasses.replace(self, nodes=nodes - 1 - self.nodes)
 
+    def holding(self, turns: Float[Array, "n+1"], moves: Float[Array, "n+1"]) -> "FarRows":
+        """`turns`, `moves`: 0 at nodes whose rotation or place is held, else 1."""
+        return dataclasses.replace(
+            self,
+            by_rotation=self.by_rotation * turns[self.nodes][None, None],
+            by_position=self.by_position * moves[self.nodes][None, None],
+        )
+
     @property
     def positive(self) -> int:
         """The number of the columns whose compliance is positive."""

@@ -70,7 +70,7 @@ class Harness(eqx.Module):
     unless a support of its own holds it in a direction. Without contact between rods one end must be a `Joint`.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with friction or self-contact, with a dead moment on the free end of a plain rod, or with a sliding
+    and for a scene with friction, with a dead moment on the free end of a plain rod, or with a sliding
     clip beside obstacles, in a field of forces, under loads without a potential or in contact with other rods.
     """
 
@@ -206,8 +206,6 @@ def check_movable(scene: Scene, name: str) -> None:
     """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
     if has_friction(scene):
         raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
-    if scene.self_contact:
-        raise ValueError(f"{name}.self_contact must be False where ends of the rod have unknown poses")
     if slides(scene) and has_node_positions(scene):
         raise ValueError(
             f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles, fields or loads "

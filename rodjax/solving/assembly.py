@@ -15,6 +15,8 @@ r) of a body: displacement in parts of a mean length, and rotation vector about 
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -80,7 +82,7 @@ from rodjax.solving.rod_contact import (
     loads_of,
     passes,
 )
-from rodjax.solving.status import Outcome, Status
+from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
@@ -388,8 +390,18 @@ def _found(assembly: Assembly, begin: State, solver: Newton, find: Find) -> Stat
         find = "equilibrium"
         fewer = jnp.minimum(solver.max_iterations, MOST_UNJUDGED)
         solver = eqx.tree_at(lambda solver: solver.max_iterations, solver, fewer)
-    return jax.lax.while_loop(
+    begin = begin._replace(points=_of_each(assembly, begin.points, lambda form, point: form.searching(point)))
+    end = jax.lax.while_loop(
         lambda state: state.status == Status.RUNNING, lambda state: _turn(assembly, state, solver, find), begin
+    )
+    return end._replace(points=_of_each(assembly, end.points, lambda form, point: form.ended(point)))
+
+
+def _of_each(assembly: Assembly, points: tuple[Any, ...], changed: Callable[[Form, Any], Any]) -> tuple[Any, ...]:
+    """Of each group the points, changed where a search changes them at its beginning or end alone."""
+    return tuple(
+        jax.vmap(changed)(group.form, of_group) if group.form.refines else of_group
+        for group, of_group in zip(assembly.groups, points, strict=True)
     )
 
 
@@ -494,14 +506,14 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
-    goes = (status == Status.RUNNING) & trial.is_better
+    points_here, changes = _refined(assembly, all_here, state, balance, status)
+    status = jnp.where(changes, Status.RUNNING, status)
+    goes = (status == Status.RUNNING) & trial.is_better & ~changes
     taken = jnp.where(goes, trial.part, 0.0)
     # Forces and pressures change as the merit has them.
     pushed = jnp.where(goes, steps.part, 0.0)
     there = state.poses.retract(taken * steps.bodies, assembly.length), trial.points
-    poses, points = jax.tree.map(
-        lambda new, old: jnp.where(goes, new, old), there, (state.poses, tuple(here.points for here in all_here))
-    )
+    poses, points = jax.tree.map(lambda new, old: jnp.where(goes, new, old), there, (state.poses, points_here))
     at_ends = state.at_ends
     if contacts is not None:
         at_ends = _split(all_here, at_ends, contacts.at_ends, lambda pressures, change: pressures + pushed * change)
@@ -978,6 +990,24 @@ def _status(
     status = jnp.where(has_saddle, Status.SADDLE, status)
     status = jnp.where(is_balanced & is_sought, balance.balanced, status)
     return jnp.where(steps.is_finite | is_balanced, status, Status.NOT_FINITE)
+
+
+def _refined(
+    assembly: Assembly, all_here: list[_Here], state: State, balance: _Balance, status: Int[Array, ""]
+) -> tuple[tuple[Any, ...], Bool[Array, ""]]:
+    """The points, with what a search changes at its beginning or end alone; whether it goes on from there."""
+    points, changes = [], jnp.array(False)
+    begins, ends = (state.iterations == 0) & ~balance.is_balanced, is_converged(status)
+    for group, here in zip(assembly.groups, all_here, strict=True):
+        if not group.form.refines:
+            points.append(here.points)
+            continue
+        found, differ = jax.vmap(lambda form, point: form.refined(point, ends))(group.form, here.points)
+        is_new = (a != b for a, b in zip(*map(jax.tree.leaves, (found, here.points)), strict=True))
+        differs = functools.reduce(jnp.logical_or, map(jnp.any, is_new))
+        changes |= (begins & differs) | (ends & jnp.any(differ))
+        points.append(jax.tree.map(lambda new, old: jnp.where(begins | ends, new, old), found, here.points))
+    return tuple(points), changes
 
 
 def _damping(state: State, trial: _Trial) -> Float[Array, ""]:

@@ -26,7 +26,7 @@ from rodjax.model.harness import (
     of_one_rod,
 )
 from rodjax.model.loads import ContactLoads
-from rodjax.model.scene import Scene, nondimensional, slid, slides, under_contact
+from rodjax.model.scene import Scene, has_contacts, nondimensional, slid, slides, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
@@ -513,7 +513,7 @@ def _equilibria(
             positions = point.nodal.positions + (rod.units.origin - units.origin)[None] / units.length
             point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, positions=positions))
         point = form.settled(form.holding(point))
-        pressures = point.nodal.pressures if scene.obstacles else None
+        pressures = point.nodal.pressures if has_contacts(scene) else None
         shape = rod.shape.reached(form, point)
         state = SolverState(shape, point.end_force, units, arclengths, pressures=pressures)
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)

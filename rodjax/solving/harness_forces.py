@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from rodjax.checks import leaf
 from rodjax.model.harness import Bodies, Harness, end_radii, floating, joint_ends, rotated
+from rodjax.model.scene import has_contacts
 from rodjax.solving.assembly import Poses
 from rodjax.solving.equilibrium import Options
 from rodjax.solving.result import Equilibrium
@@ -75,12 +76,13 @@ def no_pressures(harness: Harness, members: Members) -> Float[Array, "c"]:
 
 
 def split_pressures(harness: Harness, members: Members, pressures: Float[Array, "c"]) -> list[Array | None]:
-    """Of each group (rods, obstacles, ends); `None` of rods that touch neither obstacles nor other rods."""
+    """Of each group (rods, obstacles, ends); `None` of rods that touch nothing."""
     found, first, touched = [], 0, in_contact(pairs_of(harness.contact, members))
     for group, (count, numbers) in enumerate(zip(_of_obstacles(harness, members), members, strict=True)):
         size = 2 * count * len(numbers)
         of_group = pressures[first : first + size].reshape(len(numbers), count, 2)
-        found.append(of_group if count or group in touched else None)
+        touches = has_contacts(harness.scenes[numbers[0]]) or group in touched
+        found.append(of_group if touches else None)
         first += size
     return found
 

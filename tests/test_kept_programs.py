@@ -205,7 +205,6 @@ def test_what_jax_had_in_its_own_cache_is_not_kept(folder, tmp_path):
     program()(1.0)
     (file,) = files(folder)
     file.unlink()
-    jax.clear_caches()
     assert program()(1.0)["scaled"] == 2.0
     assert not files(folder)
 

@@ -134,6 +134,14 @@ def pytest_collection_modifyitems(config, items):
         items.sort(key=lambda item: _rank(item.nodeid))
 
 
+@pytest.fixture(autouse=True)
+def earlier_tests_are_not_collected():
+    """Full collections, for which Hypothesis, imageio and windows ask, went through millions of objects of other tests,
+    for up to half a minute each.
+    """
+    gc.freeze()
+
+
 @pytest.fixture
 def compiled_at_once():
     """No first answers from NumPy code."""

@@ -27,8 +27,7 @@ def numpy_first():
 
 @pytest.fixture(autouse=True)
 def nothing_is_cleared(monkeypatch):
-    """Collecting goes through millions of objects of other tests, for seconds; and they need what JAX holds."""
-    monkeypatch.setattr("gc.collect", lambda *_: 0)
+    """Other tests need what JAX holds."""
     monkeypatch.setattr("jax.clear_caches", lambda: None)
 
 

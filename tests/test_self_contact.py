@@ -292,6 +292,11 @@ def test_results_are_saved_and_told(pressed, tmp_path):
     assert "self_contact" in str(pressed.scene).splitlines()[-1]
     rodjax.write_scene(pressed.scene, tmp_path / "scene.toml")
     assert rodjax.read_scene(tmp_path / "scene.toml").self_contact
+    joint = rodjax.Joint("j")
+    first = rodjax.Scene(pressed.scene.rod, pressed.scene.start, joint, self_contact=True)
+    harness = rodjax.Harness({"a": first, "b": rodjax.Scene(pressed.scene.rod, joint, pressed.scene.end)})
+    rodjax.write_scene(harness, tmp_path / "harness.toml")
+    assert [scene.self_contact for scene in rodjax.read_scene(tmp_path / "harness.toml").scenes] == [True, False]
 
 
 def test_what_makes_no_sense_is_refused():

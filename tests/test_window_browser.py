@@ -36,12 +36,6 @@ pytestmark = pytest.mark.slow
 viser = pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
 
 
-@pytest.fixture(autouse=True)
-def nothing_is_collected(monkeypatch):
-    """Each window collects as it opens, which goes through millions of objects of other tests, for seconds."""
-    monkeypatch.setattr("gc.collect", lambda *_: 0)
-
-
 def scene() -> rj.Scene:
     cable = rj.Rod.circular(1.0, 8e-3, 1e7, poisson_ratio=0.5, density=1200)
     clips = [rj.Clip(0.5, (0.4, 0.02, -0.12))]

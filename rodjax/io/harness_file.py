@@ -5,7 +5,7 @@ A complete example: a trunk that branches into two, one of them on a pin.
     contact = [["trunk", "left"]]  # optional: which cables touch one another; or true, for all that share no joint
 
     [cables.trunk.rod]             # the tables of a cable are those of `rodjax.io.scene_file`: rod, start, end, loads,
-    section = "circular"           # clips, obstacles
+    section = "circular"           # clips, obstacles; and self_contact = true in [cables.trunk]
     length = "40 cm"
     radius = "5 mm"
     youngs_modulus = "10 MPa"
@@ -64,7 +64,7 @@ from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strai
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
 HARNESS_TABLES = ("cables", "contact", "joints", "loads", "obstacles", "solve")
-CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles")
+CABLE_TABLES = ("rod", "start", "end"), ("loads", "clips", "obstacles", "self_contact")
 
 
 class HarnessFile(NamedTuple):

@@ -77,7 +77,8 @@ def _written_scene(scene: Scene, where: str, before: str) -> list[str]:
         )
     if scene.contact_loads is not None:
         raise ValueError(f"{where} must be one that was given, got that of a rod touching others: write its Harness")
-    lines = ["self_contact = true", ""] if scene.self_contact else []
+    table = [f"[{before[:-1]}]"] if before else []  # of its cable in a harness
+    lines = [*table, "self_contact = true", ""] if scene.self_contact else []
     lines += [f"[{before}rod]", *_written_rod(scene.rod)]
     for name, end in (("start", scene.start), ("end", scene.end)):
         lines += ["", f"[{before}{name}]", *_written_support(end)]

@@ -109,7 +109,7 @@ class Border(eqx.Module):
             places = k + np.arange(5)[:, None] * p + np.arange(count)[None]
             at = np.concatenate([np.arange(k), places.reshape(-1)])
             branches.append(lambda count=count, at=at: spread(self._with_first(count), at))
-        level = jnp.sum(jnp.asarray(self._needed) > np.array(few)) if few else 0
+        level = _largest_of_all(jnp.sum(jnp.asarray(self._needed) > np.array(few))) if few else 0
         return jax.lax.switch(level, [*branches, lambda: whole(self)])
 
     @property
@@ -131,3 +131,14 @@ class Border(eqx.Module):
         assert self.is_closed is not None
         closed = self.is_closed.astype(self.by_rotation.dtype)
         return jnp.concatenate([closed[None], jnp.ones((4, len(closed)), closed.dtype)])
+
+
+@jax.custom_batching.custom_vmap
+def _largest_of_all(level: Int[Array, ""]) -> Int[Array, ""]:
+    """Under `vmap` that of all rods together: JAX would compute every branch for each of several levels."""
+    return level
+
+
+@_largest_of_all.def_vmap
+def _(size: int, is_batched: list[bool], level: Int[Array, "size"]) -> tuple[Int[Array, ""], bool]:
+    return _largest_of_all(jnp.max(level)), False

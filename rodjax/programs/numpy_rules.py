@@ -417,6 +417,7 @@ INNER: dict[str, Rule] = {
     "core_call": _inner("call_jaxpr"),
     "custom_jvp_call": _inner("call_jaxpr"),
     "custom_vjp_call": _inner("call_jaxpr"),
+    "custom_vmap_call": _inner("call"),
     "checkpoint": _inner("jaxpr"),
     "call_hi_primitive": _high_level,
     "while": _while,

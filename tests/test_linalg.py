@@ -12,6 +12,7 @@ from numpy_programs import by_numpy
 import rodjax as rj
 from rodjax.linalg.bordered import BorderedFactors, Vectors
 from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
+from rodjax.linalg.chain_border import Border
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count
@@ -411,3 +412,25 @@ def test_pivots_of_a_complement_tell_where_it_is_singular(j):
         symmetric = complemented(jnp.asarray(matrix + matrix.T))
         assert symmetric.below_by_pivots == symmetric.below == np.sum(np.linalg.eigvalsh(matrix + matrix.T) < 0)
         assert (-1) ** int(complemented(jnp.asarray(matrix)).below_by_pivots) == np.sign(np.linalg.det(matrix))
+
+
+def test_borders_side_by_side_with_other_contacts_in_need():
+    """Together they are inverted with the contacts that one of them needs: none, a few, all."""
+    rng, p, k = np.random.default_rng(5), 20, 2
+
+    def border(needed: int) -> tuple[Border, np.ndarray]:
+        is_needed = np.arange(p) < needed
+        vectors = rng.normal(size=(5, 7, 4, p)) * is_needed
+        far = FarRows(*map(jnp.asarray, (vectors[:, :4], vectors[:, 4:], np.zeros((4, p), int), np.arange(p))), row=0)
+        compliance = jnp.asarray(np.diag([-1.0, -2.0]))
+        found = Border(jnp.zeros((4, k, 9)), compliance, far, jnp.asarray(is_needed), jnp.asarray(0.1))
+        parts = rng.normal(size=(found.size, found.size)) / found.size
+        parts *= np.concatenate([np.ones(k, bool), np.tile(is_needed, 5)])
+        return found, parts.T @ parts * 5 - np.asarray(found.whole_compliance())
+
+    borders, matrices = zip(*(border(needed) for needed in (0, 3, p)), strict=True)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *zip(borders, matrices, strict=True))
+    together = by_numpy(jax.vmap(Border.inverse))(*stacked)
+    alone = [by_numpy(Border.inverse)(*each) for each in zip(borders, matrices, strict=True)]
+    for found in (together, alone):
+        np.testing.assert_allclose(found, np.linalg.inv(np.stack(matrices)), atol=1e-11)

@@ -282,6 +282,21 @@ def test_a_hairpin_cut_beside_its_contact_is_the_hairpin():
     np.testing.assert_allclose(rates, expected, atol=1e-7 * np.max(np.abs(expected)))
 
 
+def test_a_search_of_a_harness_without_numbers_ends():
+    """Wells are made wide once, whatever the point is."""
+    along = rodjax.frame((1, 0, 0))
+
+    def status(gravity):
+        down = jnp.stack([0 * gravity, 0 * gravity, gravity])
+        rod = rodjax.Rod(LENGTH, 1.0, 1.0, 1e4, 0.1, radius=RADIUS)
+        scene = rodjax.Scene(rod, rodjax.Clamp((0, 0, 0), along), rodjax.Joint("j"), down, self_contact=True)
+        return rodjax.solve(rodjax.Harness({"a": scene}, {"j": rodjax.Body(mass=0.1)}), segments=4).status
+
+    found = by_numpy(status)
+    assert found(-9.81) == rodjax.Status.CONVERGED
+    assert found(np.nan) == rodjax.Status.NOT_FINITE
+
+
 def test_results_are_saved_and_told(pressed, tmp_path):
     rodjax.save(pressed, tmp_path / "pressed.vtkhdf")
     again = rodjax.load(tmp_path / "pressed.vtkhdf")

@@ -997,7 +997,8 @@ def _refined(
 ) -> tuple[tuple[Any, ...], Bool[Array, ""]]:
     """The points, with what a search changes at its beginning or end alone; whether it goes on from there."""
     points, changes = [], jnp.array(False)
-    begins, ends = (state.iterations == 0) & ~balance.is_balanced, is_converged(status)
+    begins = (state.iterations == 0) & ~balance.is_balanced & (status == Status.RUNNING)  # finite, then
+    ends = is_converged(status)
     for group, here in zip(assembly.groups, all_here, strict=True):
         if not group.form.refines:
             points.append(here.points)

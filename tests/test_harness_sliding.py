@@ -110,6 +110,8 @@ def test_what_does_not_slide_in_a_harness_is_told():
     clip = Clip(0.25, PLACE, sliding=True)
     with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide .* obstacles, fields or loads"):
         cut(plain, clip, obstacles=[Plane((0, 0, -1), (0, 0, 1))])
+    with pytest.raises(ValueError, match=r"clips must not slide .*, or it may touch itself"):
+        cut(plain, clip, self_contact=True)
     other = Scene(plain(1.0), Clamp((0, 0.5, 0), rodjax.frame((1, 0, 0))), Free())
     scenes = cut(plain, clip)
     with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide, as it may touch another cable"):

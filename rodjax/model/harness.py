@@ -71,7 +71,7 @@ class Harness(eqx.Module):
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
     and for a scene with friction, with a dead moment on the free end of a plain rod, or with a sliding
-    clip beside obstacles, in a field of forces, under loads without a potential or in contact with other rods.
+    clip beside obstacles, in a field of forces, under loads without a potential or in contact with itself or others.
     """
 
     # In the place of a scene.
@@ -209,7 +209,7 @@ def check_movable(scene: Scene, name: str) -> None:
     if slides(scene) and has_node_positions(scene):
         raise ValueError(
             f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles, fields or loads "
-            "without a potential act on it"
+            "without a potential act on it, or it may touch itself"
         )
     if dead_end_moment(scene) is not None and not needs_frames(scene):
         raise ValueError(

@@ -382,6 +382,9 @@ def test_negative_eigenvalues_are_counted(size):
     # Eigenvalues 2 cos(k pi/(size + 1)): pivots that are exactly zero stand before others.
     path = np.eye(size, k=1) + np.eye(size, k=-1)
     assert int(jax.jit(negative_count)(jnp.asarray(path[None]))) == size // 2
+    # Of pivots that are not quite symmetric the lower triangle counts.
+    lost = np.triu(generator.normal(size=mixed.shape), 1)
+    assert int(jax.jit(negative_count)(jnp.asarray(mixed + lost))) == np.sum(values < 0)
 
 
 # --- borders that may be full ----------------------------------------------------------------------------------------
@@ -397,6 +400,22 @@ def test_inverses_and_their_derivatives():
     for order in (jax.jacfwd, jax.jacrev, lambda f: jax.jacfwd(jax.jacrev(f))):
         both = [order(inverse)(matrices[0]) for inverse in (inverse_matrix, jnp.linalg.inv)]
         np.testing.assert_allclose(*both, rtol=1e-10, atol=1e-10 * float(jnp.max(jnp.abs(both[1]))))
+
+
+@pytest.mark.parametrize("size", [1, 2, 9, 16, 17])
+def test_inverses_of_all_sizes(size):
+    """Also where each row is exchanged, over 8 orders; a singular matrix has none, and one beside it is not changed."""
+    rng = np.random.default_rng(size)
+    orders = 10.0 ** rng.uniform(-4, 4, (5, size, 1))
+    matrices = orders * (np.eye(size)[::-1] + 0.3 * rng.normal(size=(5, size, size)) / size)
+    matrices[1], matrices[2] = 0.0, np.eye(size)[rng.permutation(size)]
+    found = np.asarray(jax.jit(inverse_matrix)(matrices))
+    assert not np.isfinite(found[1]).any()
+    assert jax.jit(inverse_matrix)(matrices[:0]).shape == (0, size, size)
+    assert jax.jit(inverse_matrix)(matrices[:, :0, :0]).shape == (5, 0, 0)
+    for k in (0, 2, 3, 4):
+        # Roundings of 1e-16, times the condition of some 1e3 of rows of one order, which a row's order does not change.
+        np.testing.assert_allclose(found[k] @ matrices[k], np.eye(size), atol=1e-11)
 
 
 def complemented(complement: jax.Array) -> BorderedFactors:

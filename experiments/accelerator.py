@@ -1,12 +1,12 @@
 """How many independent scenes a second on an accelerator? `rodjax.solve_batch` there and on one core of the processor.
 
 Seeded scenes: a cable between two clamps about 0.7 L apart, their directions about 17 degrees off, under its weight;
-the same with two bending stiffnesses, and over a floor. Then a scene by itself, and a number made of all end forces
-with its derivatives by all bending stiffnesses, in one program. Where JAX has no accelerator the same runs on the
-processor.
+the same with two bending stiffnesses, over a floor, and cut into two rods of a harness. Then a scene by itself, and a
+number made of all end forces with its derivatives by all bending stiffnesses, in one program. Where JAX has no
+accelerator the same runs on the processor.
 
-    python experiments/accelerator.py [--count 100000] [--of-core 256] [--kinds differences elements frames floor]
-                                      [--profile]
+    python experiments/accelerator.py [--count 100000] [--of-core 256]
+                                      [--kinds differences elements frames floor harness] [--profile]
 """
 
 import argparse
@@ -27,13 +27,14 @@ from measuring import set_up
 from scipy.spatial.transform import Rotation
 
 import rodjax
-from rodjax import Clamp, Plane, Rod, Scene, frame, problems
+from rodjax import Clamp, Harness, Joint, Plane, Rod, Scene, frame, problems
 
 KINDS: dict[str, tuple[Any, int, float]] = {  # discretization, segments, part of the scenes
     "differences": ("finite_difference", 50, 1.0),
     "elements": ("hermite", 16, 1.0),
     "frames": ("hermite", 16, 0.25),
     "floor": ("hermite", 16, 0.01),
+    "harness": ("hermite", 8, 0.01),
 }
 REPEATS = 5
 
@@ -54,7 +55,7 @@ def processor() -> Any:
     return jax.devices("cpu")[0]
 
 
-def stacked(kind: str, count: int) -> Scene:
+def stacked(kind: str, count: int) -> Any:
     """The scenes of a kind, made on the processor."""
     rng = np.random.default_rng(0)
     cable = problems.cable()
@@ -65,6 +66,11 @@ def stacked(kind: str, count: int) -> Scene:
     ends = np.array([0.7, 0, 0]) + rng.uniform(-0.1, 0.1, (count, 3))
 
     def scene(first, last, end):
+        if kind == "harness":
+            half = eqx.tree_at(lambda rod: rod.length, cable, cable.length / 2)
+            cut = Joint("cut", np.eye(3))
+            begin = Scene(half, Clamp((0, 0, 0), first), cut, (0, 0, -9.81))
+            return Harness({"begin": begin, "end": Scene(half, cut, Clamp(end, last), (0, 0, -9.81))})
         return Scene(cable, Clamp((0, 0, 0), first), Clamp(end, last), (0, 0, -9.81), obstacles=obstacles)
 
     with jax.default_device(processor()):
@@ -98,7 +104,8 @@ def measured(kind: str, count: int, of_core: int) -> Row:
     few = jax.tree.map(lambda leaf: leaf[:some], scenes)
     with jax.default_device(processor()):
         alone, _, core = least_seconds(lambda: rodjax.solve_batch(few, threads=1, **options))
-    difference = float(np.max(np.abs(np.asarray(result.nodes[:some]) - alone.nodes)))
+    theirs, ours = (found["begin"].nodes if kind == "harness" else found.nodes for found in (result, alone))
+    difference = float(np.max(np.abs(np.asarray(theirs[:some]) - ours)))
     numbers = float(np.mean(result.converged)), float(np.mean(result.iterations))
     return Row(kind, count, first, 1e6 * seconds / count, 1e6 * core / some, peak_gigabytes(), difference, *numbers)
 

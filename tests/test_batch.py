@@ -107,6 +107,24 @@ def test_chunks_do_not_show(monkeypatch):
             np.testing.assert_array_equal(ours, theirs)
 
 
+def test_threads_share_the_few_that_go_one_after_another(monkeypatch):
+    scenes, by_cg = random_scenes(10), {**OPTIONS, "solver": rj.NonlinearCG()}
+    with rj.numpy_first(False):
+        alone = solve_batch(scenes, threads=1, **by_cg)
+    names, solve_many = set(), batch._solve_many
+
+    def watched(*arguments):
+        names.add(threading.current_thread().name)
+        time.sleep(0.05)  # so that no thread does all
+        return solve_many(*arguments)
+
+    monkeypatch.setattr(batch, "_solve_many", watched)
+    shared = solve_batch(scenes, threads=2, **by_cg)
+    assert len(names) == 2
+    for ours, theirs in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_side_by_side_as_on_an_accelerator(monkeypatch):
     """All rods of a chunk at once; those that go one after another on a processor."""
     on = []
@@ -117,14 +135,16 @@ def test_side_by_side_as_on_an_accelerator(monkeypatch):
 
     scenes = random_scenes(20)
     monkeypatch.setattr(batch, "CHUNKS", ((16, math.inf),))
-    expected, by_cg = solve_batch(scenes, **OPTIONS), solve_batch(scenes, solver=rj.NonlinearCG(), **OPTIONS)
+    expected = solve_batch(scenes, **OPTIONS)
+    with rj.numpy_first(False):
+        by_cg = solve_batch(scenes, solver=rj.NonlinearCG(), **OPTIONS)
     monkeypatch.setattr(batch, "is_on_processor", is_on_processor)
     monkeypatch.setattr(batch, "ACCELERATOR_CHUNKS", ((16, math.inf),))
     at_once, in_turn = [], batch.as_completed
 
-    def as_completed(solved, parts, threads):
+    def as_completed(solved, parts, threads, **options):
         at_once.append(threads)
-        return in_turn(solved, parts, threads=threads)
+        return in_turn(solved, parts, threads=threads, **options)
 
     monkeypatch.setattr(batch, "as_completed", as_completed)
     for threads in (1, 4):

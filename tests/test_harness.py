@@ -2,6 +2,8 @@
 
 import math
 import re
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from planar_frames import PlanarRod, solve_frame
 
 import rodjax
 from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Plane, Rod, Scene, Slider, Spring, plot
+from rodjax.paths import harness_path
 from rodjax.solving.first_poses import first_poses
 
 GRAVITY = (0.0, 3.0, -9.81)
@@ -251,15 +254,32 @@ def pulled(load: float) -> Harness:
     return Harness({"a": first, "b": second}, {"end": Body((0, load, 0), support=soft)})
 
 
-def test_a_batch_of_harnesses_is_each_of_them():
-    loads = [0.0, 0.5]
-    batch = rodjax.solve_batch([pulled(load) for load in loads], segments=4)
+def test_a_batch_of_harnesses_is_each_of_them(monkeypatch):
+    loads, names, solve = [0.0, 0.5, 0.25, 0.75, 1.0], set(), harness_path.solve_harness
+
+    def watched(*arguments, **options):
+        names.add(threading.current_thread().name)
+        time.sleep(0.05)  # so that no thread does all
+        return solve(*arguments, **options)
+
+    monkeypatch.setattr(harness_path, "solve_harness", watched)
+    batch = rodjax.solve_batch([pulled(load) for load in loads], segments=4, threads=2)
+    assert len(names) == 3  # the first begins
     assert jnp.all(batch.converged)
     for k, load in enumerate(loads):
         one = rodjax.solve(pulled(load), segments=4)
         # Bit by bit: the same program from the same start.
         assert np.array_equal(batch["b"].nodes[k], one["b"].nodes)
         assert batch.joints["cut"].position[k, 1] == one.joints["cut"].position[1]
+
+
+def test_of_a_batch_each_harness_that_did_not_converge_is_told():
+    first = rodjax.solve(pulled(0.0), segments=4)
+    harnesses = [pulled(load) for load in (0.0, 3.0, 4.0)]
+    with pytest.warns(rodjax.NotConvergedWarning) as told:
+        batch = rodjax.solve_batch(harnesses, segments=4, guess=first, solver=Newton(max_iterations=4), threads=2)
+    assert batch.converged.tolist() == [True, False, False]
+    assert len(told) == 2
 
 
 def test_steps_of_a_path_that_fail_are_halved():

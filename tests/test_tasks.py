@@ -57,6 +57,22 @@ def test_threads_that_wait_for_one_another_run_at_once():
     assert len(in_order(lambda k: barrier.wait(), [(k,) for k in range(6)], threads=3)) == 6
 
 
+def test_fewer_parts_than_threads_share_them():
+    """Else a part is not parted again; what is no part keeps to the threads that it was given."""
+
+    def threads(_):
+        return checked_threads(None)
+
+    assert in_order(threads, [(0,)], threads=3) == [3]
+    assert in_order(threads, [(0,), (1,)], threads=3) == [1, 1]
+    assert in_order(threads, [(0,), (1,)], threads=5) == [2, 2]
+    assert in_order(threads, PARTS, threads=5) == [1] * len(PARTS)
+    assert dict(as_completed(threads, iter([(0,)]), threads=3, count=1)) == {0: 3}
+    assert dict(as_completed(threads, iter([(0,)]), threads=3)) == {0: 1}
+    assert in_order(lambda k: in_order(threads, [(k,)]), [(0,)], threads=2) == [[2]]
+    assert checked_threads(5) == 5
+
+
 def test_a_part_that_fails_is_given_away_again():
     with Unreliable(lambda number: number in (0, 3, 4)) as engine:
         assert in_order(squared, PARTS, executor=engine) == SQUARES

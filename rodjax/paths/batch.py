@@ -43,6 +43,7 @@ from rodjax.solving.equilibrium import (
     solve_from,
 )
 from rodjax.solving.guess import Guess
+from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
 from rodjax.solving.ranges import check_ranges, with_ranges
@@ -62,6 +63,8 @@ LANES, ACCELERATOR_LANES = 8, 8192
 # by the last. The fewer in a call, the more threads share them, and the longer lanes idle at its end: 128 take 11 %
 # more time a scene than 1024, 256 take 6 %. What is prepared for a scene takes some 20 kB at 50 segments.
 CHUNKS = ((16, 16), (128, 128), (256, 4096), (1024, math.inf))
+# Of those that go one after another none is idle at the end.
+IN_TURN = 4
 ACCELERATOR_CHUNKS = ((1024, 1024), (8192, 8192), (65536, math.inf))
 
 
@@ -87,12 +90,12 @@ def solve_batch(
 
     - `scenes`: `Scene`s of one structure, or one `Scene` whose leaves have a leading axis; or sequences of `Scene`s of
         one length, each a path as for `rodjax.solve_path`, or one `Scene` with two leading axes, paths and steps; or
-        `Harness`es of one structure, or one `Harness` with a leading axis, which are solved one after another.
+        `Harness`es of one structure, or one `Harness` with a leading axis, each solved by itself.
     - `guess`: one for all scenes, or an `Equilibrium` with a leading axis, one for each, from which friction acts.
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
-    - `threads`: the most that share more than 256 scenes, without `mesh`; `None`: the environment variable
-        `RODJAX_THREADS`, or one for each core. The result is the same to the last bit whatever their number.
+    - `threads`: the most that share many scenes, without `mesh`; `None`: the environment variable `RODJAX_THREADS`,
+        or one for each core. The result is the same to the last bit whatever their number.
     - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
     - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
         scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.
@@ -106,10 +109,10 @@ def solve_batch(
         scenes = list(unstacked(scenes))
     if isinstance(scenes, (list, tuple)) and scenes and isinstance(scenes[0], Harness):
         if mesh is not None:
-            raise ValueError("mesh must be None for harnesses, which are solved one after another")
+            raise ValueError("mesh must be None for harnesses, each of which is solved by itself")
         numbers: dict[str, Any] = {"segments": segments, "rtol": rtol, "guess": guess, "strain_limit": strain_limit}
         how: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
-        return harness_batch(cast(Sequence[Harness], scenes), **numbers, **how)
+        return _of_harnesses(cast(Sequence[Harness], scenes), threads=threads, **numbers, **how)
     stacked = _stacked(cast(Sequence[Scene] | Sequence[Sequence[Scene]] | Scene, scenes))
     check_ranges(*not_differentiated(stacked))
     return solve_stack(
@@ -137,14 +140,13 @@ def solve_stack(
     **settings: Any,
 ) -> Any:
     """The same of stacked scenes of which some may have supports that are too far apart, as in a search; or of stacked
-    harnesses, one after another, of which no warning tells what is wrong with them.
+    harnesses, of which no warning tells what is wrong with them.
 
     `settings`: the other arguments of `solve_batch`.
     """
     if isinstance(stacked, Harness):
-        return harness_batch(
-            list(unstacked(stacked)), guess=guess, strain_limit=strain_limit, is_told=False, **settings
-        )
+        harnesses, how = list(unstacked(stacked)), {"strain_limit": strain_limit, "threads": threads}
+        return _of_harnesses(harnesses, guess=guess, is_told=False, **how, **settings)
     threads = checked_threads(threads)
     if mesh is not None:
         instance(mesh, "mesh", Mesh)
@@ -168,6 +170,16 @@ def solve_stack(
     if is_here(result):
         warn_of_outcome(result, strain_limit)
     return differentiable(stacked, result)
+
+
+def _of_harnesses(harnesses: Sequence[Harness], *, guess: Any, **options: Any) -> HarnessEquilibrium:
+    processor = None if is_on_processor() or not is_known(harnesses, guess) else _processor()
+    if processor is None:
+        return harness_batch(harnesses, guess=guess, **options)
+    # One at a time an accelerator only waits for its next small program.
+    with jax.default_device(processor):
+        harnesses, guess = jax.tree.map(np.asarray, (harnesses, guess))
+        return harness_batch(harnesses, guess=guess, **options)
 
 
 def _stacked(scenes: Sequence[Scene] | Sequence[Sequence[Scene]] | Scene) -> Scene:
@@ -222,10 +234,11 @@ def _in_chunks(
     devices = 1 if mesh is None else mesh.size
     share = -(-count // devices)
     lanes, chunk = lane_count(mesh), chunk_size(share, mesh)
-    is_traced = not is_known(scenes, guess)
-    if _go_in_turn(scenes, options) and not (is_traced or mesh is not None or is_on_processor()):
-        # One rod at a time an accelerator only waits for its next small program.
-        processor = _processor()
+    is_traced, is_in_turn = not is_known(scenes, guess), _go_in_turn(scenes, options)
+    if is_in_turn and mesh is None and is_on_processor():
+        chunk = IN_TURN
+    elif is_in_turn and mesh is None and not is_traced:
+        processor = _processor()  # see `_of_harnesses`
         if processor is not None:
             with jax.default_device(processor):
                 scenes, guess = jax.tree.map(np.asarray, (scenes, guess))
@@ -258,7 +271,10 @@ def _in_chunks(
     else:
         # Of several devices each call uses all; one accelerator has no room for many.
         at_once = 1 if mesh is not None else threads if is_on_processor() else min(threads, 2)
-        results = as_completed(solved, ((first,) for first in firsts), threads=at_once)
+        # A few that go one after another take less time by NumPy code than the compiler does.
+        results = as_completed(
+            solved, ((first,) for first in firsts), threads=at_once, by_numpy=is_in_turn, count=len(firsts)
+        )
         parts = {}
         with bar(count, "cases") as drawn:
             for k, part in results:
@@ -289,6 +305,8 @@ def _part(x: Array, first: int, last: int, size: int) -> Any:
     if last - first == size == len(x):
         return x
     if is_on_processor():
+        if last - first == size:
+            return np.asarray(x)[first:last]
         return np.asarray(x)[np.minimum(np.arange(first, first + size), last - 1)]
     if last - first == size:
         return jax.lax.dynamic_slice_in_dim(x, first, size)
@@ -299,10 +317,13 @@ def solve_first(scenes: Scene | Harness, guesses: Any, count: int, options: Opti
     """The first `count` of stacked scenes or harnesses, each from its guess, without derivatives; of the others nothing
     of use.
     """
-    if isinstance(scenes, Harness):
+    if isinstance(scenes, Harness) or _go_in_turn(scenes, options):
         first, begins = jax.tree.map(lambda x: np.asarray(x)[:count], (scenes, guesses))
-        numbers: dict[str, Any] = {"segments": options.segments, "solver": options.solver, "find": options.find}
-        found = solve_stack(first, begins, strain_limit=None, **numbers)
+        if isinstance(first, Harness):
+            numbers: dict[str, Any] = {"segments": options.segments, "solver": options.solver, "find": options.find}
+            found = solve_stack(first, begins, strain_limit=None, **numbers)
+        else:
+            found = _in_chunks(first, begins, DEFAULT_STRAIN_LIMIT, options, None, checked_threads(None))
         which = np.minimum(np.arange(len(guesses.energy)), count - 1)
         return jax.tree.map(lambda x: leaf(np.asarray(x)[which]), found)
     return _solve_many(scenes, guesses, np.array([count]), DEFAULT_STRAIN_LIMIT, options, None, lane_count())

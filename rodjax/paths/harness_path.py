@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from rodjax.checks import instance, is_known, leaf, namespace, sequence
 from rodjax.model.harness import Harness, harness_between
 from rodjax.programs.compilation import compiled
+from rodjax.programs.tasks import checked_threads, in_order
 from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
 from rodjax.solving.harness import finer_meshes, solve_harness, warn_of_harness
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -32,14 +33,14 @@ def harness_path(
     """See `rodjax.paths.path.solve_path`. All steps are on one mesh, refined until no step needs a finer one."""
     harnesses = _checked(harnesses, "path")
 
-    def steps(first: HarnessEquilibrium) -> list[HarnessEquilibrium]:
+    def steps(first: HarnessEquilibrium, _: Any) -> list[HarnessEquilibrium]:
         found = [first]
         for harness in harnesses[1:]:
             found.append(_step(found[-1], harness, segments=first.segments, **options))
         return found
 
     first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=guess, **options)
-    return _on_one_mesh(first, steps, segments, rtol, options)
+    return _on_one_mesh(first, steps, segments, rtol, options)[0]
 
 
 def harness_batch(
@@ -48,10 +49,14 @@ def harness_batch(
     segments: int | list[int] | None,
     rtol: float | None = None,
     guess: HarnessEquilibrium | None,
+    threads: int | None = None,
+    is_told: bool = True,
     **options: Any,
 ) -> HarnessEquilibrium:
-    """See `rodjax.paths.batch.solve_batch`: one after another, by one program, on one mesh."""
-    harnesses = _checked(harnesses, "batch")
+    """See `rodjax.paths.batch.solve_batch`: by one program, on one mesh, shared by threads;
+    `is_told`: whether warnings say what is wrong with the results.
+    """
+    harnesses, threads = _checked(harnesses, "batch"), checked_threads(threads)
     if guess is not None:
         instance(guess, "guess", HarnessEquilibrium)
         if guess.energy.shape not in ((), (len(harnesses),)):
@@ -60,14 +65,23 @@ def harness_batch(
     def begin(k: int) -> HarnessEquilibrium | None:
         return guess if guess is None or not guess.energy.ndim else jax.tree.map(lambda leaf: leaf[k], guess)
 
-    def all_of(first: HarnessEquilibrium) -> list[HarnessEquilibrium]:
-        found = [first]
-        for k, harness in enumerate(harnesses[1:], 1):
-            found.append(solve_harness(harness, segments=first.segments, guess=begin(k), **options))
-        return found
+    def all_of(first: HarnessEquilibrium, coarser: list[HarnessEquilibrium] | None) -> list[HarnessEquilibrium]:
+        def solved(k: int) -> HarnessEquilibrium:
+            guess = coarser[k] if coarser else begin(k)
+            return solve_harness(harnesses[k], segments=first.segments, guess=guess, is_told=False, **options)
 
-    first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=begin(0), **options)
-    return _on_one_mesh(first, all_of, segments, rtol, options)
+        others = range(1, len(harnesses))
+        if is_known(harnesses, guess):
+            parts = [(k,) for k in others]
+            return [first, *in_order(solved, parts, threads=threads, unit="harnesses", by_numpy=True)]
+        return [first, *map(solved, others)]
+
+    first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=begin(0), is_told=False, **options)
+    found, all_found = _on_one_mesh(first, all_of, segments, rtol, options)
+    if is_told and is_known(found.status):
+        for result in all_found:
+            warn_of_harness(result, options["strain_limit"], is_given=segments is not None)
+    return found
 
 
 def _checked(harnesses: Any, name: str) -> tuple[Harness, ...]:
@@ -100,18 +114,24 @@ def unstacked(stack: Any) -> Iterator[Any]:
 
 def _on_one_mesh(
     first: HarnessEquilibrium,
-    solved: Callable[[HarnessEquilibrium], list[HarnessEquilibrium]],
+    solved: Callable[[HarnessEquilibrium, list[HarnessEquilibrium] | None], list[HarnessEquilibrium]],
     segments: int | list[int] | None,
     rtol: float | None,
     options: dict[str, Any],
-) -> HarnessEquilibrium:
-    """All equilibria on the mesh of the first, refined until none needs a finer one, unless `segments` are given."""
+) -> tuple[HarnessEquilibrium, list[HarnessEquilibrium]]:
+    """All equilibria on the mesh of the first, refined until none needs a finer one, unless `segments` are given:
+    stacked, and each.
+
+    `solved`: those on a mesh, of which the first is known, and those on the mesh before.
+    """
     tolerance = DEFAULT_RTOL if rtol is None else checked_rtol(rtol)
     depths: dict[tuple[int, ...], Depth] = {}
+    each = None
     while True:
-        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *solved(first))
+        each = solved(first, each)
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
         if segments is not None or not is_known(found.status):
-            return found
+            return found, each
         counts, worst, _ = finer_meshes(found, tolerance, depths)
         if counts == first.segments:
             if worst > tolerance:
@@ -119,7 +139,7 @@ def _on_one_mesh(
                     f"the estimated error {worst:.1e} of a rod is above rtol = {tolerance:g} on the finest mesh",
                     NotConvergedWarning,
                 )
-            return found
+            return found, each
         first = solve_harness(first.harness, segments=counts, guess=first, **options)
 
 

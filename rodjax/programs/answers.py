@@ -56,7 +56,7 @@ class Program:
         self.answer = ANSWERS.number
         self.asked = ANSWERS.number, 1
         self.seconds_left = math.inf
-        self.lock = threading.Lock()
+        self.lock, self.writing = threading.Lock(), threading.Lock()
 
     def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
         code = self._code(args, options) if self.executable is None else None
@@ -83,10 +83,11 @@ class Program:
         is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
         if not ANSWERS.by_numpy or _here.is_compiled_only or not is_early or self.seconds_left <= 0:
             return None
-        if self.code is None:
-            with noted(PREPARING):
-                self._find_or_write_code(args, options)
-        return self.code
+        with self.writing:
+            if self.code is None and self.executable is None:
+                with noted(PREPARING):
+                    self._find_or_write_code(args, options)
+            return self.code
 
     def _find_or_write_code(self, args: tuple, options: dict[str, Any]) -> None:
         if self.name is not None:
@@ -221,10 +222,15 @@ class _Here(threading.local):
 _here = _Here()
 
 
+def is_compiled_only() -> bool:
+    """Whether this thread is within `compiled_only`."""
+    return _here.is_compiled_only
+
+
 @contextlib.contextmanager
-def compiled_only() -> Iterator[None]:
+def compiled_only(is_so: bool = True) -> Iterator[None]:
     """No NumPy code in this thread, as `numpy_first(False)` says for all of them."""
-    before, _here.is_compiled_only = _here.is_compiled_only, True
+    before, _here.is_compiled_only = _here.is_compiled_only, is_so
     try:
         yield
     finally:

@@ -6,6 +6,7 @@ of one type.
 """
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import pickle
@@ -23,7 +24,7 @@ from jaxtyping import Int
 from rodjax.checks import line, shown, whole_number
 from rodjax.notes import bar
 from rodjax.programs import kept
-from rodjax.programs.answers import compiled_only
+from rodjax.programs.answers import compiled_only, is_compiled_only
 from rodjax.version import __version__
 
 # The environment variable: the most threads.
@@ -51,9 +52,11 @@ class Workers(NamedTuple):
 
 
 class _Here(threading.local):
-    """Whether this thread is at a part of some work, which is not parted again."""
+    """How many threads what this thread is at may use, `None` for as many as there are cores: a single one where that
+    is a part of some work.
+    """
 
-    is_at_part = False
+    threads: int | None = None
 
 
 _here = _Here()
@@ -66,8 +69,8 @@ def checked_threads(threads: Any) -> int:
     """
     if threads is not None:
         return whole_number(threads, "threads", 1, MOST_THREADS)
-    if _here.is_at_part:
-        return 1
+    if _here.threads is not None:
+        return _here.threads
     text = os.environ.get(VARIABLE, "").strip()
     if not text:
         return _cores()
@@ -105,15 +108,19 @@ def in_order(
     executor: Executor | None = None,
     threads: int | None = None,
     unit: str = "parts",
+    by_numpy: bool = False,
 ) -> list[Any]:
     """What `function` gives for each of the parts, in their order: see `as_completed`; a bar counts them by `unit`. A
-    single part is done here as if it were no part, by NumPy code too, unless there is an executor.
+    single part is done here as if it were no part, by NumPy code too, and uses the threads itself, unless there is an
+    executor.
     """
     if executor is None and len(parts) == 1:
-        return [function(*parts[0])]
+        with _limited_to(checked_threads(threads)):
+            return [function(*parts[0])]
     found = {}
     with bar(len(parts), unit) as drawn:
-        for number, one in as_completed(function, parts, executor=executor, threads=threads):
+        workers: dict[str, Any] = {"executor": executor, "threads": threads, "by_numpy": by_numpy}
+        for number, one in as_completed(function, parts, **workers, count=len(parts)):
             found[number] = one
             drawn.update()
     return [found[number] for number in range(len(found))]
@@ -125,6 +132,8 @@ def as_completed(
     *,
     executor: Executor | None = None,
     threads: int | None = None,
+    by_numpy: bool = False,
+    count: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """The number of each part and `function(*part)`, as they are done.
 
@@ -134,30 +143,36 @@ def as_completed(
     - `parts`: tuples of arguments; each is made when it is needed. A bounded number of them is under way.
     - `executor`: the engine, which gets arrays as NumPy's and gives such back; `None`: `threads` of this process.
 
-    Programs run compiled, never as NumPy code. Raises what `function` raises where that would happen everywhere
+    - `count`: how many parts there are, where that is known: of more threads each part uses its share.
+    - `by_numpy`: whether threads may run programs as NumPy code for a first answer, which suits few short parts.
+
+    Otherwise programs run compiled. Raises what `function` raises where that would happen everywhere
     (`FINAL`); `TaskError` where an engine fails a part more than `RETRIES` times, or takes no more of them.
     """
     if executor is not None:
         return _by_engine(function, parts, executor)
-    count = checked_threads(threads)
-    return _by_threads(function, parts, count) if count > 1 else _one_by_one(function, parts)
+    at_once = checked_threads(threads)
+    of_part = max(at_once // count, 1) if count else 1
+    done = functools.partial(_part_done, function, threads=of_part, by_numpy=by_numpy)
+    return (_by_threads if at_once > 1 else _one_by_one)(done, parts, at_once)
 
 
-def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple]) -> Iterator[tuple[int, Any]]:
+def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple], _: int = 1) -> Iterator[tuple[int, Any]]:
     for number, part in enumerate(parts):
-        yield number, _part_done(function, part)
+        yield number, function(*part)
 
 
 def inherited() -> Callable[[], contextlib.AbstractContextManager]:
-    """What holds in this thread, for threads that it starts to enter: that it is at a part, precision and device."""
-    is_at_part, is_double = _here.is_at_part, jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    """What holds in this thread, for threads that it starts to enter: its share of the work, precision and device."""
+    threads, is_compiled = _here.threads, is_compiled_only()
+    is_double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     @contextlib.contextmanager
     def entered() -> Iterator[None]:
         with contextlib.ExitStack() as stack:
-            if is_at_part:
-                stack.enter_context(_at_part())
+            stack.enter_context(_limited_to(threads))
+            stack.enter_context(compiled_only(is_compiled))
             if is_double != jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
                 stack.enter_context(jax.enable_x64(is_double))
             if device != jax.config.jax_default_device:  # pyright: ignore[reportAttributeAccessIssue]
@@ -168,17 +183,16 @@ def inherited() -> Callable[[], contextlib.AbstractContextManager]:
 
 
 @contextlib.contextmanager
-def _at_part() -> Iterator[None]:
-    before, _here.is_at_part = _here.is_at_part, True
+def _limited_to(threads: int | None) -> Iterator[None]:
+    before, _here.threads = _here.threads, threads
     try:
-        with compiled_only():
-            yield
+        yield
     finally:
-        _here.is_at_part = before
+        _here.threads = before
 
 
-def _part_done(function: Callable[..., Any], part: tuple) -> Any:
-    with _at_part():
+def _part_done(function: Callable[..., Any], *part: Any, threads: int = 1, by_numpy: bool = False) -> Any:
+    with _limited_to(threads), compiled_only(is_compiled_only() or not by_numpy):
         return function(*part)
 
 
@@ -195,7 +209,7 @@ def _by_threads(function: Callable[..., Any], parts: Iterable[tuple], count: int
             yield from _one_by_one(function, parts)
             return
         yield from _collected(
-            lambda part: pool.submit(within, _part_done, function, part), parts, UNDER_WAY_A_THREAD * count, retries=0
+            lambda part: pool.submit(within, function, *part), parts, UNDER_WAY_A_THREAD * count, retries=0
         )
 
 
@@ -312,7 +326,7 @@ def _done_elsewhere(
             stack.enter_context(jax.enable_x64(surroundings.is_double))
         leaves, tree = jax.tree.flatten(part)
         leaves = [jax.device_put(leaf) if is_jax else leaf for leaf, is_jax in zip(leaves, are_jax, strict=True)]
-        return _as_numpy(_part_done(function, jax.tree.unflatten(tree, leaves)))
+        return _as_numpy(_part_done(function, *jax.tree.unflatten(tree, leaves)))
 
 
 def _as_numpy(values: Any) -> Any:

@@ -20,7 +20,7 @@ from rodjax.notes import bar
 from rodjax.paths.batch import chunk_size, lane_count, solve_stack
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.compilation import compiled
-from rodjax.programs.tasks import Workers, as_completed, rows_of
+from rodjax.programs.tasks import Workers, as_completed, in_order, rows_of
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
 from rodjax.solving.harness_derivatives import jacobian
@@ -143,9 +143,9 @@ class Scattering(eqx.Module):
         options["find"] = "minimum" if bool(self.equilibrium.stable) else "equilibrium"
         parts = ((self, zs[rows_of(first, size, total)], options) for first in range(0, total, size))
         if workers.executor is None and total <= size:  # no parts, and so by NumPy code at first
-            results: Iterable[tuple[int, Any]] = enumerate(_solved_part(*part) for part in parts)
+            results: Iterable[tuple[int, Any]] = enumerate(in_order(_solved_part, [*parts], threads=workers.threads))
         else:
-            results = as_completed(_solved_part, parts, **workers._asdict())
+            results = as_completed(_solved_part, parts, **workers._asdict(), count=-(-total // size))
         with bar(total, "cases") as drawn:
             for number, part in results:
                 drawn.update(min(size, total - number * size))

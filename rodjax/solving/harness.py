@@ -127,11 +127,8 @@ def solve_harness(
             result = _refined(
                 result, tuple(all_options), DEFAULT_RTOL if tolerance is None else tolerance, strain_limit
             )
-        elif is_told:
-            for group in result.groups:
-                warn_if_coarse(group)
         if is_told:
-            warn_of_harness(result, strain_limit)
+            warn_of_harness(result, strain_limit, is_given=segments is not None)
     return result if fixed is harness else differentiable_harness(harness, result)
 
 
@@ -186,8 +183,11 @@ def _of_one_rod(result: HarnessEquilibrium) -> Equilibrium:
     )
 
 
-def warn_of_harness(result: HarnessEquilibrium, strain_limit: Any) -> None:
-    """Outside `jit`, what is wrong with the result."""
+def warn_of_harness(result: HarnessEquilibrium, strain_limit: Any, *, is_given: bool = False) -> None:
+    """Outside `jit`, what is wrong with the result; `is_given`: whether its mesh was, which may be too coarse."""
+    if is_given:
+        for group in result.groups:
+            warn_if_coarse(group)
     if not bool(result.converged):
         warn(result.in_words().splitlines()[0], NotConvergedWarning)
         return

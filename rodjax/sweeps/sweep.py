@@ -182,7 +182,8 @@ def _swept(
     done = manifest.rows - sum(len(manifest.cases_of(chunk)) for chunk in missing)
     with bar(manifest.rows, "cases", done) as drawn:
         try:
-            for k, solved in as_completed(solved_chunk, tasks, executor=executor, threads=threads):
+            workers = {"executor": executor, "threads": threads, "count": len(missing)}
+            for k, solved in as_completed(solved_chunk, tasks, **workers):
                 _write(_part(parts, missing[k]), solved)
                 drawn.update(len(solved["case"]))
         except TaskError as error:

@@ -53,8 +53,8 @@ def harness_batch(
     is_told: bool = True,
     **options: Any,
 ) -> HarnessEquilibrium:
-    """See `rodjax.paths.batch.solve_batch`: by one program, on one mesh, shared by threads;
-    `is_told`: whether warnings say what is wrong with the results.
+    """See `rodjax.paths.batch.solve_batch`: by one program, on one mesh, shared by threads; `is_told`: whether
+    warnings say what is wrong with the results.
     """
     harnesses, threads = _checked(harnesses, "batch"), checked_threads(threads)
     if guess is not None:
@@ -67,7 +67,7 @@ def harness_batch(
 
     def all_of(first: HarnessEquilibrium, coarser: list[HarnessEquilibrium] | None) -> list[HarnessEquilibrium]:
         def solved(k: int) -> HarnessEquilibrium:
-            guess = coarser[k] if coarser else begin(k)
+            guess = coarser[k] if coarser and bool(coarser[k].converged) else begin(k)
             return solve_harness(harnesses[k], segments=first.segments, guess=guess, is_told=False, **options)
 
         others = range(1, len(harnesses))

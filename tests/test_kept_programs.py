@@ -17,11 +17,11 @@ import rodjax as rj
 from rodjax.programs import kept
 from rodjax.programs.compilation import compiled
 
-# Solves, and says how many programs were traced and compiled for that and where the rod is. Under a moment LAPACK takes
-# part.
+# Solves, inverts a matrix by LAPACK, and says how many programs were traced and compiled for that and what was found.
 SCRIPT = """
 import jax; jax.config.update("jax_enable_x64", True)
-import rodjax as rj
+import numpy as np, rodjax as rj
+from rodjax.programs.compilation import compiled as by_program
 traced, compiled = [0], [0]
 def listen(name, *_, **more):
     compiled[0] += name.endswith("backend_compile_duration")
@@ -29,7 +29,11 @@ def listen(name, *_, **more):
 jax.monitoring.register_event_duration_secs_listener(listen)
 clamp = rj.Clamp((0, 0, 0), rj.frame(tangent=(1, 0, 0)))
 result = rj.solve(rj.Scene(rj.Rod(1.0, 1.0, 1.0, 1e4), clamp, rj.Free(moment=(0.1, 0.2, 0.3))), segments=4)
-print(traced[0], compiled[0], result.nodes.tolist())
+def inverse(matrix):
+    return jax.numpy.linalg.inv(matrix)
+inverse.__module__ = "rodjax.example"
+found = by_program(inverse)(np.diag([2.0, 4.0]))
+print(traced[0], compiled[0], result.nodes.tolist(), found.tolist())
 """
 
 
@@ -76,6 +80,7 @@ def test_another_process_neither_traces_nor_compiles(tmp_path, first):
     assert again == 0
     # Where an executable calls LAPACK, JAX prepares that by tracing a call of its own.
     assert traced_again == (first == "off")
+    assert "[0.5, 0.0]" in there
     assert there == here
     assert {path.suffix for path in tmp_path.iterdir()} == {".program" if first == "off" else ".numpy"}
 

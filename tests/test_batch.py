@@ -156,6 +156,15 @@ def test_side_by_side_as_on_an_accelerator(monkeypatch):
     assert any(on)
 
 
+def test_harnesses_go_to_the_processor_where_there_is_an_accelerator(monkeypatch):
+    scene, cut = random_scenes(1)[0], rj.Joint("cut", np.eye(3))
+    harness = rj.Harness({"a": Scene(scene.rod, scene.start, cut), "b": Scene(scene.rod, cut, scene.end)})
+    monkeypatch.setattr(batch, "harness_batch", lambda harnesses, **_: jax.config.jax_default_device)
+    assert batch.solve_batch([harness]) is None
+    monkeypatch.setattr(batch, "is_on_processor", lambda mesh=None: False)
+    assert batch.solve_batch([harness]).platform == "cpu"
+
+
 def test_what_fills_up_a_chunk_is_not_solved():
     scenes = batch._stacked(random_scenes(5))
 

@@ -63,7 +63,7 @@ LANES, ACCELERATOR_LANES = 8, 8192
 # by the last. The fewer in a call, the more threads share them, and the longer lanes idle at its end: 128 take 11 %
 # more time a scene than 1024, 256 take 6 %. What is prepared for a scene takes some 20 kB at 50 segments.
 CHUNKS = ((16, 16), (128, 128), (256, 4096), (1024, math.inf))
-# Of those that go one after another none is idle at the end.
+# The same of scenes that go one after another, of which none waits at the end.
 IN_TURN = 4
 ACCELERATOR_CHUNKS = ((1024, 1024), (8192, 8192), (65536, math.inf))
 
@@ -95,7 +95,8 @@ def solve_batch(
     - `mesh`: a `jax.sharding.Mesh` of one axis whose devices share the scenes; `None`: JAX's default device. Over
         several processes every one of them passes the same scenes, as many as the devices or a multiple.
     - `threads`: the most that share many scenes, without `mesh`; `None`: the environment variable `RODJAX_THREADS`,
-        or one for each core. The result is the same to the last bit whatever their number.
+        or one for each core. The result of compiled programs (`rodjax.numpy_first`) is the same to the last bit
+        whatever their number.
     - `progress`: whether a bar on stderr tells of it; `None`: in a terminal or notebook, after 2 s.
     - `segments`, `rtol`, `discretization`, `solver`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`. All
         scenes have one mesh: where the estimated error of any is above `rtol`, all are solved on a finer one.

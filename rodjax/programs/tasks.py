@@ -154,10 +154,10 @@ def as_completed(
     at_once = checked_threads(threads)
     of_part = max(at_once // count, 1) if count else 1
     done = functools.partial(_part_done, function, threads=of_part, by_numpy=by_numpy)
-    return (_by_threads if at_once > 1 else _one_by_one)(done, parts, at_once)
+    return _by_threads(done, parts, at_once) if at_once > 1 else _one_by_one(done, parts)
 
 
-def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple], _: int = 1) -> Iterator[tuple[int, Any]]:
+def _one_by_one(function: Callable[..., Any], parts: Iterable[tuple]) -> Iterator[tuple[int, Any]]:
     for number, part in enumerate(parts):
         yield number, function(*part)
 

@@ -4,8 +4,8 @@ Random harnesses: stars, trees, loops, rods with a branch that hangs freely, sin
 round, flat, curved at rest or twisted at rest, 2 to some 50 % longer than their chords, w L^3/EI 1 to 300; joints have
 offsets, masses, forces, dead moments, and supports of every kind; some rods have a clip; a quarter of the harnesses
 lie over a floor, half of these over a pipe too; in some all rods may touch. With `--sliding` more rods have clips,
-through which they slide, and nothing is touched; with `--follower` half of the rods bear forces that follow them or
-couples. Prints a line a harness, and how many converge.
+through which they slide, and do not touch one another; with `--follower` half of the rods bear forces that follow them
+or couples. Prints a line a harness, and how many converge.
 """
 
 import argparse
@@ -137,7 +137,7 @@ def harness_of(seed: int, *, slides: bool, follower: bool = False) -> tuple[str,
         joints[name] = drawn.body(at[name], support)
         told += [] if support is None else [support]
     obstacles: list[Any] = []
-    if not slides and drawn.chance(0.25):
+    if drawn.chance(0.25):
         obstacles = [rj.Plane((min(place[2] for place in at.values()) - 0.02 - random.uniform(0, 0.1)) * UP, UP)]
         middle, half = np.array([0.5, 0.5, 0.0]) + 0.1 * random.normal(size=3), 0.6 * drawn.near(ACROSS, 0.3)
         pipe = rj.Capsule(middle - half, middle + half, random.uniform(0.01, 0.05))
@@ -154,6 +154,8 @@ def harness_of(seed: int, *, slides: bool, follower: bool = False) -> tuple[str,
         if last != "f" and drawn.chance(0.4 if slides else 0.15):
             part, aside = random.uniform(0.3, 0.7), np.sqrt(1 - np.linalg.norm(chord) / length)
             place = at[first] + part * chord + 0.1 * length * aside * random.normal(size=3)
+            # Not below the floor, as no joint is.
+            place += max(0.0, float(obstacles[0].point[2]) + 0.02 - place[2]) * UP if obstacles else 0.0
             tangent = {} if drawn.chance(0.6) else {"tangent": drawn.near(chord, 0.3)}
             clips = [rj.Clip(part * length, place, sliding=slides, **tangent)]
             kind += " in a clip"

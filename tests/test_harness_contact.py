@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rodjax
-from rodjax import Clamp, Harness, Joint, Newton, Plane, Potential, Rod, Scene
+from rodjax import Clamp, Free, Harness, Joint, Newton, Plane, Potential, Rod, Scene
 from rodjax.solving import assembly
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -205,3 +205,98 @@ def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
     result = rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=5, solver=TIGHT)
     assert result.converged
     assert result.iterations > 3
+
+
+# --- friction --------------------------------------------------------------------------------------------------------
+
+ROUGH = Plane((0, 0, -0.005), (0, 0, 1), friction=0.3)
+DRAWN = [(0.0, 0.0), (-0.02, 0.0), (-0.03, 0.05), (0.0, 0.06)]  # where the upper end is
+
+
+def lowered(x, y) -> tuple[Scene, Harness]:
+    """A cable that hangs down to a rough floor, and the same with a joint above that."""
+
+    def rod(length: float) -> Rod:
+        return Rod(length, 0.01, 0.008, 100.0, 0.1, radius=0.005)
+
+    start, joint, gravity = Clamp((x, y, 0.42), rodjax.frame((1, 0, -2))), Joint("cut", **ASIDE), (0, 0, -10.0)
+    hanging = Scene(rod(0.5), start, joint, gravity)
+    lying = Scene(rod(0.5), joint, Free(), gravity, obstacles=[ROUGH])
+    return Scene(rod(1.0), start, Free(), gravity, obstacles=[ROUGH]), Harness({"a": hanging, "b": lying})
+
+
+@pytest.fixture(scope="module")
+def drawn() -> rodjax.HarnessEquilibrium:
+    return rodjax.solve_path([lowered(*place)[1] for place in DRAWN], segments=8, solver=TIGHT)
+
+
+def test_a_cut_rod_sticks_and_slips_as_the_rod(drawn):
+    whole = rodjax.solve_path([lowered(*place)[0] for place in DRAWN], segments=16, solver=TIGHT)
+    assert np.all(drawn.converged)
+    nodes = jnp.concatenate([drawn["a"].nodes, drawn["b"].nodes[:, 1:]], axis=1)
+    # Residuals of 1e-11 EI/L^2.
+    np.testing.assert_allclose(nodes, whole.nodes, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(drawn["b"].friction_forces, whole.friction_forces[:, :, 8:], rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(drawn["b"].contact_states, whole.contact_states[:, :, 8:])
+    # From rest without friction; then some stick and others slip.
+    assert not np.any(drawn["b"].friction_forces[0])
+    assert {0, 1, 2} <= set(np.ravel(drawn["b"].contact_states[1:]).tolist())
+
+
+def test_slips_are_counted_from_the_guess_and_come_back_from_a_file(drawn, tmp_path):
+    last = jax.tree.map(lambda leaf: leaf[2], drawn)
+    rodjax.save(last, tmp_path / "drawn.vtkhdf")
+    harness = lowered(*DRAWN[3])[1]
+    for guess in (last, rodjax.load(tmp_path / "drawn.vtkhdf")):
+        found = rodjax.solve(harness, segments=8, solver=TIGHT, guess=guess)
+        np.testing.assert_allclose(found["b"].friction_forces, drawn["b"].friction_forces[3], rtol=0, atol=1e-10)
+    batch = rodjax.solve_batch([harness, harness], segments=8, solver=TIGHT, guess=last)
+    np.testing.assert_allclose(batch["b"].friction_forces[1], drawn["b"].friction_forces[3], rtol=0, atol=1e-10)
+
+
+def test_obstacles_with_friction_stay_along_paths():
+    harness = lowered(0.0, 0.0)[1]
+    raised = eqx.tree_at(lambda harness: harness.scenes[1].obstacles[0].point, harness, jnp.array([0.0, 0.0, 0.01]))
+    with pytest.raises(ValueError, match=r"cables\['b'\]\.obstacles\[0\] must stay the same along a path"):
+        rodjax.solve_path([harness, raised])
+
+
+@pytest.mark.parametrize(
+    "take",
+    [
+        lambda result: rodjax.route(result.harness, []),
+        lambda result: rodjax.tolerances(result, []),
+        lambda result: rodjax.Experiment(result.harness, []),
+    ],
+)
+def test_what_is_no_path_refuses_friction(drawn, take):
+    with pytest.raises(ValueError, match=r"cables\['b'\]\.obstacles\[0\]\.friction must be 0 in .* along a path only"):
+        take(jax.tree.map(lambda leaf: leaf[2], drawn))
+
+
+@pytest.mark.slow
+def test_a_finer_mesh_has_the_memory_of_the_step(drawn):
+    """Slips are counted from the guess, not from the equilibrium on the coarse mesh, where nothing would be drawn."""
+    last = jax.tree.map(lambda leaf: leaf[2], drawn)
+    finer = rodjax.solve(lowered(*DRAWN[3])[1], rtol=1e-3, guess=last)
+    assert finer.segments != [8, 8]
+    found, coarse = (result.sum(1)[0] for result in (finer["b"].friction_forces, drawn["b"].friction_forces[3]))
+    # A node sticks or slips as a whole: of nine that lie, one more or less.
+    np.testing.assert_allclose(found, coarse, rtol=0, atol=0.15 * float(jnp.linalg.norm(coarse)))
+
+
+@pytest.mark.slow
+def test_derivatives_with_friction_are_those_of_a_step(drawn):
+    last = jax.tree.map(lambda leaf: leaf[1], drawn)
+
+    def pulled(x):
+        found = rodjax.solve(lowered(x, jnp.array(0.05))[1], segments=8, solver=TIGHT, guess=last)
+        return jnp.stack(
+            [found["a"].start_force[0], found["b"].nodes[-1, 1], found["b"].friction_forces[0, :, 1].sum()]
+        )
+
+    x, step = jnp.array(-0.03), 1e-6
+    _, change = jax.jvp(pulled, (x,), (jnp.array(1.0),))
+    differences = (pulled(x + step) - pulled(x - step)) / (2 * step)
+    # Differences of results that are off by 1e-11, over a step of 1e-6.
+    np.testing.assert_allclose(change, differences, rtol=1e-5, atol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from test_harness import ASIDE, END, GRAVITY, START, bent, plain
 
 import rodjax
-from rodjax import Body, Clamp, Clip, Free, Harness, Joint, Newton, Plane, PointForce, Scene, Spring
+from rodjax import Body, Clamp, Clip, DistributedForce, Free, Harness, Joint, Newton, PointForce, Scene, Sphere, Spring
 
 JOINT = Joint("cut", **ASIDE)
 PLACE = (0.12, 0.02, -0.25)
@@ -106,12 +106,34 @@ def test_paths_batches_and_files_have_where_the_rod_passes_its_clips(tmp_path):
     assert abs(any_kind["a"].scene.clips[0].at - at) < 1e-6
 
 
+@pytest.mark.parametrize(
+    "loads",
+    [
+        {"obstacles": [Sphere((0.182, 0.056, -0.37), 0.03)]},
+        pytest.param({"distributed": [DistributedForce((0.0, 0.3, 0.0), follower=True)]}, marks=pytest.mark.slow),
+    ],
+    ids=["over a ball", "under a follower force"],
+)
+def test_a_rod_of_a_harness_slides_as_between_clamps(loads):
+    """Where the joint was found, from another start; and the joint is in balance."""
+    parts = rodjax.solve(cut(plain, Clip(0.25, PLACE, sliding=True), **loads), segments=8, solver=TIGHT)
+    assert parts.converged
+    assert parts.stable or "distributed" in loads
+    alone = rodjax.solve(parts["a"].scene, segments=8, solver=TIGHT)
+    assert alone.converged
+    # Residuals of 1e-11 EI/L^2.
+    assert abs(alone.scene.clips[0].at - parts["a"].scene.clips[0].at) < 1e-9
+    np.testing.assert_allclose(alone.nodes, parts["a"].nodes, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(alone.contact_forces, parts["a"].contact_forces, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(parts["a"].end_force, parts["b"].start_force, rtol=0, atol=1e-9)
+    if "obstacles" in loads:
+        assert jnp.linalg.norm(parts["a"].contact_forces.sum(0)) > 0.1
+    along = parts["a"].clip_forces[0] @ parts["a"].tangents[jnp.argmin(jnp.abs(parts["a"].s - alone.scene.clips[0].at))]
+    assert abs(along) < 1e-8 * jnp.linalg.norm(parts["a"].clip_forces[0])
+
+
 def test_what_does_not_slide_in_a_harness_is_told():
     clip = Clip(0.25, PLACE, sliding=True)
-    with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide .* obstacles, fields or loads"):
-        cut(plain, clip, obstacles=[Plane((0, 0, -1), (0, 0, 1))])
-    with pytest.raises(ValueError, match=r"clips must not slide .*, or it may touch itself"):
-        cut(plain, clip, self_contact=True)
     other = Scene(plain(1.0), Clamp((0, 0.5, 0), rodjax.frame((1, 0, 0))), Free())
     scenes = cut(plain, clip)
     with pytest.raises(ValueError, match=r"cables\['a'\]\.clips must not slide, as it may touch another cable"):

@@ -44,7 +44,7 @@ from rodjax.discretization.node_contacts import (
     relaxation,
     shares,
 )
-from rodjax.discretization.node_friction import with_friction
+from rodjax.discretization.node_friction import travelled, with_friction
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.potentials import OnElements, PointForces
 from rodjax.discretization.self_contact import comes_through, wide_cells
@@ -203,11 +203,14 @@ class NodalForm(PositionForm):
         """L with the energy of contacts as soft as `MERIT_COMPLIANCE`, with the pressures after the step."""
         assert here.gaps is not None
         model = contact_model(self, point, here.gaps, here.reference_displacements)
-        return here.energy + self._merit_of_contacts(model, others)
+        return here.energy + _merit_of_contacts(model, others)
 
     def contact_energy(self, there: Any, point: Any, others: NodalChange) -> Float[Array, ""]:
         """That in `objective`, at a trial of a step from `point`."""
-        return self._merit_of_contacts(contact_model(self, point, self.gaps(there), None), others)
+        nodal, displacements = there.nodal, None
+        if nodal.friction is not None:
+            displacements = travelled(self, nodal.positions, nodal.friction)
+        return _merit_of_contacts(contact_model(self, point, self.gaps(there), displacements), others)
 
     def gaps(self, point: Any) -> Float[Array, "k n+1"]:
         """In the rows of pressures."""
@@ -218,10 +221,6 @@ class NodalForm(PositionForm):
             return gaps
         far = contacts_with_itself(self, point, point.nodal.pressures[-1])
         return jnp.concatenate([gaps, far.gaps[None]])
-
-    def _merit_of_contacts(self, model: Unilateral, others: NodalChange) -> Float[Array, ""]:
-        pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE
-        return model.energy(pushing, jnp.asarray(MERIT_COMPLIANCE, pushing.dtype))
 
     def half_square(self, here: Linearization) -> Float[Array, ""]:
         assert isinstance(here.system, ChainSystem)
@@ -238,22 +237,9 @@ class NodalForm(PositionForm):
             return super().sought(here, point, system, push)
         moments, c = self.without_contacts(here, nodal.contact_forces)
         contacts = contact_model(self, point, here.gaps, here.reference_displacements)
-        is_closed = system.contacts.is_closed
-        if nodal.friction is None:
-            is_closed = self.first_closed(is_closed, contacts)
-        else:
-            k = len(here.gaps)
-            # What slips, and by how much, is a matter of the model.
-            trial = contacts.pressures - contacts.gaps / system.contacts.contact_compliance
-            sticks = contacts.is_closed(trial)[k:]
-            is_closed = jnp.concatenate([is_closed[:k] | (contacts.gaps[:k] < LIES_ON), sticks])
-        system = system.closed_where(is_closed)
+        system = first_closed(system, contacts)
         found = minimized(system, push + moments, c, contacts)
         return found.is_minimum, found.x, found.y
-
-    def first_closed(self, is_closed: Bool[Array, "k n+1"], contacts: Unilateral) -> Bool[Array, "k n+1"]:
-        """The first guess of the closed contacts: a node that lies on an obstacle without pressure counts as closed."""
-        return is_closed | (contacts.gaps < LIES_ON)
 
     def without_contacts(
         self, here: Linearization, forces: Float[Array, "r n+1"]
@@ -324,6 +310,25 @@ class NodalForm(PositionForm):
         if not has_contacts(self.scene):
             return floor
         return floor + FLOOR_SAFETY * jnp.finfo(floor.dtype).eps * GAP_WEIGHT
+
+
+def first_closed(system: ChainSystem, contacts: Unilateral) -> ChainSystem:
+    """With the first guess of the closed contacts; a node that lies on an obstacle without pressure counts as closed.
+
+    What slips, and by how much, is a matter of the model of a step.
+    """
+    is_closed, rough = system.contacts.is_closed, 0 if contacts.bounds is None else 3 * len(contacts.bounds)
+    k = len(is_closed) - rough
+    is_closed = is_closed.at[:k].set(is_closed[:k] | (contacts.gaps[:k] < LIES_ON))
+    if rough:
+        trial = contacts.pressures - contacts.gaps / system.contacts.contact_compliance
+        is_closed = is_closed.at[k:].set(contacts.is_closed(trial)[k:])
+    return system.closed_where(is_closed)
+
+
+def _merit_of_contacts(model: Unilateral, others: NodalChange) -> Float[Array, ""]:
+    pushing = model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE
+    return model.energy(pushing, jnp.asarray(MERIT_COMPLIANCE, pushing.dtype))
 
 
 def held_back(system: ChainSystem, shift: Float[Array, ""]) -> ChainSystem:

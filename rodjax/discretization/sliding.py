@@ -25,6 +25,7 @@ from rodjax.discretization.edges import EdgeTangents
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.forms import form_of, form_on
+from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.nodes import LEAST_ELEMENT, varying
 from rodjax.discretization.shape import Shape
@@ -33,7 +34,7 @@ from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
 from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
 from rodjax.model.along import Along
 from rodjax.model.scene import Scene, has_contacts, slid, sliding_arclengths
-from rodjax.model.supports import Support
+from rodjax.model.supports import Free, Support
 
 # The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
 # pass, as it then has a node of its own no more.
@@ -88,15 +89,19 @@ class SlidingForm(Form):
         if not isinstance(form, PositionForm):
             return form
         assert isinstance(self.first, PositionForm)
-        return dataclasses.replace(form, closed=self.first.closed)
+        return dataclasses.replace(form, closed=self.first.closed, pushed=self.first.pushed)
 
-    def between(self, ends: tuple[Support, Support]) -> "SlidingForm":
-        """Of the rod between other supports of the same kinds."""
+    def between(self, ends: tuple[Support, Support], pushed: Bool[Array, "2"]) -> "SlidingForm":
+        """Of the rod between other supports of the same kinds; `pushed`: as of `PositionForm`."""
 
         def with_ends(scene: Scene) -> Scene:
-            return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, ends)
+            # Another one may bear a part of the load on its end.
+            own = scene.start, scene.end
+            both = tuple(end if isinstance(end, Free) else new for end, new in zip(own, ends, strict=True))
+            return eqx.tree_at(lambda scene: (scene.start, scene.end), scene, both)
 
         first = eqx.tree_at(lambda form: form.scene, self.first, with_ends(self.first.scene))
+        first = dataclasses.replace(first, pushed=pushed) if isinstance(first, NodalForm) else first
         return dataclasses.replace(self, scene=with_ends(self.scene), made=with_ends(self.made), first=first)
 
     def _fixed(self, arclengths: Float[Array, "j"]) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
@@ -353,6 +358,11 @@ class SlidingForm(Form):
     def objective(self, here: Any, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
         of_inner = self.at(here.arclengths).objective(here.at_arclengths, point.inner, others.others)
         return of_inner - point.excess_at(here.arclengths)
+
+    def contact_energy(self, there: SlidingPoint, point: SlidingPoint, others: SlidingChange) -> Float[Array, ""]:
+        form = self.at(there.arclengths)
+        assert isinstance(form, NodalForm)
+        return form.contact_energy(there.inner, point.inner, others.others)
 
     def lagrangian(self, point: SlidingPoint) -> tuple[Float[Array, ""], Float[Array, "c"]]:
         return self.at(point.arclengths).lagrangian(point.inner)

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from rodjax.checks import instance, is_known, leaf, number_array, number_list, one_of, positive, shown, vector
-from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, check_without_friction
+from rodjax.model.harness import Harness, check_without_friction
+from rodjax.model.scene import Scene
 from rodjax.model.supports import frame, rotate
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.guess import Guess
@@ -374,8 +374,7 @@ class Experiment(eqx.Module):
         length = (scene.scenes[0] if isinstance(scene, Harness) else scene).rod.length
         if length.ndim:
             raise ValueError(f"scene must be a single one, got a stack of shape {length.shape}")
-        if isinstance(scene, Scene):  # rods of harnesses have none
-            check_without_friction(scene, "an Experiment")
+        check_without_friction(scene, "an Experiment")
         measured = (measured,) if isinstance(measured, Measurement) else tuple(measured)
         if not measured:
             raise ValueError("measured must hold at least one measurement, got none")

@@ -152,7 +152,10 @@ def _clipped(forces: Float[Array, "f 3 n+1"], bounds: Float[Array, "f n+1"]) -> 
 
 
 def _lengths(vectors: Float[Array, "f 3 n+1"]) -> Float[Array, "f n+1"]:
-    return jnp.sqrt(jnp.sum(vectors**2, axis=1))
+    squares = jnp.sum(vectors**2, axis=1)
+    is_zero = squares == 0
+    # With the derivative 0 at 0.
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squares)))
 
 
 def _across(directions: Float[Array, "f 3 n+1"]) -> Float[Array, "f 3 3 n+1"]:
@@ -308,12 +311,7 @@ class _OfChain(eqx.Module):
     ) -> tuple[Bool[Array, ""], tuple[Array, Array], None]:
         here = closed_softly(self.system, is_closed, contact_compliance)
         f, c = with_pressures(here, self.contacts, self.f, self.c)
-        slipping = self.contacts.slipping(trial, here.contacts, contact_compliance)
-        if slipping is not None:
-            here = eqx.tree_at(lambda system: system.stiffness, here, here.stiffness + slipping[0])
-            first, rows, nodes, gaps = here.split(c)
-            nodes += jnp.where(here.held[:, None], 0.0, slipping[1])
-            c = jnp.concatenate([part.reshape(-1) for part in (first, rows, nodes, gaps)])
+        here, c = with_slips(here, self.contacts, c, trial)
         factors = factor_chain(here)
         return factors.is_minimum, factors.solve_softly(f, c), None
 
@@ -351,6 +349,19 @@ def with_pressures(
     rows = jnp.where(is_closed, contacts.gaps, contacts.pressures)
     right = [part.reshape(-1) for part in (first, rows, nodes, elements)]
     return system.contacts.turned(pressures, f), jnp.concatenate(right)
+
+
+def with_slips(
+    system: ChainSystem, contacts: Unilateral, c: Float[Array, "j"], trial: Float[Array, "r n+1"]
+) -> tuple[ChainSystem, Float[Array, "j"]]:
+    """System and right side with what slips."""
+    slipping = contacts.slipping(trial, system.contacts, system.contacts.contact_compliance)
+    if slipping is None:
+        return system, c
+    first, rows, nodes, gaps = system.split(c)
+    nodes += jnp.where(system.held[:, None], 0.0, slipping[1])
+    c = jnp.concatenate([part.reshape(-1) for part in (first, rows, nodes, gaps)])
+    return eqx.tree_at(lambda system: system.stiffness, system, system.stiffness + slipping[0]), c
 
 
 def work(system: ChainSystem, motion: tuple[Array, Array], by: tuple[Array, Array]) -> Float[Array, ""]:

@@ -17,8 +17,6 @@ from rodjax.model.scene import (
     Scene,
     between,
     dead_end_moment,
-    has_friction,
-    has_node_positions,
     has_potential,
     needs_frames,
     slides,
@@ -67,11 +65,11 @@ class Harness(eqx.Module):
         the supports, of `guess`, or of the last step of a path.
 
     A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it,
-    unless a support of its own holds it in a direction. Without contact between rods one end must be a `Joint`.
+    there without friction, unless a support of its own holds it in a direction. Without contact between rods one end
+    must be a `Joint`.
 
     Raises `ValueError` for a body without a rod, for rods that nothing holds, for a mass under no gravity or several,
-    and for a scene with friction, with a dead moment on the free end of a plain rod, or with a sliding
-    clip beside obstacles, in a field of forces, under loads without a potential or in contact with itself or others.
+    for a scene with a dead moment on the free end of a plain rod, and for a sliding clip of a rod that touches others.
     """
 
     # In the place of a scene.
@@ -204,13 +202,6 @@ def _check_scene(scene: Scene, name: str) -> None:
 
 def check_movable(scene: Scene, name: str) -> None:
     """Raises `ValueError` for what a rod with ends of unknown pose cannot have."""
-    if has_friction(scene):
-        raise ValueError(f"{name}.obstacles must have no friction where ends of the rod have unknown poses")
-    if slides(scene) and has_node_positions(scene):
-        raise ValueError(
-            f"{name}.clips must not slide where ends of the rod have unknown poses and obstacles, fields or loads "
-            "without a potential act on it, or it may touch itself"
-        )
     if dead_end_moment(scene) is not None and not needs_frames(scene):
         raise ValueError(
             f"{name} must have no dead moment on the free end of a plain rod where its other end has an unknown pose: "
@@ -496,6 +487,14 @@ def scenes_of(scene: Scene | Harness, prefix: str = "{}") -> dict[str, Scene]:
     if isinstance(scene, Scene):
         return {"": scene}
     return dict(zip(map(prefix.format, scene.names), scene.scenes, strict=True))
+
+
+def check_without_friction(subject: Scene | Harness, name: str) -> None:
+    """Raises `ValueError` where what `name` does has no path along which friction could act."""
+    for of, scene in scenes_of(subject, "cables[{!r}].").items():
+        for k, obstacle in enumerate(scene.obstacles):
+            if obstacle.friction is not None:
+                raise ValueError(f"{of}obstacles[{k}].friction must be 0 in {name}: it acts along a path only")
 
 
 def of_one_rod(scene: Scene) -> Harness:

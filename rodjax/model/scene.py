@@ -475,13 +475,6 @@ def has_friction(scene: Scene) -> bool:
     return any(obstacle.friction is not None for obstacle in scene.obstacles)
 
 
-def check_without_friction(scene: Scene, name: str) -> None:
-    """Raises `ValueError` where what `name` does has no path along which friction could act."""
-    for k, obstacle in enumerate(scene.obstacles):
-        if obstacle.friction is not None:
-            raise ValueError(f"obstacles[{k}].friction must be 0 in {name}: it acts along a path only")
-
-
 def _follows(end: Support) -> bool:
     return type(end) is Free and end.follower
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from rodjax.checks import instance, is_known, leaf, namespace, sequence
 from rodjax.model.harness import Harness, harness_between
+from rodjax.model.scene import has_friction
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import checked_threads, in_order
 from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
@@ -40,7 +41,7 @@ def harness_path(
         return found
 
     first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=guess, **options)
-    return _on_one_mesh(first, steps, segments, rtol, options)[0]
+    return _on_one_mesh(first, guess, steps, segments, rtol, options)[0]
 
 
 def harness_batch(
@@ -67,7 +68,9 @@ def harness_batch(
 
     def all_of(first: HarnessEquilibrium, coarser: list[HarnessEquilibrium] | None) -> list[HarnessEquilibrium]:
         def solved(k: int) -> HarnessEquilibrium:
-            guess = coarser[k] if coarser and bool(coarser[k].converged) else begin(k)
+            # A step with friction is one from the guess.
+            is_free = not any(map(has_friction, harnesses[k].scenes))
+            guess = coarser[k] if coarser and is_free and bool(coarser[k].converged) else begin(k)
             return solve_harness(harnesses[k], segments=first.segments, guess=guess, is_told=False, **options)
 
         others = range(1, len(harnesses))
@@ -77,7 +80,7 @@ def harness_batch(
         return [first, *map(solved, others)]
 
     first = solve_harness(harnesses[0], segments=segments, rtol=rtol, guess=begin(0), is_told=False, **options)
-    found, all_found = _on_one_mesh(first, all_of, segments, rtol, options)
+    found, all_found = _on_one_mesh(first, begin(0), all_of, segments, rtol, options)
     if is_told and is_known(found.status):
         for result in all_found:
             warn_of_harness(result, options["strain_limit"], is_given=segments is not None)
@@ -114,13 +117,14 @@ def unstacked(stack: Any) -> Iterator[Any]:
 
 def _on_one_mesh(
     first: HarnessEquilibrium,
+    begin: HarnessEquilibrium | None,
     solved: Callable[[HarnessEquilibrium, list[HarnessEquilibrium] | None], list[HarnessEquilibrium]],
     segments: int | list[int] | None,
     rtol: float | None,
     options: dict[str, Any],
 ) -> tuple[HarnessEquilibrium, list[HarnessEquilibrium]]:
-    """All equilibria on the mesh of the first, refined until none needs a finer one, unless `segments` are given:
-    stacked, and each.
+    """All equilibria on the mesh of the first, which was sought from `begin`, refined until none needs a finer one,
+    unless `segments` are given: stacked, and each.
 
     `solved`: those on a mesh, of which the first is known, and those on the mesh before.
     """
@@ -140,7 +144,8 @@ def _on_one_mesh(
                     NotConvergedWarning,
                 )
             return found, each
-        first = solve_harness(first.harness, segments=counts, guess=first, **options)
+        guess = begin if any(map(has_friction, first.harness.scenes)) else first
+        first = solve_harness(first.harness, segments=counts, guess=guess, **options)
 
 
 def _step(last: HarnessEquilibrium, harness: Harness, *, strain_limit: Any, **options: Any) -> HarnessEquilibrium:

@@ -115,13 +115,16 @@ def solve_path(
     one_of(at_critical, "at_critical", typing.get_args(AtCritical))
     if are_harnesses(scenes):
         harnesses = cast(Sequence[Harness], scenes)
+        stack = stack_harnesses(harnesses)
+        for name, of_rod in zip(stack, stack.scenes, strict=True):
+            check_still(of_rod, of=f"cables[{name!r}].")
         if at_critical == "stop":
-            _check_stop(stack_harnesses(harnesses))
+            _check_stop(stack)
         numbers: dict[str, Any] = {"segments": segments, "rtol": rtol, "guess": guess, "strain_limit": strain_limit}
         how: dict[str, Any] = {"discretization": discretization, "solver": solver, "planar": planar, "find": find}
         path = harness_path(harnesses, **numbers, **how)
         if at_critical == "stop":
-            count = _before_critical(stack_harnesses(harnesses), jax.lax.stop_gradient(path))
+            count = _before_critical(stack, jax.lax.stop_gradient(path))
             path = jax.tree.map(lambda leaf: leaf[:count], path)
         return path
     scenes = cast(Sequence[Scene] | Scene, scenes)
@@ -149,14 +152,16 @@ def solve_path(
     return differentiable(stacked, path)
 
 
-def check_still(scenes: Scene, axis: int = 0) -> None:
-    """Raises `ValueError` where an obstacle with friction moves along a path, whose steps are along an axis."""
+def check_still(scenes: Scene, axis: int = 0, of: str = "") -> None:
+    """Raises `ValueError` where an obstacle with friction moves along a path, whose steps are along an axis; `of`: what
+    the names of obstacles begin with.
+    """
     for k, obstacle in enumerate(scenes.obstacles):
         if obstacle.friction is None:
             continue
         body = jax.tree.leaves(eqx.tree_at(lambda body: body.friction, obstacle, None))
         if is_known(body) and any(np.any(np.ptp(np.asarray(leaf), axis=axis) > 0) for leaf in body):
-            raise ValueError(f"obstacles[{k}] must stay the same along a path, as it has friction")
+            raise ValueError(f"{of}obstacles[{k}] must stay the same along a path, as it has friction")
 
 
 def _check_stop(scenes: Scene | Harness) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rodjax.checks import instance, leaf, positive, whole_number
-from rodjax.model.harness import Harness, scenes_of
+from rodjax.model.harness import Harness, check_without_friction, scenes_of
 from rodjax.model.obstacles import Obstacle
-from rodjax.model.scene import Scene, check_without_friction
+from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_stack
 from rodjax.programs.answers import one_answer
 from rodjax.programs.tasks import Workers, checked_executor, checked_threads, in_order, rows_of
@@ -253,8 +253,7 @@ def _problem(
     scene: Any, variables: Any, limits: Any, objective: Any, obstacles: Any, names: Any, segments: Any, solver: Any
 ) -> tuple[Problem, tuple[str, ...]]:
     instance(scene, "scene", (Scene, Harness))
-    if isinstance(scene, Scene):  # rods of harnesses have none
-        check_without_friction(scene, "a route")
+    check_without_friction(scene, "a route")
     if any(rod.rod.length.ndim for rod in scenes_of(scene).values()):
         raise ValueError("scene must be a single one, got a stack: route takes one after another")
     variables = checked_variables(variables, scene)

@@ -19,8 +19,8 @@ from scipy import linalg, stats
 from rodjax.analysis.sensitivity import named_numbers
 from rodjax.checks import Numbers, instance, is_known, leaf, number_array, positive, sequence, shown, whole_number
 from rodjax.identification.unknowns import Unknown, known_names, target
-from rodjax.model.harness import Harness
-from rodjax.model.scene import Scene, check_without_friction
+from rodjax.model.harness import Harness, check_without_friction
+from rodjax.model.scene import Scene
 from rodjax.programs.answers import one_answer
 from rodjax.programs.tasks import Workers, checked_executor, checked_threads
 from rodjax.routing.limits import Limits
@@ -269,8 +269,7 @@ def tolerances(
         raise ValueError("equilibrium must be of elements or finite differences, got one of the continuum")
     if not bool(equilibrium.converged):
         raise ValueError(f"equilibrium must be one: {Status(int(equilibrium.status)).message}")
-    if isinstance(equilibrium, Equilibrium):  # rods of harnesses have none
-        check_without_friction(equilibrium.scene, "tolerances")
+    check_without_friction(solved_in(equilibrium), "tolerances")
     tolerances = sequence(tolerances, "tolerances", "Tolerance")
     samples = None if samples is None else whole_number(samples, "samples", 0, MOST_SAMPLES)
     rng = np.random.default_rng(whole_number(seed, "seed", 0, 2**63))

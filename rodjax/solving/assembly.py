@@ -157,7 +157,7 @@ class RodStep(NamedTuple):
         if isinstance(form, SlidingForm):
             value -= self.point.excess_at(there.arclengths)
         if self.at_ends is not None:
-            assert isinstance(form, NodalForm)
+            assert isinstance(form, NodalForm | SlidingForm)
             assert self.at_ends_change is not None
             value += form.contact_energy(there, self.point, self.others)
             value += end_contact_energy(rod, form, self.at_ends, self.at_ends_change)
@@ -546,7 +546,7 @@ def _linearized(
     here, coupling = linearized_with_ends(rod, form, point)
     point, at_ends = form.accepted(point, here), None
     if pressures is not None:
-        assert isinstance(form, NodalForm)
+        assert isinstance(form, NodalForm | SlidingForm)
         at_ends, coupling = end_contacts(rod, form, pressures, coupling)
         here = dataclasses.replace(here, residual=jnp.maximum(here.residual, at_ends.residual))
     aside = components(here.bases, generic_field(point.tangents, scene_axes(form.scene)))
@@ -759,6 +759,9 @@ def _with_contacts(
 ) -> tuple[_Rods, _Bodies, ContactStep]:
     """The same with the contacts of rods and bodies, which are sought with both."""
     stiffness, force = _condensed_system(assembly, all_here, rods, balance)
+    moved, q = _moves(assembly, all_here)
+    count, slide = len(force), q - len(force)
+    stiffness, force = jnp.pad(stiffness, ((0, slide), (0, slide))), jnp.pad(force, (0, slide))
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
     may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
     groups, shifts, is_pushed = [], [], rods.is_pushed
@@ -773,7 +776,7 @@ def _with_contacts(
         pushes = (PUSH / here.aside.shape[2] * pushing)[:, None, None] * here.aside
         forms = jax.vmap(lambda rod: rod.form_at())(here.rods)
         parts = forms, here.points, here.linearization, here.coupling, here.at_ends, pushes
-        touched = RodsInContact.of(*parts, group.body, assembly.shares(group))
+        touched = RodsInContact.of(*parts, moved[len(groups)], assembly.shares(group))
         if together is not None and number in of_pairs:
             columns = _columns(assembly, number, here, forms, chosen)
             touched = touched.touched(columns, together.pressures)
@@ -781,8 +784,7 @@ def _with_contacts(
         shifts.append(shift)
     push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
     pattern = jnp.asarray(_generic(len(force), dtype))
-    motions = assembly.bodies.motions
-    parts = motions, stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"
+    parts = stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"
     model = ContactModel(tuple(groups), *parts, together, _is_symmetric(assembly, all_here))
     found = contact_step(model, tuple(shifts), state.damping)
     is_definite = rods.is_definite & found.is_found
@@ -796,8 +798,28 @@ def _with_contacts(
         is_pushed,
     )
     pushes_bodies = (found.below > 0) & (push > 0)
-    bodies = _Bodies((motions @ found.bodies).reshape(assembly.count, 6), found.below, pushes_bodies)
-    return all_rods, bodies, found
+    motions = (assembly.bodies.motions @ found.q[:count]).reshape(assembly.count, 6)
+    return all_rods, _Bodies(motions, found.below, pushes_bodies), found
+
+
+def _moves(assembly: Assembly, all_here: list[_Here]) -> tuple[list[Float[Array, "k 12+a q"]], int]:
+    """Of the rods with contacts, group by group, what moves them by the unknowns of bodies and sliding clips, and how
+    many these are.
+    """
+    motions = assembly.bodies.motions
+    rows, bodies = motions.shape
+    motions = jnp.pad(motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, bodies)
+    groups = [group for group, here in zip(assembly.groups, all_here, strict=True) if here.at_ends is not None]
+    total = bodies + sum(len(group.body) * group.form.sliding_count for group in groups)
+    found, first = [], bodies
+    for group in groups:
+        k, clips = len(group.body), group.form.sliding_count
+        by_q = jnp.zeros((k, 12 + clips, total), motions.dtype)
+        by_q = by_q.at[:, :12, :bodies].set(motions[group.body].reshape(k, 12, bodies))
+        rod, clip = np.indices((k, clips)).reshape(2, -1)
+        found.append(by_q.at[rod, 12 + clip, first + clips * rod + clip].set(1.0))
+        first += k * clips
+    return found, total
 
 
 def _columns(assembly: Assembly, number: int, here: _Here, forms: NodalForm, chosen: Any) -> Columns:

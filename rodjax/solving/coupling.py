@@ -21,7 +21,8 @@ from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.discretization.sliding import SlidingForm
-from rodjax.discretization.sliding_point import SlidingPoint
+from rodjax.discretization.sliding_point import SlidingLinearization, SlidingPoint
+from rodjax.linalg.bordered import BorderedSystem
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
 from rodjax.model.supports import Clamp, rotate
@@ -61,7 +62,7 @@ class RodInBodies(NamedTuple):
                 support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
             ends.append(support)
         if isinstance(form, SlidingForm):
-            return form.between((ends[0], ends[1]))
+            return form.between((ends[0], ends[1]), self.touches)
         scene = eqx.tree_at(lambda scene: (scene.start, scene.end), scene, tuple(ends))
         form = eqx.tree_at(lambda form: form.scene, form, scene)
         return dataclasses.replace(form, pushed=self.touches) if isinstance(form, NodalForm) else form
@@ -137,6 +138,13 @@ def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Fl
     return jnp.where(touches, distances - radius[None], 1.0), jnp.where(touches[..., None], normals, 0.0)
 
 
+def _at_ends(form: NodalForm | SlidingForm) -> NodalForm:
+    """At the ends of a rod it does not matter where it passes its clips."""
+    form = form.first if isinstance(form, SlidingForm) else form  # pyright: ignore[reportAssignmentType]
+    assert isinstance(form, NodalForm)
+    return form
+
+
 def _places(form: NodalForm) -> Float[Array, "2 3"]:
     """Of clamped ends."""
     nowhere = jnp.zeros(3, form.field.s.dtype)
@@ -145,18 +153,19 @@ def _places(form: NodalForm) -> Float[Array, "2 3"]:
 
 
 def end_contact_energy(
-    rod: RodInBodies, form: NodalForm, here: EndContacts, change: Float[Array, "o 2"]
+    rod: RodInBodies, form: NodalForm | SlidingForm, here: EndContacts, change: Float[Array, "o 2"]
 ) -> Float[Array, ""]:
     """As `NodalForm.contact_energy`, from where a step begins that changes the pressures."""
-    gaps, _ = end_gaps(rod, form)
+    gaps, _ = end_gaps(rod, _at_ends(form))
     pushing = here.pressures + change - (gaps + here.gaps - here.found) / MERIT_COMPLIANCE
     return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 
 
 def end_contacts(
-    rod: RodInBodies, form: NodalForm, pressures: Float[Array, "o 2"], coupling: Coupling
+    rod: RodInBodies, form: NodalForm | SlidingForm, pressures: Float[Array, "o 2"], coupling: Coupling
 ) -> tuple[EndContacts, Coupling]:
     """And with what these contacts add to L."""
+    form = _at_ends(form)
     gaps, normals = end_gaps(rod, form)
     relaxed = jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0)
     carried = jnp.stack([rod.carried(0), rod.carried(1)])
@@ -206,7 +215,44 @@ def _with_arclengths(rod: RodInBodies, point: SlidingPoint, coupled: Coupling) -
     before = jnp.zeros_like(by_arclengths.T)
     return coupled._replace(
         of_constraints=jnp.concatenate([before, coupled.of_constraints]),
-        of_multipliers=jnp.concatenate([by_arclengths.T, coupled.of_constraints]),
+        of_multipliers=jnp.concatenate([by_arclengths.T, coupled.by_multipliers]),
+    )
+
+
+def sliding_along(here: SlidingLinearization, coupled: Coupling) -> Coupling:
+    """What moves a rod beside obstacles: the motions of its ends, and after these the arclengths of its sliding clips,
+    which stay as they are where it does not slide yet.
+    """
+    system, slides = here.system, here.slides
+    assert isinstance(system, BorderedSystem)
+    chain = system.inner
+    assert isinstance(chain, ChainSystem)
+    j = len(here.arclengths)
+    columns, rows = (
+        tuple(jnp.where(slides, jnp.moveaxis(part, 0, -1), 0.0) for part in parts)
+        for parts in (system.columns, system.rows)
+    )
+    identity = jnp.eye(j, dtype=system.corner.dtype)
+    by_ends = jnp.where(slides, coupled.by_multipliers[:j].T, 0.0)
+    second = jnp.pad(coupled.second, ((0, j), (0, j)))
+    second = second.at[:12, 12:].set(by_ends).at[12:, 12:].set(jnp.where(slides, system.corner, identity))
+    # Rows of closed contacts are their gaps, with a minus.
+    first, size = len(chain.compliance), chain.contacts.is_closed.size
+    contacts = slice(first, first + size)
+    of_gaps = None
+    if coupled.of_gaps is not None:
+        by_arclengths = -columns[1][contacts].reshape(*chain.contacts.is_closed.shape, j)
+        of_gaps = jnp.concatenate([coupled.of_gaps, by_arclengths], axis=2)
+    of_constraints = jnp.concatenate([coupled.of_constraints[j:], columns[1].at[contacts].set(0.0)], axis=1)
+    return Coupling(
+        jnp.concatenate([coupled.first, jnp.where(slides, here.constraint_residual[:j], 0.0)]),
+        second,
+        jnp.concatenate([coupled.of_gradient, columns[0]], axis=2),
+        of_constraints,
+        of_gaps,
+        coupled.of_nodes,
+        jnp.concatenate([coupled.by_multipliers[j:], rows[1]], axis=1),
+        jnp.concatenate([coupled.by_rotations, rows[0]], axis=2),
     )
 
 

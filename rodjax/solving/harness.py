@@ -26,7 +26,7 @@ from rodjax.model.harness import (
     of_one_rod,
 )
 from rodjax.model.loads import ContactLoads
-from rodjax.model.scene import Scene, has_contacts, nondimensional, slid, slides, under_contact
+from rodjax.model.scene import Scene, has_contacts, has_friction, nondimensional, slid, slides, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
@@ -105,6 +105,8 @@ def solve_harness(
     if planar:
         raise ValueError("planar must be False where poses are unknown, in space")
     fixed, earlier, shapes = not_differentiated(harness, *_begins(harness, guess))
+    if earlier is not None and any(map(has_friction, harness.scenes)):
+        earlier = _as_memory(earlier)
     strain_limit = checked_strain_limit(strain_limit)
     if not harness.bodies:
         bodies = Bodies.of(harness)
@@ -218,6 +220,17 @@ def _begins(
 
 
 @compiled
+def _as_memory(guess: HarnessEquilibrium) -> HarnessEquilibrium:
+    """With slips counted from there, if that is an equilibrium."""
+
+    def of_rod(rod: Equilibrium) -> Equilibrium:
+        state = jax.tree.map(lambda new, old: jnp.where(guess.converged, new, old), rod.state.as_memory(), rod.state)
+        return dataclasses.replace(rod, state=state)
+
+    return dataclasses.replace(guess, groups=tuple(map(jax.vmap(of_rod), guess.groups)))
+
+
+@compiled
 def _followed(harness: Harness, guess: HarnessEquilibrium) -> Poses:
     """The poses of an earlier equilibrium, displaced with the supports."""
     return Poses(*Bodies.of(harness).followed(Bodies.of(guess.harness), guess.positions, guess.frames))
@@ -298,7 +311,10 @@ def _solved(
                 else:
                     scene = _touchable(harness, number, harness.scenes[number], options.segments)
                     scene = _at(scene, _bodies_of(harness, number), poses)
-                    each.append(first_state(scene, rod, options))
+                    state, first = first_state(scene, rod, options)
+                    if isinstance(rod, Equilibrium) and _same_memory(rod.state, state):
+                        state = dataclasses.replace(state, friction=rod.state.friction)
+                    each.append((state, first))
             start = _stacked_starts(tuple(each))
         starts.append(start)
     options = tuple(all_options[group[0]] for group in members)
@@ -309,6 +325,13 @@ def _solved(
     if guess is not None and guess.members == members and guess.rod_pressures.shape == of_rods.shape:
         of_rods = guess.rod_pressures
     return _solve(harness, poses, tuple(starts), pressures, of_rods, strain_limit, options, members=members)
+
+
+def _same_memory(one: SolverState, other: SolverState) -> bool:
+    """Whether both have a memory of friction, on meshes of as many elements."""
+    if one.friction is None or other.friction is None:
+        return False
+    return one.friction.forces.shape == other.friction.forces.shape
 
 
 @compiled
@@ -433,8 +456,15 @@ def _made_anew(form: SlidingForm, point: SlidingPoint, units: Units, mesh: Shape
     """On a mesh like that of a shape, for a rod with its ends where the bodies are."""
     scene, reached = slid(form.scene, point.arclengths), form.at(point.arclengths)
     shape = on_mesh_of(scene, form.shape.reached(reached, reached.settled(point.inner)), mesh)
-    state = SolverState(shape, point.end_force, units, point.arclengths)
+    state = SolverState(shape, point.end_force, units, point.arclengths, **_of_contacts(scene, point))
     return sliding_search(scene, state, FirstTwist(point.total_twist), options)
+
+
+def _of_contacts(scene: Scene, point: Any) -> dict[str, Any]:
+    """What a state has of them."""
+    if not has_contacts(scene):
+        return {}
+    return {"pressures": point.nodal.pressures, "friction": point.nodal.friction}
 
 
 def harness_equilibrium(
@@ -513,14 +543,16 @@ def _equilibria(
             positions = point.nodal.positions + (rod.units.origin - units.origin)[None] / units.length
             point = dataclasses.replace(point, nodal=dataclasses.replace(point.nodal, positions=positions))
         point = form.settled(form.holding(point))
-        pressures = point.nodal.pressures if has_contacts(scene) else None
         shape = rod.shape.reached(form, point)
-        state = SolverState(shape, point.end_force, units, arclengths, pressures=pressures)
+        state = SolverState(shape, point.end_force, units, arclengths, **_of_contacts(scene, point))
         outcome = Outcome(residual, end.iterations, end.evaluations, end.status)
         found = Found(state, point, outcome, is_stable)
         if scene.obstacles:
             assert search is not None
             assert begin is not None
+            if isinstance(search.form, SlidingForm):
+                assert isinstance(search.point, SlidingPoint)
+                search = dataclasses.replace(search, form=search.form.first, point=search.point.inner)
             found = on_one_side(search, form, found, begin.before)
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 

@@ -6,6 +6,9 @@ ends; contacts of a body, where a rod ends in it, of these motions alone. Where 
 along a motion, it is reversed for the rest of the search, and a rod without a minimum becomes stiffer, so that the
 model only gains stiffness while its minimum is sought.
 
+Arclengths at which rods slide through clips are sought as motions of the bodies are, with columns and rows of their own
+for each rod.
+
 Contacts between rods are unknowns beside the motions of the bodies: the forces -p of closed ones, with the compliance
 of the model, and what their curvature takes and adds (`linalg.far_rows`). Each rod is eliminated to its columns of
 these as it is to the motions of its ends. Rods and contacts have a minimum between held bodies where all negative
@@ -19,15 +22,18 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.form import Linearization
-from rodjax.discretization.nodal import NodalForm, held_back
+from rodjax.discretization.nodal import NodalForm, first_closed, held_back
 from rodjax.discretization.node_contacts import contact_model
+from rodjax.discretization.sliding import SlidingForm
+from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
-from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, work
-from rodjax.solving.coupling import Coupling, EndContacts
+from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, with_slips, work
+from rodjax.solving.coupling import Coupling, EndContacts, sliding_along
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
 from rodjax.solving.rod_contact import Between, BetweenStep, Columns
 
@@ -36,9 +42,9 @@ class RodsInContact(eqx.Module):
     """Rods of one structure beside obstacles, stacked along a first axis of every array.
 
     `contacts`: at nodes and within elements; `f`, `c`: right sides without them; `at_ends`: contacts of the bodies in
-    which the rods end; `first`: the derivative of L by the motions of the ends without contacts; `body`: of each end;
-    `shares`: the unit of energy of each rod, in that of the bodies; `columns`: of contacts with other rods, `None`
-    without such.
+    which the rods end; `first`: the derivative of L by the motions of the ends and arclengths of sliding clips, which
+    move a rod, without contacts; `by_q`: how these follow from the unknowns of all; `shares`: the unit of energy of
+    each rod, in that of the bodies; `columns`: of contacts with other rods, `None` without such.
     """
 
     system: ChainSystem
@@ -47,37 +53,40 @@ class RodsInContact(eqx.Module):
     f: Float[Array, "k b m"]
     c: Float[Array, "k j"]
     at_ends: EndContacts
-    first: Float[Array, "k 12"]
-    body: Int[Array, "k 2"]
+    first: Float[Array, "k 12+a"]
+    by_q: Float[Array, "k 12+a q"]
     shares: Float[Array, "k"]
     columns: Columns | None = None
 
     @staticmethod
     def of(
-        forms: NodalForm,
+        forms: NodalForm | SlidingForm,
         points: Any,
         here: Linearization,
         coupling: Coupling,
         at_ends: EndContacts,
         pushes: Float[Array, "k b m"],
-        body: Int[Array, "k 2"],
+        by_q: Float[Array, "k 12+a q"],
         shares: Float[Array, "k"],
     ) -> "RodsInContact":
-        def of_rod(
-            form: NodalForm, point: Any, here: Linearization, coupling: Coupling, at_ends: EndContacts, push: Array
-        ):
+        def of_rod(form: Any, point: Any, here: Linearization, coupling: Coupling, at_ends: EndContacts, push: Array):
+            if isinstance(form, SlidingForm):
+                assert isinstance(here, SlidingLinearization)
+                coupling = sliding_along(here, coupling)
+                form, point, here = form.at(point.arclengths), point.inner, here.at_arclengths
+            assert isinstance(form, NodalForm)
             system, forces = here.system, point.nodal.contact_forces
             assert isinstance(system, ChainSystem)
             assert here.gaps is not None
             moments, c = form.without_contacts(here, forces)
             contacts = contact_model(form, point, here.gaps, here.reference_displacements)
-            system = system.closed_where(form.first_closed(system.contacts.is_closed, contacts))
-            first = coupling.first + jnp.einsum("rni,rn->i", _of_gaps(system, coupling), forces)
-            first += jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12)
-            return system, contacts, push + moments, c, first
+            system = first_closed(system, contacts)
+            first = coupling.first.at[:12].add(jnp.einsum("rni,rn->i", _of_gaps(system, coupling)[..., :12], forces))
+            first = first.at[:12].add(jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12))
+            return system, coupling, contacts, push + moments, c, first
 
-        system, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
-        return RodsInContact(system, coupling, contacts, f, c, at_ends, first, body, shares)
+        system, coupling, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
+        return RodsInContact(system, coupling, contacts, f, c, at_ends, first, by_q, shares)
 
     def touched(self, columns: Columns, pressures: Float[Array, "c"]) -> "RodsInContact":
         """By other rods, whose pressures are among the loads so far."""
@@ -115,58 +124,64 @@ class RodsInContact(eqx.Module):
         of_rods, at_ends = self._shapes
         return row[: of_rods.size].reshape(of_rods.shape), row[of_rods.size :].reshape(at_ends.shape)
 
-    def of_ends(self, motions: Float[Array, "j+1 6"]) -> Float[Array, "k 12"]:
-        return motions[self.body].reshape(-1, 12)
+    def moved(self, q: Float[Array, "q"]) -> Float[Array, "k 12+a"]:
+        return self.by_q @ q
 
-    def opening(self, motion: tuple[Array, Array], motions: Float[Array, "j+1 6"]) -> Float[Array, "size"]:
-        of_ends = self.of_ends(motions)
+    def opening(self, motion: tuple[Array, Array], q: Float[Array, "q"]) -> Float[Array, "size"]:
+        moved = self.moved(q)
 
         def of_rod(system: ChainSystem, coupling: Coupling, x: Array, y: Array, q: Array) -> Array:
             return system.contacts.rates(x, system.split(y)[2]) + _of_gaps(system, coupling) @ q
 
-        rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, of_ends)
-        return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, of_ends.reshape(-1, 2, 6)))
+        rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, moved)
+        return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, moved[:, :12].reshape(-1, 2, 6)))
 
 
 class Eliminated(NamedTuple):
     """Rods with some contacts closed, under a shift: whether they have a minimum, negative eigenvalues, solutions
-    without motions of the ends and by these, and what is left for the ends: stiffness, and forces. After the motions of
-    the ends stand the unknowns of contacts with other rods.
+    without what moves them and by that, and what is left for it: stiffness, and forces. After the motions of the ends
+    stand the arclengths of sliding clips, then the unknowns of contacts with other rods.
     """
 
     is_minimum: Bool[Array, "k"]
     negative: Int[Array, "k"]
     motion: tuple[Array, Array]
     by_motions: tuple[Array, Array]
-    stiffness: Float[Array, "k 12+z 12+z"]
-    force: Float[Array, "k 12+z"]
+    stiffness: Float[Array, "k 12+a+z 12+a+z"]
+    force: Float[Array, "k 12+a+z"]
 
 
-def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12"]:
+def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12+a"]:
     """None of a rod without obstacles."""
     if coupling.of_gaps is not None:
         return coupling.of_gaps
-    return jnp.zeros((*system.contacts.is_closed.shape, 12), coupling.first.dtype)
+    return jnp.zeros((*system.contacts.is_closed.shape, len(coupling.first)), coupling.first.dtype)
 
 
 def _eliminated(
-    rods: RodsInContact, is_closed: Array, contact_compliance: Array, shift: Float[Array, "k"]
+    rods: RodsInContact, is_closed: Array, trial: Array, contact_compliance: Array, shift: Float[Array, "k"]
 ) -> Eliminated:
     def of_rod(
-        rod: RodsInContact, is_closed: Array, closed_end: Array, contact_compliance: Array, shift: Array
+        rod: RodsInContact, is_closed: Array, closed_end: Array, trial: Array, contact_compliance: Array, shift: Array
     ) -> Eliminated:
         coupling, at_ends, m = rod.coupling, rod.at_ends, rod.f.shape[1]
         system = closed_softly(rod.system, is_closed, contact_compliance)
         f, c = with_pressures(system, rod.contacts, rod.f, rod.c)
+        system, c = with_slips(system, rod.contacts, c, trial)
         factors = factor_chain(held_back(system, shift / m))
         rates = jnp.where(is_closed[..., None], _of_gaps(system, coupling), 0.0)
         size = len(system.compliance)
         of_gradient, second = coupling.of_gradient, coupling.second
         contacts = slice(size, size + is_closed.size)
-        of_constraints = coupling.of_constraints.at[contacts].add(-rates.reshape(-1, 12))
+        moves = len(coupling.first)
+        of_constraints = coupling.of_constraints.at[contacts].add(-rates.reshape(-1, moves))
         by_rotations, by_multipliers = coupling.by_rotations, coupling.by_multipliers
-        by_multipliers = by_multipliers.at[contacts].add(-rates.reshape(-1, 12))
-        force = jnp.einsum("rni,rn->i", rates, rod.contacts.pressures) - rod.first
+        # What a clip applies along the rod knows of no contacts.
+        of_ends = rates[..., :12]
+        by_multipliers = by_multipliers.at[contacts, :12].add(-of_ends.reshape(-1, 12))
+        force = (-rod.first).at[:12].add(jnp.einsum("rni,rn->i", of_ends, rod.contacts.pressures))
+        slides = np.arange(12, moves)
+        second = second.at[slides, slides].add(shift)
         if rod.columns is not None:
             of_gradient = jnp.concatenate([of_gradient, rod.columns.rotation], axis=2)
             of_constraints = jnp.concatenate([of_constraints, rod.columns.rows], axis=1)
@@ -174,7 +189,7 @@ def _eliminated(
             by_multipliers = jnp.concatenate([by_multipliers, rod.columns.rows], axis=1)
             count = rod.columns.ends.shape[1]
             force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
-            second = second.at[:12, 12:].set(rod.columns.ends).at[12:, :12].set(rod.columns.ends.T)
+            second = second.at[:12, moves:].set(rod.columns.ends).at[moves:, :12].set(rod.columns.ends.T)
         x, y = factors.solve_softly(f, c)
         by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(of_gradient, of_constraints)
         stiffness = second - jnp.einsum("bmi,bmj->ij", by_rotations, by_motions[0])
@@ -190,28 +205,47 @@ def _eliminated(
         return Eliminated(factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force)
 
     closed_rods, closed_ends = rods.split(is_closed)
+    trials, _ = rods.split(trial)
     of_rods, _ = rods.split(contact_compliance)
     count = len(shift)
     # Of a rod without obstacles there is none.
     soft = of_rods[:, 0, 0] if of_rods.size else rods.system.contacts.contact_compliance
-    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, jnp.broadcast_to(soft, (count,)), shift)
+    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, trials, jnp.broadcast_to(soft, (count,)), shift)
 
 
 class BodyContacts(eqx.Module):
-    """The contacts of all rods and bodies in a row, as `linalg.unilateral.Unilateral` those of one rod."""
+    """The contacts of all rods and bodies in a row, as `linalg.unilateral.Unilateral` those of one rod; `rough`: of
+    rods with friction the place of the first contact in the row, and all of theirs.
+    """
 
     gaps: Float[Array, "c"]
     pressures: Float[Array, "c"]
     weights: Float[Array, "c"]
+    rough: tuple[tuple[int, Unilateral], ...]
+
+    def _of_rough(self, row: Array) -> list[tuple[slice, Unilateral, Array]]:
+        found = []
+        for first, contacts in self.rough:
+            where = slice(first, first + contacts.gaps.size)
+            found.append((where, contacts, row[where].reshape(contacts.gaps.shape)))
+        return found
 
     def allowed(self, trial: Float[Array, "c"]) -> Float[Array, "c"]:
-        return jnp.where(trial > 0, trial, 0.0)
+        row = jnp.where(trial > 0, trial, 0.0)
+        for where, contacts, of_rods in self._of_rough(trial):
+            row = row.at[where].set(jax.vmap(lambda each, trial: each.allowed(trial))(contacts, of_rods).reshape(-1))
+        return row
 
     def is_closed(self, trial: Float[Array, "c"]) -> Bool[Array, "c"]:
-        return trial > 0
+        row = trial > 0
+        for where, contacts, of_rods in self._of_rough(trial):
+            row = row.at[where].set(jax.vmap(lambda each, trial: each.is_closed(trial))(contacts, of_rods).reshape(-1))
+        return row
 
     def energy(self, trial: Float[Array, "c"], contact_compliance: Float[Array, "c"]) -> Float[Array, ""]:
-        return jnp.sum(self.weights * contact_compliance / 2 * self.allowed(trial) ** 2)
+        # c p^2 / 2, and of what is beyond its bound c b (2 |trial| - b) / 2.
+        exerted = self.allowed(trial)
+        return jnp.sum(self.weights * contact_compliance / 2 * exerted * (2 * trial - exerted))
 
     def slope(
         self, trial: Float[Array, "c"], falls: Float[Array, "c"], contact_compliance: Float[Array, "c"]
@@ -221,10 +255,15 @@ class BodyContacts(eqx.Module):
     def growth(
         self, trial: Float[Array, "c"], falls: Float[Array, "c"], contact_compliance: Float[Array, "c"]
     ) -> Float[Array, ""]:
-        return jnp.sum(jnp.where(trial > 0, self.weights * contact_compliance * falls, 0.0) * falls)
+        if not self.rough:
+            return jnp.sum(jnp.where(trial > 0, self.weights * contact_compliance * falls, 0.0) * falls)
+        return jnp.sum(self.weights * contact_compliance * falls * jax.jvp(self.allowed, (trial,), (falls,))[1])
 
     def turned(self, trial: Array, other: Array) -> Bool[Array, ""]:
-        return jnp.array(False)
+        turned = jnp.array(False)
+        for (_, contacts, here), (_, _, there) in zip(self._of_rough(trial), self._of_rough(other), strict=True):
+            turned |= jnp.any(jax.vmap(lambda each, *trials: each.turned(*trials))(contacts, here, there))
+        return turned
 
 
 class Memory(eqx.Module):
@@ -240,15 +279,15 @@ class Memory(eqx.Module):
 
 
 class ContactModel(eqx.Module):
-    """The model of a step. `stiffness`, `force`: of the bodies and of the rods that touch nothing, along `motions`.
+    """The model of a step. Its unknowns q: how far the bodies move as their supports let them, then the arclengths of
+    sliding clips. `stiffness`, `force`: of the bodies and of the rods that touch nothing.
 
     `push`: by how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
     negative; `may_reverse`: whether a minimum is sought; `between`: the contacts of rods with one another, `None`
-    without such; `is_symmetric`: else steps are exact once the symmetric part of the stiffness is positive.
+    without such; `has_symmetry`: else steps are exact once the symmetric part of the stiffness is positive.
     """
 
     groups: tuple[RodsInContact, ...]
-    motions: Float[Array, "6j q"]
     stiffness: Float[Array, "q q"]
     force: Float[Array, "q"]
     push: Float[Array, ""]
@@ -256,7 +295,11 @@ class ContactModel(eqx.Module):
     least: float = eqx.field(static=True)
     may_reverse: bool = eqx.field(static=True)
     between: Between | None = None
-    is_symmetric: bool = eqx.field(static=True, default=True)
+    has_symmetry: bool = eqx.field(static=True, default=True)
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.has_symmetry or any(rods.contacts.bounds is not None for rods in self.groups)
 
     def begin(self, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> Memory:
         size = len(self.force)
@@ -270,11 +313,6 @@ class ContactModel(eqx.Module):
         between = None if self.between is None else jnp.zeros(5 * len(self.between.gaps), self.force.dtype)
         return of_rods, jnp.zeros_like(self.force), between
 
-    def bodies(self, q: Float[Array, "q"]) -> Float[Array, "j+1 6"]:
-        """Their motions, and none of what is no body."""
-        motions = self.motions @ q
-        return jnp.concatenate([motions.reshape(-1, 6), jnp.zeros((1, 6), q.dtype)])
-
     def rows(self, parts: list[Array]) -> Array:
         return jnp.concatenate(parts)
 
@@ -287,19 +325,19 @@ class ContactModel(eqx.Module):
         return [*found, row[first:]]
 
     def _regularized(
-        self, rods: RodsInContact, is_closed: Array, contact_compliance: Array, shift: Float[Array, "k"]
+        self, rods: RodsInContact, is_closed: Array, at: Array, contact_compliance: Array, shift: Float[Array, "k"]
     ) -> tuple[Eliminated, Float[Array, "k"]]:
-        """Stiffer until each rod by itself has a minimum."""
+        """Stiffer until each rod by itself has a minimum; `at`: what contacts would exert at the last iterate."""
         if not self.may_reverse:
-            return _eliminated(rods, is_closed, contact_compliance, shift), shift
+            return _eliminated(rods, is_closed, at, contact_compliance, shift), shift
 
         def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
             shift, tries, found = trial
             larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
             shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
-            return shift, tries + 1, _eliminated(rods, is_closed, contact_compliance, shift)
+            return shift, tries + 1, _eliminated(rods, is_closed, at, contact_compliance, shift)
 
-        kinds = jax.eval_shape(_eliminated, rods, is_closed, contact_compliance, shift)
+        kinds = jax.eval_shape(_eliminated, rods, is_closed, at, contact_compliance, shift)
         blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         shift, _, found = jax.lax.while_loop(
             lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
@@ -314,21 +352,22 @@ class ContactModel(eqx.Module):
         stiffness, force, touching = self.stiffness + memory.reversal, self.force + memory.push, None
         *of_groups, of_pairs = self.split(is_closed)
         *softness, soft_pairs = self.split(contact_compliance)
+        *trials, _ = self.split(trial)
         if self.between is None:
-            each = zip(self.groups, of_groups, softness, memory.shifts, strict=True)
+            each = zip(self.groups, of_groups, trials, softness, memory.shifts, strict=True)
             all_found, shifts = zip(*(self._regularized(*given) for given in each), strict=True)
         else:
             closed = self._with_closed(of_pairs)
             all_found, shifts, touching = self._together(
-                closed, of_groups, softness, (of_pairs, soft_pairs), memory.shifts
+                closed, of_groups, trials, softness, (of_pairs, soft_pairs), memory.shifts
             )
         is_minimum = jnp.array(True) if touching is None else touching.is_minimum
         for rods, found in zip(self.groups, all_found, strict=True):
             if touching is None:
                 is_minimum &= jnp.all(found.is_minimum)
-            at_bodies, of_ends = self._at_ends(rods), found.stiffness[:, :12, :12]
-            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, at_bodies, of_ends, at_bodies)
-            force += jnp.einsum("k,kiq,ki->q", rods.shares, at_bodies, found.force[:, :12])
+            by_q, moves = rods.by_q, rods.by_q.shape[1]
+            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, by_q, found.stiffness[:, :moves, :moves], by_q)
+            force += jnp.einsum("k,kiq,ki->q", rods.shares, by_q, found.force[:, :moves])
         if touching is not None:
             stiffness -= touching.by_bodies.T @ touching.inverse @ touching.by_bodies
             force -= touching.by_bodies.T @ touching.inverse @ touching.force
@@ -347,30 +386,24 @@ class ContactModel(eqx.Module):
             regularized = jnp.where(jnp.abs(values) < self.least, self.least, values)
             is_minimum &= ~jnp.any(is_below)
         q = vectors @ ((vectors.T @ force) / regularized)
-        if not self.is_symmetric:
+        if not self.has_symmetry:
             values = values if self.may_reverse else jnp.abs(values)
             q = solved_where_regular(stiffness, force, values, self.least, q)
-        bodies, motions = self.bodies(q), []
+        motions = []
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
         for rods, found in zip(self.groups, all_found, strict=True):
-            of_ends = rods.of_ends(bodies)
+            moved = rods.moved(q)
             if rods.columns is not None:
                 assert between is not None
-                of_ends = jnp.concatenate([of_ends, jnp.tile(between[None], (len(of_ends), 1))], axis=1)
-            by_ends = (jnp.einsum("k...i,ki->k...", by, of_ends) for by in found.by_motions)
-            motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_ends))))
+                moved = jnp.concatenate([moved, jnp.tile(between[None], (len(moved), 1))], axis=1)
+            by_moves = (jnp.einsum("k...i,ki->k...", by, moved) for by in found.by_motions)
+            motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_moves))))
         negative = tuple(found.negative for found in all_found)
         if touching is not None:
             # What contacts take from them counts with the first group.
             negative = (negative[0].at[0].add(touching.excess), *negative[1:])
         below = jnp.where(jnp.any(is_below), jnp.sum(is_below), memory.below)
         return is_minimum, (tuple(motions), q, between), Memory(tuple(shifts), negative, reversal, below, push)
-
-    def _at_ends(self, rods: RodsInContact) -> Float[Array, "k 12 q"]:
-        """The motions of the ends of rods by q."""
-        rows, columns = self.motions.shape
-        padded = jnp.pad(self.motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, columns)
-        return padded[rods.body].reshape(len(rods.body), 12, columns)
 
     def _with_closed(self, is_closed: Bool[Array, "c"]) -> list[RodsInContact]:
         """The rods with the columns of closed contacts between them."""
@@ -384,6 +417,7 @@ class ContactModel(eqx.Module):
         self,
         groups: list[RodsInContact],
         is_closed: list[Array],
+        trials: list[Array],
         contact_compliance: list[Array],
         pairs: tuple[Array, Array],
         shifts: tuple[Float[Array, "k"], ...],
@@ -393,7 +427,8 @@ class ContactModel(eqx.Module):
         """
 
         def of_all(shifts: tuple[Array, ...]) -> tuple[list[Eliminated], _Touching]:
-            found = [_eliminated(*given) for given in zip(groups, is_closed, contact_compliance, shifts, strict=True)]
+            each = zip(groups, is_closed, trials, contact_compliance, shifts, strict=True)
+            found = [_eliminated(*given) for given in each]
             return found, self._touching(found, *pairs)
 
         if not self.may_reverse:
@@ -430,17 +465,17 @@ class ContactModel(eqx.Module):
             negative += jnp.sum(found.negative)
             if rods.columns is None:
                 continue
-            matrix += jnp.einsum("k,kzy->zy", rods.shares, found.stiffness[:, 12:, 12:])
-            by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.stiffness[:, 12:, :12], self._at_ends(rods))
-            force += jnp.einsum("k,kz->z", rods.shares, found.force[:, 12:])
+            moves = rods.by_q.shape[1]
+            matrix += jnp.einsum("k,kzy->zy", rods.shares, found.stiffness[:, moves:, moves:])
+            by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.stiffness[:, moves:, :moves], rods.by_q)
+            force += jnp.einsum("k,kz->z", rods.shares, found.force[:, moves:])
         excess = jnp.sum(jnp.linalg.eigvalsh(matrix) < 0) - between.positive
         is_minimum = (negative + excess == 0) & jnp.isfinite(jnp.sum(matrix))
         return _Touching(is_minimum, excess, inverse_matrix(matrix), jnp.asarray(by_bodies), force)
 
     def opening(self, motion: Any) -> Array:
         of_rods, q, _ = motion
-        bodies = self.bodies(q)
-        rows = [rods.opening(each, bodies) for rods, each in zip(self.groups, of_rods, strict=True)]
+        rows = [rods.opening(each, q) for rods, each in zip(self.groups, of_rods, strict=True)]
         if self.between is not None:
             rows.append(self.rates(motion)[: len(self.between.gaps)])
         return self.rows(rows)
@@ -451,7 +486,7 @@ class ContactModel(eqx.Module):
         total = 0.0
         for rods, (x, y) in zip(self.groups, of_rods, strict=True):
             if rods.columns is not None:
-                total += rods.shares @ rods.columns.rates(x, y, rods.of_ends(self.bodies(q)))
+                total += rods.shares @ rods.columns.rates(x, y, rods.moved(q))
         return jnp.asarray(total)
 
     def along(self, motion: Any, change: Any, memory: Memory) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -460,9 +495,7 @@ class ContactModel(eqx.Module):
         slope = q @ stiffness @ dq - (self.force + memory.push) @ dq
         curvature = dq @ stiffness @ dq
         for rods, here, ahead, shift in zip(self.groups, of_rods, changes, memory.shifts, strict=True):
-            slopes, curvatures = jax.vmap(_along_rod)(
-                rods, shift, (*here, rods.of_ends(self.bodies(q))), (*ahead, rods.of_ends(self.bodies(dq)))
-            )
+            slopes, curvatures = jax.vmap(_along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
             slope += jnp.sum(rods.shares * slopes)
             curvature += jnp.sum(rods.shares * curvatures)
         if self.between is not None:
@@ -498,6 +531,7 @@ def _along_rod(
         by_bodies = (
             coupling.second @ q + coupling.of_constraints.T @ y + jnp.einsum("bmi,bm->i", coupling.of_gradient, x)
         )
+        by_bodies = by_bodies.at[12:].add(shift * q[12:])
         return moments + coupling.of_gradient @ q, rows + coupling.of_constraints @ q, by_bodies
 
     def works(motion: tuple[Array, Array, Array], by: tuple[Array, Array, Array]) -> Float[Array, ""]:
@@ -515,16 +549,16 @@ def _along_rod(
 
 
 class ContactStep(NamedTuple):
-    """The step that a search found: of each group rotations, multipliers, the pressures at the ends, shifts, and
-    negative eigenvalues; motions of the bodies; whether the contacts were found and the rods have a minimum; `between`:
-    of contacts between rods, `None` without such.
+    """The step that a search found: of each group rotations, multipliers as of its form, the pressures at the ends,
+    shifts, and negative eigenvalues; the unknowns of bodies and sliding clips; whether the contacts were found and the
+    rods have a minimum; `between`: of contacts between rods, `None` without such.
     """
 
     motions: tuple[tuple[Array, Array], ...]
     at_ends: tuple[Float[Array, "k o 2"], ...]
     shifts: tuple[Float[Array, "k"], ...]
     negative: Int[Array, ""]
-    bodies: Float[Array, "q"]
+    q: Float[Array, "q"]
     below: Int[Array, ""]
     is_found: Bool[Array, ""]
     between: BetweenStep | None
@@ -545,7 +579,12 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         for row, part in zip(rows, (*of_pairs, between.contact_compliance), strict=True):
             row.append(part)
     *of_contacts, is_closed, contact_compliance = map(model.rows, rows)
-    contacts = BodyContacts(*of_contacts)
+    rough, first = [], 0
+    for rods in groups:
+        rough += [] if rods.contacts.bounds is None else [(first, rods.contacts)]
+        first += rods.size
+    gaps, pressures, weights = of_contacts
+    contacts = BodyContacts(gaps, pressures, weights, tuple(rough))
     end = sought(model, contacts, is_closed, contact_compliance, model.nowhere(), model.begin(shifts, damping))
     of_rods, q, multipliers = end.motion
     found = contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance
@@ -561,7 +600,7 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         in_rods, in_ends = rods.split(row)
         size = rods.system.compliance.shape[-1]
         y = y.at[:, size : size + in_rods[0].size].set(in_rods.reshape(len(y), -1))
-        motions.append((x, y))
+        motions.append((x, jnp.concatenate([rods.moved(q)[:, 12:], y], axis=1)))
         at_ends.append(in_ends)
     negative = sum((jnp.sum(each) for each in end.memory.negative), jnp.zeros((), int))
     return ContactStep(

@@ -20,8 +20,7 @@ from rodjax.checks import file_path, whole_number
 from rodjax.file_lock import LockedError, locked
 from rodjax.io.harness_file import HarnessFile
 from rodjax.io.scene_file import SceneFile
-from rodjax.model.harness import Harness
-from rodjax.model.scene import check_without_friction
+from rodjax.model.harness import Harness, check_without_friction
 from rodjax.notes import bar, told
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
 from rodjax.solving.equilibrium import DEFAULT_RTOL
@@ -140,8 +139,7 @@ def sweep(
     executor, threads = checked_executor(executor), checked_threads(threads)
     reader = CaseReader(file_path(scene, "scene"), file_path(over, "over"))
     try:
-        if isinstance(reader.first, SceneFile):  # rods of harnesses have none
-            check_without_friction(reader.first.scenes[0], "a sweep")
+        check_without_friction(reader.first.scenes[0], "a sweep")
     except ValueError as error:
         raise SweepError(f"{scene}: {error}") from None
     parts = output.with_name(output.name + ".parts")

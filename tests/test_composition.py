@@ -182,6 +182,14 @@ def harness_of(names: dict[str, str]) -> rj.Harness:
 OF_HARNESSES = [
     {kind: name} for kind, names in FEATURES.items() if kind not in ("planar", "ends") for name in list(names)[1:]
 ] + [{"ends": name} for name in FEATURES["ends"]]
+# What slides has columns of its own beside contacts, fields and loads that follow the rod.
+SLIDING_IN_HARNESSES = [
+    {"clip": clip, kind: name}
+    for clip in FEATURES["clip"]
+    if "sliding" in clip
+    for kind in ("load", "obstacle")
+    for name in list(FEATURES[kind])[1:]
+]
 
 
 def test_what_harnesses_refuse_is_listed():
@@ -200,7 +208,7 @@ def test_what_harnesses_refuse_is_listed():
 
 @pytest.mark.slow
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("names", OF_HARNESSES, ids=lambda names: ", ".join(names.values()))
+@pytest.mark.parametrize("names", OF_HARNESSES + SLIDING_IN_HARNESSES, ids=lambda names: ", ".join(names.values()))
 def test_every_feature_solves_in_a_harness(names):
     if any(name in refused for refused in NOT_IN_HARNESSES.values() for name in names.values()):
         pytest.skip("refused")

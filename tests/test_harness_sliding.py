@@ -7,10 +7,25 @@ import pytest
 from test_harness import ASIDE, END, GRAVITY, START, bent, plain
 
 import rodjax
-from rodjax import Body, Clamp, Clip, DistributedForce, Free, Harness, Joint, Newton, PointForce, Scene, Sphere, Spring
+from rodjax import (
+    Body,
+    Clamp,
+    Clip,
+    DistributedForce,
+    Free,
+    Harness,
+    Joint,
+    Newton,
+    Plane,
+    PointForce,
+    Scene,
+    Sphere,
+    Spring,
+)
 
 JOINT = Joint("cut", **ASIDE)
 PLACE = (0.12, 0.02, -0.25)
+BALL = Sphere((0.182, 0.056, -0.37), 0.03)
 TIGHT = Newton(tolerance=1e-11)
 
 
@@ -109,7 +124,7 @@ def test_paths_batches_and_files_have_where_the_rod_passes_its_clips(tmp_path):
 @pytest.mark.parametrize(
     "loads",
     [
-        {"obstacles": [Sphere((0.182, 0.056, -0.37), 0.03)]},
+        {"obstacles": [BALL]},
         pytest.param({"distributed": [DistributedForce((0.0, 0.3, 0.0), follower=True)]}, marks=pytest.mark.slow),
     ],
     ids=["over a ball", "under a follower force"],
@@ -130,6 +145,27 @@ def test_a_rod_of_a_harness_slides_as_between_clamps(loads):
         assert jnp.linalg.norm(parts["a"].contact_forces.sum(0)) > 0.1
     along = parts["a"].clip_forces[0] @ parts["a"].tangents[jnp.argmin(jnp.abs(parts["a"].s - alone.scene.clips[0].at))]
     assert abs(along) < 1e-8 * jnp.linalg.norm(parts["a"].clip_forces[0])
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+def test_derivatives_of_what_slides_over_a_floor():
+    """As those of rods that slide, and of rods that touch something, by programs that take minutes to compile."""
+    floor = [Plane((0, 0, -0.28), (0, 0, 1))]
+
+    def place(scale):
+        gravity = scale * jnp.array(GRAVITY)
+        clips = [Clip(0.29, PLACE, sliding=True)]
+        first = Scene(plain(0.42), START, JOINT, gravity=gravity, clips=clips, obstacles=floor)
+        second = Scene(plain(0.58), JOINT, END, gravity=gravity, obstacles=floor)
+        parts = rodjax.solve(Harness({"a": first, "b": second}), segments=8, solver=TIGHT)
+        return jnp.stack([parts["a"].scene.clips[0].at, parts.positions[0, 2], parts.energy])
+
+    one, step = jnp.array(1.0), 1e-4
+    _, change = jax.jvp(place, (one,), (one,))
+    differences = (place(one + step) - place(one - step)) / (2 * step)
+    # Differences have errors of step^2 and of roundings by step.
+    np.testing.assert_allclose(change, differences, rtol=1e-6, atol=1e-8)
 
 
 def test_what_does_not_slide_in_a_harness_is_told():

@@ -422,6 +422,11 @@ class SlidingForm(Form):
         )
 
 
+def at_its_arclengths(form: Form, point: Any) -> tuple[Form, Any]:
+    """Of a rod that slides, form and point at the arclengths where its clips are."""
+    return (form.at(point.arclengths), point.inner) if isinstance(form, SlidingForm) else (form, point)
+
+
 def _goes_down(factors: BorderedFactors, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
     """Whether a step leads to less energy by the arclengths: what pulls along the rod leads away from a largest one,
     and no shift is needed.

@@ -103,7 +103,7 @@ def solve_path(
     Friction of obstacles acts from step to step: the slip of a node is its displacement along an obstacle from one
     equilibrium to the next. The tangential force is at most mu times the pressure; where the node slips it equals that
     bound and opposes the slip. The first scene is solved from rest, without friction, unless the guess is an
-    `Equilibrium`. A step that is split has more equilibria on its way, and slips are counted from each. Obstacles with
+    equilibrium. A step that is split has more equilibria on its way, and slips are counted from each. Obstacles with
     friction stay where they are. Derivatives are those of each step, with the places of the last equilibrium held.
 
     - `segments`, `rtol`, `discretization`, `solver`, `guess`, `planar`, `find`, `strain_limit`: as for `rodjax.solve`.

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from rodjax.discretization.joints import generic_field
 from rodjax.discretization.motion import Metric, Motion, neutral_turn
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT
-from rodjax.discretization.sliding import SlidingForm, SlidingPoint
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint, at_its_arclengths
 from rodjax.geometry.vectors import components
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
@@ -299,7 +299,7 @@ class RodProblem(eqx.Module):
         scene = scene_at(self.scenes, self.segment, parameter)
         units = nondimensional(scene)[1]
         arclengths = place.point.arclengths if isinstance(place.point, SlidingPoint) else None
-        form, point = _settled(place.form, place.point)
+        form, point = at_its_arclengths(place.form, place.point)
         shape = self.equilibrium.state.shape.reached(form, point)
         state = SolverState(shape, point.end_force, units, arclengths)
         if isinstance(form, NodalForm) and scene.obstacles:
@@ -310,7 +310,7 @@ class RodProblem(eqx.Module):
 
     def amounts(self, place: RodPlace) -> Float[Array, "k n+1"]:
         """See `BranchContacts`."""
-        form, point = _settled(place.form, place.point)
+        form, point = at_its_arclengths(place.form, place.point)
         assert isinstance(form, NodalForm)
         assert form.closed is not None
         return jnp.where(form.closed, point.nodal.pressures, GAP_WEIGHT * form.gaps(point))
@@ -328,11 +328,6 @@ class RodProblem(eqx.Module):
 
         still = jax.tree.map(jnp.zeros_like, motion)
         return BranchContacts(self.closed, *jax.jvp(amounts, (parameter, still), (rate, motion)))
-
-
-def _settled(form: Form, point: Any) -> tuple[Form, Any]:
-    """Of a rod that slides, where its clips are."""
-    return (form.at(point.arclengths), point.inner) if isinstance(form, SlidingForm) else (form, point)
 
 
 def pressing(result: Equilibrium) -> Bool[Array, "k n+1"] | None:

@@ -50,7 +50,7 @@ from rodjax.solving.coupling import (
     free_points,
     linearized_with_ends,
 )
-from rodjax.solving.harness_contact import BetweenStep, ContactModel, ContactStep, RodsInContact, contact_step
+from rodjax.solving.harness_contact import BetweenStep, ContactModel, ContactStep, RodsInContact, contact_step, moved_by
 from rodjax.solving.loading import bearing, put_on
 from rodjax.solving.newton import (
     CLOSURE_WEIGHT,
@@ -759,8 +759,10 @@ def _with_contacts(
 ) -> tuple[_Rods, _Bodies, ContactStep]:
     """The same with the contacts of rods and bodies, which are sought with both."""
     stiffness, force = _condensed_system(assembly, all_here, rods, balance)
-    moved, q = _moves(assembly, all_here)
-    count, slide = len(force), q - len(force)
+    in_touch = [group for group, here in zip(assembly.groups, all_here, strict=True) if here.at_ends is not None]
+    moved = moved_by([(group.body, group.form.sliding_count) for group in in_touch], assembly.bodies.motions)
+    count = len(force)
+    slide = moved[0].shape[2] - count
     stiffness, force = jnp.pad(stiffness, ((0, slide), (0, slide))), jnp.pad(force, (0, slide))
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
     may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
@@ -800,26 +802,6 @@ def _with_contacts(
     pushes_bodies = (found.below > 0) & (push > 0)
     motions = (assembly.bodies.motions @ found.q[:count]).reshape(assembly.count, 6)
     return all_rods, _Bodies(motions, found.below, pushes_bodies), found
-
-
-def _moves(assembly: Assembly, all_here: list[_Here]) -> tuple[list[Float[Array, "k 12+a q"]], int]:
-    """Of the rods with contacts, group by group, what moves them by the unknowns of bodies and sliding clips, and how
-    many these are.
-    """
-    motions = assembly.bodies.motions
-    rows, bodies = motions.shape
-    motions = jnp.pad(motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, bodies)
-    groups = [group for group, here in zip(assembly.groups, all_here, strict=True) if here.at_ends is not None]
-    total = bodies + sum(len(group.body) * group.form.sliding_count for group in groups)
-    found, first = [], bodies
-    for group in groups:
-        k, clips = len(group.body), group.form.sliding_count
-        by_q = jnp.zeros((k, 12 + clips, total), motions.dtype)
-        by_q = by_q.at[:, :12, :bodies].set(motions[group.body].reshape(k, 12, bodies))
-        rod, clip = np.indices((k, clips)).reshape(2, -1)
-        found.append(by_q.at[rod, 12 + clip, first + clips * rod + clip].set(1.0))
-        first += k * clips
-    return found, total
 
 
 def _columns(assembly: Assembly, number: int, here: _Here, forms: NodalForm, chosen: Any) -> Columns:

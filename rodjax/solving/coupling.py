@@ -140,9 +140,9 @@ def end_gaps(rod: RodInBodies, form: NodalForm) -> tuple[Float[Array, "o 2"], Fl
 
 def _at_ends(form: NodalForm | SlidingForm) -> NodalForm:
     """At the ends of a rod it does not matter where it passes its clips."""
-    form = form.first if isinstance(form, SlidingForm) else form  # pyright: ignore[reportAssignmentType]
-    assert isinstance(form, NodalForm)
-    return form
+    nodal = form.first if isinstance(form, SlidingForm) else form
+    assert isinstance(nodal, NodalForm)
+    return nodal
 
 
 def _places(form: NodalForm) -> Float[Array, "2 3"]:

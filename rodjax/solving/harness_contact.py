@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.form import Linearization
 from rodjax.discretization.nodal import NodalForm, first_closed, held_back
 from rodjax.discretization.node_contacts import contact_model
-from rodjax.discretization.sliding import SlidingForm
+from rodjax.discretization.sliding import SlidingForm, at_its_arclengths
 from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
@@ -72,8 +72,8 @@ class RodsInContact(eqx.Module):
         def of_rod(form: Any, point: Any, here: Linearization, coupling: Coupling, at_ends: EndContacts, push: Array):
             if isinstance(form, SlidingForm):
                 assert isinstance(here, SlidingLinearization)
-                coupling = sliding_along(here, coupling)
-                form, point, here = form.at(point.arclengths), point.inner, here.at_arclengths
+                coupling, here = sliding_along(here, coupling), here.at_arclengths
+            form, point = at_its_arclengths(form, point)
             assert isinstance(form, NodalForm)
             system, forces = here.system, point.nodal.contact_forces
             assert isinstance(system, ChainSystem)
@@ -135,6 +135,26 @@ class RodsInContact(eqx.Module):
 
         rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, moved)
         return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, moved[:, :12].reshape(-1, 2, 6)))
+
+
+def moved_by(
+    groups: list[tuple[Int[Array, "k 2"], int]], motions: Float[Array, "6j q"]
+) -> list[Float[Array, "k 12+a q+s"]]:
+    """What moves the rods of each group, of which the bodies at the ends and the number of sliding clips are given, by
+    the unknowns of all: those of `motions` of the bodies, then the arclengths of the clips of rod after rod.
+    """
+    rows, bodies = motions.shape
+    motions = jnp.pad(motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, bodies)
+    total = bodies + sum(len(body) * clips for body, clips in groups)
+    found, first = [], bodies
+    for body, clips in groups:
+        k = len(body)
+        by_q = jnp.zeros((k, 12 + clips, total), motions.dtype)
+        by_q = by_q.at[:, :12, :bodies].set(motions[body].reshape(k, 12, bodies))
+        rod, clip = np.indices((k, clips)).reshape(2, -1)
+        found.append(by_q.at[rod, 12 + clip, first + clips * rod + clip].set(1.0))
+        first += k * clips
+    return found
 
 
 class Eliminated(NamedTuple):
@@ -255,8 +275,6 @@ class BodyContacts(eqx.Module):
     def growth(
         self, trial: Float[Array, "c"], falls: Float[Array, "c"], contact_compliance: Float[Array, "c"]
     ) -> Float[Array, ""]:
-        if not self.rough:
-            return jnp.sum(jnp.where(trial > 0, self.weights * contact_compliance * falls, 0.0) * falls)
         return jnp.sum(self.weights * contact_compliance * falls * jax.jvp(self.allowed, (trial,), (falls,))[1])
 
     def turned(self, trial: Array, other: Array) -> Bool[Array, ""]:

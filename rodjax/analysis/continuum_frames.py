@@ -42,7 +42,7 @@ from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.frame_point import FramePoint
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_curve import FramedCurve
-from rodjax.discretization.framed_results import own_moments, section_forces
+from rodjax.discretization.framed_results import through_cells
 from rodjax.discretization.nodes import varying
 from rodjax.geometry.rotations import columns, continuous, from_frame, product, unit
 from rodjax.geometry.vectors import dot, root
@@ -376,7 +376,8 @@ def _along(guess: Equilibrium, units: Units) -> _Along:
     assert isinstance(form, FrameForm)
     assert isinstance(point, FramePoint)
     scales = guess.state.units.force / units.force, guess.state.units.energy / units.energy
-    by_cells, own = scales[0] * section_forces(form, point), scales[1] * own_moments(form, point)
+    through = through_cells(form, point)
+    by_cells, own = scales[0] * through.forces, scales[1] * through.moments
     beyond_clips = None
     if form.clip_nodes is not None:
         beyond_clips = by_cells[:, 0, form.clip_nodes], -own[:, 0, form.clip_nodes]

@@ -38,8 +38,9 @@ def with_contacts(errors: Errors, form: PositionForm, point: Any) -> Errors:
         defects = defects + (sizes[:-1] + sizes[1:]) / 2
     nodes = errors.nodes + misplaced[:, jnp.argmax(sizes)][None]
     moment = jnp.max(root(dot(alone, alone)) * spacing) / CONTACT_MOMENT
-    within = form.point_forces(point)
-    if within is not None:
+    fields = form.fields_on_elements(point)
+    if fields is not None and fields.points is not None:
+        within = fields.points
         sizes = jnp.sqrt(jnp.sum(within.forces**2, axis=1))
         beside = jnp.pad(sizes, ((0, 0), (1, 1)))
         sizes = sizes - (beside[:, :-2] + beside[:, 2:]) / 2

@@ -62,12 +62,6 @@ def pressure_rows(scene: Scene) -> int:
     return len(scene.obstacles) + len(smooth_obstacles(scene)) + scene.self_contact
 
 
-def has_inner_contacts(form: PositionForm) -> bool:
-    """Whether the rod may touch something between its nodes."""
-    scene = form.scene
-    return bool(smooth_obstacles(scene)) or scene.self_contact or scene.contact_loads is not None
-
-
 def distances_and_normals(
     scene: Scene, positions: Float[Array, "n+1 3"]
 ) -> tuple[Float[Array, "k n+1"], Float[Array, "k n+1 3"]]:

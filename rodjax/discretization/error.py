@@ -25,7 +25,7 @@ from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
-from rodjax.discretization.potentials import PointForces
+from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.results import clip_moments, resultants, with_fields_by_tangent
 from rodjax.discretization.twist import transport
 from rodjax.geometry.vectors import components, cross, dot, root
@@ -200,15 +200,15 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     ends = at_ends(tangents)
     through = forces_of(point.end_force)
     by_ends, further = field.by_end_tangents_linearized(scene, tangents, through[:, ::2], torque)
-    by_ends = with_fields_by_tangent(form.fields_on_elements(point), by_ends)
-    forces = form.with_fields(point, through)
+    fields = form.fields_on_elements(point)
+    by_ends = with_fields_by_tangent(fields, by_ends)
+    forces = form.with_fields(through, fields)
     bending_moments = turned_about(ends, by_ends)
     moments = jnp.concatenate([bending_moments[:, 0, :1], bending_moments[:, 1]], axis=1)
     # In a clip that holds the tangent the moment jumps.
     before = bending_moments[:, 0] if scene.clips else moments[:, :-1]
     first = Section(jnp.zeros_like(middles), nodes[:, :-1], before)
-    has_fields = form.fields_on_elements(point) is not None
-    last, passed = _integrated(form, field, forces, torque, first, has_fields, form.point_forces(point))
+    last, passed = _integrated(form, field, forces, torque, first, fields)
 
     # What the elements lack: a rotation, and on the way that is turned back by it to the next node a couple, a gap and
     # a twist.
@@ -299,11 +299,10 @@ def _integrated(
     forces: Float[Array, "3 3 n"],
     torque: Float[Array, ""],
     first: Section,
-    has_fields: bool,
-    point_forces: PointForces | None,
+    fields: OnElements | None,
 ) -> tuple[Section, list[Float[Array, "3 n"]]]:
     """The sections at the ends of the elements, and the tangents passed on the way; by the rule of Runge and Kutta.
-    `has_fields`: the forces are parabolas, but for those at one place, else those at the start less the weight.
+    `forces`: with fields parabolas, but for those at one place, else those at the start less the weight.
     """
     scene, rod = form.scene, form.scene.rod
     start, middle, end = (forces[:, k] for k in range(3))
@@ -313,11 +312,11 @@ def _integrated(
     def slope(section: Section, k: Float[Array, ""], part: float) -> Section:
         """Derivatives by arclength, at so much of step k."""
         n = start - weight[:, None] * ((k + part) * step)[None]
-        if has_fields:
+        if fields is not None:
             x = (k + part) / STEPS
             n = start + x * (4 * middle - 3 * start - end + x * (2 * (start + end) - 4 * middle))
-            if point_forces is not None:
-                n += point_forces.beyond_parabola(x, k / STEPS, STEPS)
+            if fields.points is not None:
+                n += fields.points.beyond_parabola(x, k / STEPS, STEPS)
         tangent = section.tangent / jnp.sqrt(dot(section.tangent, section.tangent))[None]
         way = (1 + axial_strain_under(rod, dot(n, tangent)))[None] * tangent
         turn = cross(curvature_under(rod, section.moment), tangent)

@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.layout import ForceLayout, held_positions, nodes_along
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
-from rodjax.discretization.potentials import OnElements, PointForces
+from rodjax.discretization.potentials import OnElements, at_both, section_forces
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Free
+from rodjax.model.supports import Free, Held
 
 # Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
 # a rod that can spin about the line through both clamps, is then regular; modes softer than this count as neutral. It
@@ -329,31 +329,34 @@ class Form(eqx.Module):
         """The point with positions of nodes, pressures and friction, where the form has them as unknowns."""
         return point
 
-    def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
-        """The section forces at start, middle and end of the elements: `forces` plus those of fields along them."""
-        return forces
-
     def fields_on_elements(self, point: Any) -> OnElements | None:
         """`None` without fields."""
         return None
 
-    def point_forces(self, point: Any) -> PointForces | None:
-        """Those of the fields on elements that act at one place of an element; `None` without such."""
-        return None
+    def with_fields(self, forces: Float[Array, "3 3 n"], fields: OnElements | None) -> Float[Array, "3 3 n"]:
+        """The section forces at start, middle and end of the elements: `forces` plus those of fields along them."""
+        return forces if fields is None else section_forces(forces, fields, jnp.diff(self.field.s))
 
     def nodes_of(self, point: Any) -> Float[Array, "n+1 3"]:
         return self.nodes(self.edges(point)) if point.nodal is None else point.nodal.positions
 
-    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The section forces at s = 0 and s = L."""
+    def end_forces(self, point: Any, fields: OnElements | None) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The section forces at s = 0 and s = L; `fields`: those on elements."""
         total, given = total_force(self.scene), jnp.zeros(3, point.tangents.dtype)
         for end in (self.scene.start, self.scene.end):
             if isinstance(end, Free) and end.force is not None:
                 given = end.force
         first, last = point.end_force[:, 0], point.end_force[:, -1]
         if isinstance(self.scene.start, Free):
-            return -given, last - total
-        return first + total, given if isinstance(self.scene.end, Free) else last
+            start, end = -given, last - total
+        else:
+            start, end = first + total, given if isinstance(self.scene.end, Free) else last
+        if fields is None:
+            return start, end
+        on_nodes = at_both(fields.by_position)
+        # Of ends that are held: a given force is one.
+        start = start - on_nodes[:, 0] if isinstance(self.scene.start, Held) else start
+        return start, end + on_nodes[:, -1] if isinstance(self.scene.end, Held) else end
 
     @abstractmethod
     def tangents_in_clips(self, point: Any) -> Float[Array, "3 clips"]: ...

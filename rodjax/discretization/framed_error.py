@@ -19,12 +19,12 @@ from rodjax.discretization.error import (
 from rodjax.discretization.frame_point import FramePoint
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.framed_results import (
-    end_moments,
+    ThroughCells,
     resultants_of_frames,
     section_arrays,
-    section_forces,
     shear_under,
     strains_at_ends,
+    through_cells,
 )
 from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.geometry.rotations import columns, inverse, product, rotated, tangent, unit
@@ -47,19 +47,20 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     field, q = form.field, point.quaternions
     if not isinstance(field, ElementCells):
         return _errors_of_joints(form, point, axis)
-    ends = end_moments(form, point)
+    through = through_cells(form, point)
+    ends = through.end_moments
     moments = ends[:, 0]
     if not (form.scene.clips or form.scene.point_couples):
         moments = jnp.concatenate([moments[:, :1], ends[:, 1, :-1]], axis=1)
     nodes = field.at_nodes(q)
     first = Pose(jnp.zeros_like(moments), nodes[:, :-1], moments)
-    last = _integrated(form, field, point, first)
+    last = _integrated(form, field, point, through, first)
 
     turn = product(last.quaternion, inverse(nodes[:, 1:]))
     turn = 2 * jnp.where(turn[0] < 0, -1.0, 1.0).astype(q.dtype)[None] * turn[1:]  # small
     edges = form.edges(point).T
     middles = q[:, 1::2]
-    force = section_forces(form, point)[:, 1]
+    force = through.forces[:, 1]
     gap = last.way - edges - field.h[None] / 2 * cross(turn, tangent(middles))
     couple = last.moment - ends[:, 1] + cross(last.way - edges, force)
 
@@ -97,9 +98,10 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
 
     # A difference, as a derivative of these would be a third one of the energy.
     there = form.retract(point, here.bases, motion.rotation, change)
-    before = section_forces(form, point), ends, strains_at_ends(form, point, ends)[0][:2]
-    moments = end_moments(lacking(1.0), there).at[:, 1].add(couple)
-    after = section_forces(form, there), moments, strains_at_ends(form, there, moments)[0][:2]
+    before = through.forces, ends, strains_at_ends(form, point, through.forces, ends)[0][:2]
+    forces, moments = through_cells(form, there).forces, through_cells(lacking(1.0), there).end_moments
+    moments = moments.at[:, 1].add(couple)
+    after = forces, moments, strains_at_ends(form, there, forces, moments)[0][:2]
     changes = jax.tree.map(jnp.subtract, after, before)
     relative, scale = of_sections(*before, changes, has_clips=bool(form.scene.clips))
     defects = sizes[0] + sizes[1] / TURN_REACH + sizes[2] / COUPLE_REACH
@@ -107,12 +109,12 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
     return Errors(displacements.T, *relative, scale, is_soft, defects, axial)
 
 
-def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, first: Pose) -> Pose:
+def _integrated(form: FrameForm, field: ElementCells, point: FramePoint, through: ThroughCells, first: Pose) -> Pose:
     """The sections at the ends of the elements, by the rule of Runge and Kutta."""
     h = field.h
     # Between the three points of an element, all along the rod that varies is a parabola; so are forces, but for those
     # at one place.
-    forces, point_forces = section_forces(form, point), form.point_forces(point)
+    forces, point_forces = through.forces, None if through.fields is None else through.fields.points
     sections = form.sections
     rest = form.scene.rod.rest_shape
     couples = form.couples_along(point.quaternions)
@@ -183,10 +185,13 @@ def _errors_of_joints(form: FrameForm, point: FramePoint, axis: Float[Array, "3"
     curvature = jnp.max(jnp.abs(better.curvature - found.curvature))
     forces = elements.forces(end.quaternions, end.end_force)
     end_changes = [
-        after - before for after, before in zip(elements.end_forces(end), form.end_forces(point), strict=True)
+        after - before
+        for after, before in zip(elements.end_forces(end, None), form.end_forces(point, None), strict=True)
     ]
     error = Sizes(longest(jnp.stack(end_changes, axis=1)), longest(jnp.stack(moments, axis=1)), curvature)
-    scale = Sizes(longest(forces), longest(end_moments(elements, end)), jnp.max(better.curvature)).as_scale()
+    scale = Sizes(
+        longest(forces), longest(through_cells(elements, end).end_moments), jnp.max(better.curvature)
+    ).as_scale()
     return Errors(
         elements.nodes(elements.edges(end)) - form.nodes(form.edges(point)),
         *error.relative_to(scale),

@@ -1,5 +1,7 @@
 """Resultants and strains of an equilibrium by frames, at its nodes and ends, and its centerline between them."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ from rodjax.discretization.cells import ElementCells, JointCells, strains_betwee
 from rodjax.discretization.frame_point import FramePoint
 from rodjax.discretization.framed import FrameForm
 from rodjax.discretization.nonconservative import point_couples
+from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.rotations import columns, inverse, rotated, tangent
@@ -34,9 +37,10 @@ class NodeStrains(eqx.Module):
 def resultants_of_frames(form: FrameForm, point: FramePoint) -> Resultants:
     scene = form.scene
     is_joints = isinstance(form.field, JointCells)
-    at_nodes = _on_joints(form, point) if is_joints else _on_elements(form, point)
+    through = through_cells(form, point)
+    at_nodes = _on_joints(form, point, through) if is_joints else _on_elements(form, point, through)
     frames = columns(form.field.at_nodes(point.quaternions))
-    forces = form.end_forces(point)
+    forces = form.end_forces(point, through.fields)
     moments = [
         _end_moment(end, frames[..., k], at_nodes.moments[:, k], sign)
         for end, k, sign in ((scene.start, 0, -1), (scene.end, -1, 1))
@@ -65,32 +69,40 @@ def _end_moment(end, frame: Float[Array, "3 3"], held: Float[Array, "3"], sign: 
     return jnp.zeros_like(held)
 
 
+class ThroughCells(NamedTuple):
+    """At the strain points of cells, global axes: forces through the rod; moments by frames, at the last one the
+    section moment, at the first the reverse; the fields that these are with.
+    """
+
+    forces: Float[Array, "3 p n"]
+    moments: Float[Array, "3 p n"]
+    fields: OnElements | None
+
+    @property
+    def end_moments(self) -> Float[Array, "3 2 n"]:
+        """The section moments at both ends of each element, on its side of the node."""
+        return jnp.stack([-self.moments[:, 0], self.moments[:, 2]], axis=1)
+
+
 @traced_once
-def own_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
-    """By frames of cells, global axes: at the last one the section moment, at the first the reverse."""
+def through_cells(form: FrameForm, point: FramePoint) -> ThroughCells:
     q = point.quaternions
     by_cells = form.by_rotations(q, point.end_force)
     couples = form.couples_along(q)
     if couples is not None:
         by_cells -= couples
-    own, fields = rotated(form.field.gather(q), by_cells), form.fields_on_elements(point)
-    if fields is None:
-        return own
-    ends = tangent(form.field.gather(q)[:, ::2])
-    return own.at[:, ::2].add(cross(ends, fields.by_tangent))
+    moments, fields = rotated(form.field.gather(q), by_cells), form.fields_on_elements(point)
+    if fields is not None:
+        ends = tangent(form.field.gather(q)[:, ::2])
+        moments = moments.at[:, ::2].add(cross(ends, fields.by_tangent))
+    return ThroughCells(form.with_fields(form.forces(q, point.end_force), fields), moments, fields)
 
 
-def section_forces(form: FrameForm, point: FramePoint) -> Float[Array, "3 p n"]:
-    """The forces through the rod at the strain points."""
-    return form.with_fields(point, form.forces(point.quaternions, point.end_force))
-
-
-def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
+def _on_elements(form: FrameForm, point: FramePoint, through: ThroughCells) -> NodeStrains:
     """Moments are the derivatives of the element beside by the frame of a node: of fourth order too. At a clip or a
     couple they may jump, and are those beyond it.
     """
-    field = form.field
-    own = own_moments(form, point)
+    field, own = form.field, through.moments
     if form.scene.point_couples:
         moments = jnp.concatenate([-own[:, 0], own[:, 2, -1:]], axis=1)
     else:
@@ -98,8 +110,7 @@ def _on_elements(form: FrameForm, point: FramePoint) -> NodeStrains:
     if form.clip_nodes is not None:
         moments = moments.at[:, form.clip_nodes].set(-own[:, 0, form.clip_nodes])
     q = field.at_nodes(point.quaternions)
-    forces = section_forces(form, point)
-    first, last = forces[:, 0], forces[:, 2]
+    first, last = through.forces[:, 0], through.forces[:, 2]
     # On the side of the element beyond, at the end of the one before.
     beyond = jnp.concatenate([first, last[:, -1:]], axis=1)
     tension = dot(beyond, tangent(q))
@@ -129,24 +140,19 @@ def strains_beside_nodes(
     form: FrameForm, point: FramePoint
 ) -> tuple[Float[Array, "2n"], Float[Array, "3 2n"], Float[Array, "2n"]]:
     """Arclengths of both ends of each element in turn, curvature along d1 and d2 and twist there, and axial strain."""
-    strains, axial = strains_at_ends(form, point, end_moments(form, point))
+    through = through_cells(form, point)
+    strains, axial = strains_at_ends(form, point, through.forces, through.end_moments)
     s = form.field.strain_arclengths[::2]
     return s.T.reshape(-1), jnp.moveaxis(strains, 1, 2).reshape(3, -1), axial.T.reshape(-1)
 
 
-def end_moments(form: FrameForm, point: FramePoint) -> Float[Array, "3 2 n"]:
-    """The section moments at both ends of each element, on its side of the node."""
-    own = own_moments(form, point)
-    return jnp.stack([-own[:, 0], own[:, 2]], axis=1)
-
-
 def strains_at_ends(
-    form: FrameForm, point: FramePoint, moments: Float[Array, "3 2 n"]
+    form: FrameForm, point: FramePoint, forces: Float[Array, "3 3 n"], moments: Float[Array, "3 2 n"]
 ) -> tuple[Float[Array, "3 2 n"], Float[Array, "2 n"]]:
-    """Curvature along d1 and d2 and twist at both ends of each element under these moments, and axial strain."""
+    """Curvature along d1 and d2 and twist at both ends of each element under these loads, and axial strain."""
     field = form.field
     q = field.gather(point.quaternions)[:, ::2]
-    tension = dot(section_forces(form, point)[:, ::2], tangent(q))
+    tension = dot(forces[:, ::2], tangent(q))
     sections = jax.tree.map(lambda leaf: leaf[..., ::2, :], section_arrays(form.sections))
     sections = eqx.combine(sections, form.sections)
     strains, axial = sections.strains_under(rotated(inverse(q), moments), tension)
@@ -159,7 +165,7 @@ def strains_at_ends(
 
 def clip_moments_of_frames(form: FrameForm, point: FramePoint) -> Float[Array, "clips 3"]:
     """What the clips apply to the rod, nondimensional: the jumps of the section moment."""
-    own, nodes = own_moments(form, point), form.clip_nodes
+    own, nodes = through_cells(form, point).moments, form.clip_nodes
     assert nodes is not None
     jumps = own[:, 2, nodes - 1] + own[:, 0, nodes]
     if form.scene.point_couples and isinstance(form.field, ElementCells):
@@ -183,14 +189,13 @@ def section_arrays(sections: Sections) -> Sections:
     return eqx.tree_at(lambda sections: sections.law, sections, None, is_leaf=lambda x: x is None)
 
 
-def _on_joints(form: FrameForm, point: FramePoint) -> NodeStrains:
+def _on_joints(form: FrameForm, point: FramePoint, through: ThroughCells) -> NodeStrains:
     """Of the joints at the inner nodes; at the ends by moment and force."""
-    q = point.quaternions
-    own = own_moments(form, point)
+    q, own = point.quaternions, through.moments
     moments = jnp.concatenate([-own[:, 0, :1], own[:, 1]], axis=1)
     ends = [
         _strains_at_end(form, point, moments[:, k], force, k)
-        for k, force in zip((0, -1), form.end_forces(point), strict=True)
+        for k, force in zip((0, -1), form.end_forces(point, None), strict=True)
     ]
     here, strains = form.strained(point), strains_between(form.field, q)
 
@@ -239,7 +244,7 @@ def positions_between_frames(
         frames = field.at_nodes(q)
         t = tangent(frames)
         if form.sections.GA is not None:
-            at_nodes = _on_joints(form, point)
+            at_nodes = _on_joints(form, point, through_cells(form, point))
             assert at_nodes.shear is not None
             t = (1 + at_nodes.axial)[None] * t + short_sum(columns(frames)[:, :2] * at_nodes.shear[None], axis=1)
         return cubic(field.s, nodes, t.T, s)

@@ -15,17 +15,17 @@ obstacle it is in the middle. First derivatives of g are those at a fixed place;
 moves. A force p n there is virtual work on both nodes: forces and couples.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.potentials import of_pulls
 from rodjax.geometry.vectors import cross, dot
-from rodjax.model.along import Value, value_at
+from rodjax.model.along import Along, Value, value_at
 from rodjax.model.obstacles import Obstacle
 
 # Within elements the rod counts as thinner by these parts, in their middle and more at their nodes. Where it lies along
@@ -47,6 +47,12 @@ SAME_CURVATURE = 0.1
 SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
 STEPS = 8
 NEAR = 1e-9
+# The polynomials above, by the powers of t: of both positions, of both tangents times h, and of h |e|^2 e; then their
+# first and second derivatives.
+_SHAPES = np.array([[1, 0, -3, 2, 0], [0, 0, 3, -2, 0], [0, 1, -2, 1, 0], [0, 0, -1, 1, 0], [0, 0, 1, -2, 1]])
+_SHAPES = _SHAPES / np.array([1, 1, 1, 1, 24])[:, None]
+_DERIVATIVE = np.diag([1.0, 2, 3, 4], -1)
+SHAPES = np.stack([_SHAPES, _SHAPES @ _DERIVATIVE, _SHAPES @ _DERIVATIVE @ _DERIVATIVE])
 # An obstacle of more numbers, as a mesh, is touched in the middle of elements: its distances take too much time.
 MOST_NUMBERS = 1000
 
@@ -90,45 +96,52 @@ class Elements(NamedTuple):
         """The rates of the tangents, by rotations about the axes."""
         return cross(self.axes, jnp.broadcast_to(self.tangents[:, :, None], self.axes.shape))
 
+    @property
+    def signed(self) -> Float[Array, "3 2 b n"]:
+        """The rates of the difference of the tangents."""
+        return self.turned * np.array([1.0, -1.0], self.s.dtype)[None, :, None, None]
+
+    @property
+    def parts(self) -> Float[Array, "5 3 n"]:
+        """What points are composed of by `SHAPES`."""
+        h, e = jnp.diff(self.s), self.difference
+        bulge = (h * dot(e, e))[None] * e
+        both = jnp.concatenate([self.positions, h[None, None] * self.tangents, bulge[:, None]], axis=1)
+        return jnp.swapaxes(both, 0, 1)
+
     def weights(
         self, t: Float[Array, "n"], derivative: int = 0
     ) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "n"]]:
         """Of the positions and tangents of both nodes, and of |e|^2 e, in the point or its derivatives by t."""
-        h, u = jnp.diff(self.s), 1 - t
-        if derivative == 0:
-            of_positions = (1 + 2 * t) * u**2, t**2 * (3 - 2 * t)
-            of_tangents = t * u**2, -(t**2) * u
-            of_bulge = t**2 * u**2 / 24
-        elif derivative == 1:
-            of_positions = -6 * t * u, 6 * t * u
-            of_tangents = u * (1 - 3 * t), t * (3 * t - 2)
-            of_bulge = t * u * (1 - 2 * t) / 12
-        else:
-            of_positions = 12 * t - 6, 6 - 12 * t
-            of_tangents = 6 * t - 4, 6 * t - 2
-            of_bulge = (1 - 6 * t * u) / 12
-        return jnp.stack(of_positions), h[None] * jnp.stack(of_tangents), h * of_bulge
+        h, found = jnp.diff(self.s), _shapes_at(t, SHAPES[derivative])
+        return found[:2], h[None] * found[2:4], h * found[4]
 
-    def at(self, t: Float[Array, "n"], derivative: int = 0) -> Float[Array, "3 n"]:
-        """Points at the parts t of the elements, or their derivatives by t."""
-        of_positions, of_tangents, of_bulge = self.weights(t, derivative)
-        e = self.difference
-        cubic = jnp.sum(self.positions * of_positions[None] + self.tangents * of_tangents[None], axis=1)
-        return cubic + (of_bulge * dot(e, e))[None] * e
+    def at(self, t: Float[Array, "n"]) -> Float[Array, "3 n"]:
+        """Points at the parts t of the elements."""
+        return jnp.sum(_shapes_at(t, SHAPES[0])[:, None] * self.parts, axis=0)
 
-    def by_tangents(self, t: Float[Array, "n"], forces: Float[Array, "3 n"], derivative: int = 0) -> Array:
-        """The derivatives of forces . x by the tangents of both nodes, (3, 2, n)."""
-        _, of_tangents, of_bulge = self.weights(t, derivative)
+    def with_derivatives(self, t: Float[Array, "q n"]) -> Float[Array, "3 q 3 n"]:
+        """Points at these parts, and their first and second derivatives by t."""
+        return jnp.sum(_shapes_at(t, SHAPES)[:, :, :, None] * self.parts[:, None], axis=1)
+
+    def by_tangents(self, t: Float[Array, "n"], forces: Float[Array, "3 n"]) -> Float[Array, "3 2 n"]:
+        """The derivatives of forces . x by the tangents of both nodes."""
+        _, of_tangents, of_bulge = self.weights(t)
         e = self.difference
         along = of_bulge[None] * (dot(e, e)[None] * forces + 2 * dot(forces, e)[None] * e)
         return forces[:, None] * of_tangents[None] + jnp.stack([along, -along], axis=1)
 
-    def rates(self, t: Float[Array, "n"], forces: Float[Array, "3 n"], derivative: int = 0) -> Float[Array, "2 b+3 n"]:
-        """The derivatives of forces . x by what moves the nodes: rotations about the axes, then the place."""
-        of_positions, _, _ = self.weights(t, derivative)
-        by_rotation = jnp.sum(self.by_tangents(t, forces, derivative)[:, :, None] * self.turned, axis=0)
-        by_position = (of_positions * self.free)[:, None] * forces[None]
-        return jnp.concatenate([by_rotation, by_position], axis=1)
+    def motions(self, t: Float[Array, "n"], derivative: int = 0) -> Float[Array, "3 2 b+3 n"]:
+        """The derivatives of points, or of their derivatives by t, by what moves the nodes: rotations about the axes,
+        then the place.
+        """
+        of_positions, of_tangents, of_bulge = self.weights(t, derivative)
+        e = self.difference
+        bulging = dot(e, e)[None, None, None] * self.signed
+        bulging += 2 * e[:, None, None] * jnp.sum(e[:, None, None] * self.signed, axis=0)[None]
+        by_rotation = of_tangents[None, :, None] * self.turned + of_bulge[None, None, None] * bulging
+        axes = jnp.eye(3, dtype=t.dtype)[:, None, :, None]
+        return jnp.concatenate([by_rotation, axes * (of_positions * self.free)[None, :, None]], axis=2)
 
     def second(self, t: Float[Array, "n"], forces: Float[Array, "3 n"]) -> Float[Array, "2 b+3 2 b+3 n"]:
         """The second derivatives of forces . x at fixed places."""
@@ -138,8 +151,7 @@ class Elements(NamedTuple):
         bulge = of_bulge[None] * e
         curving = forces[:, None] * bulge[None] + bulge[:, None] * forces[None]
         curving += dot(forces, bulge)[None, None] * jnp.eye(3, dtype=forces.dtype)[..., None]
-        signed = self.turned * jnp.array([1.0, -1.0], forces.dtype)[None, :, None, None]
-        both = 2 * jnp.einsum("cebn,cdn,dfan->ebfan", signed, curving, signed)
+        both = 2 * jnp.einsum("cebn,cdn,dfan->ebfan", self.signed, curving, self.signed)
         total = jnp.zeros((2, b + 3, 2, b + 3, n), forces.dtype).at[:, :b, :, :b].set(both)
         by_tangents = self.by_tangents(t, forces)
         for k in range(2):
@@ -182,49 +194,51 @@ class Places(NamedTuple):
 
     def rates(self, elements: Elements) -> Float[Array, "q 2 b+3 n"]:
         """The gradient of the gaps."""
-        return jax.vmap(elements.rates)(self.t, self.normals)
+        return _along(jax.vmap(elements.motions)(self.t), self.normals)
 
     def second(
         self, elements: Elements, obstacles: tuple[Obstacle, ...], pressures: Float[Array, "q n"]
     ) -> Float[Array, "2 b+3 2 b+3 n"]:
         """The second derivatives of -sum p g."""
-        axes = jnp.eye(3, dtype=pressures.dtype)[..., None]
-
-        def motions(t: Float[Array, "n"]) -> Float[Array, "3 2 b+3 n"]:
-            return jnp.stack([elements.rates(t, jnp.broadcast_to(axis, (3, len(t)))) for axis in axes])
-
         found = [
             jax.vmap(jax.hessian(obstacle.at), in_axes=-1, out_axes=-1)(points)
             for obstacle, points in zip(obstacles, self.points, strict=True)
         ]
-        curving, moving = pressures[:, None, None] * jnp.stack(found), jax.vmap(motions)(self.t)
+        curving, moving = pressures[:, None, None] * jnp.stack(found), jax.vmap(elements.motions)(self.t)
         total = -jnp.sum(jax.vmap(elements.second)(self.t, pressures[:, None] * self.normals), axis=0)
         total -= jnp.einsum("qcean,qcdn,qdfbn->eafbn", moving, curving, moving)
-        slopes = jax.vmap(elements.rates)(self.t, self.of_slope)
-        slopes += jax.vmap(lambda t, normals: elements.rates(t, normals, 1))(self.t, self.normals)
+        slopes = _along(moving, self.of_slope)
+        slopes += _along(jax.vmap(lambda t: elements.motions(t, 1))(self.t), self.normals)
         weights = jnp.where(self.stays, 0.0, pressures / jnp.where(self.stays, 1.0, self.growth))
         return total + jnp.einsum("qn,qean,qfbn->eafbn", weights, slopes, slopes)
 
 
+def _along(motions: Float[Array, "q 3 2 k n"], vectors: Float[Array, "q 3 n"]) -> Float[Array, "q 2 k n"]:
+    return jnp.sum(motions * vectors[:, :, None, None], axis=1)
+
+
+def _shapes_at(t: Float[Array, "*q"], shapes: Float[np.ndarray, "*d k 5"]) -> Array:
+    """Polynomials by the coefficients of their powers, (*d, k, *q)."""
+    powers = [jnp.ones_like(t), t]
+    for _ in range(3):
+        powers.append(powers[-1] * t)
+    terms = shapes.astype(t.dtype)[(..., *[None] * t.ndim)] * jnp.stack(powers)
+    return jnp.sum(terms, axis=shapes.ndim - 1)
+
+
 def _seen(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value, t: Float[Array, "q n"]) -> Places:
     """At the parts t of the elements."""
-    points, along, curving = (jax.vmap(lambda t, k=k: elements.at(t, k))(t) for k in range(3))
+    points, along, curving = elements.with_derivatives(t)
     found = []
     for obstacle, point, rate in zip(obstacles, points, along, strict=True):
         of_points = jax.vmap(jax.value_and_grad(obstacle.at), in_axes=-1, out_axes=(0, -1))
         found.append(jax.jvp(of_points, (point,), (rate,)))
     (distances, normals), (_, of_slope) = jax.tree.map(lambda *parts: jnp.stack(parts), *found)
-
-    def rate(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
-        return lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
-
-    def seen_radius(t: Float[Array, "q n"]) -> Float[Array, "q n"]:
-        return _seen_radius(radius, elements, t)
-
-    slope = jnp.sum(normals * along, axis=1) - rate(seen_radius)(t)
-    growth = jnp.sum(of_slope * along + normals * curving, axis=1) - rate(rate(seen_radius))(t)
+    seen_radius, radius_slope, radius_growth = _seen_radius(radius, elements, t)
+    slope = jnp.sum(normals * along, axis=1) - radius_slope
+    growth = jnp.sum(of_slope * along + normals * curving, axis=1) - radius_growth
     stays = ((t <= 0) & (slope >= 0)) | ((t >= 1) & (slope <= 0)) | (growth <= 0)
-    return Places(t, points, distances - seen_radius(t), normals, slope, growth, of_slope, stays)
+    return Places(t, points, distances - seen_radius, normals, slope, growth, of_slope, stays)
 
 
 @eqx.filter_custom_jvp
@@ -234,7 +248,7 @@ def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value)
     """
     samples, spacing = jnp.asarray(SAMPLES, elements.s.dtype), SAMPLES[1] - SAMPLES[0]
     everywhere = jnp.broadcast_to(samples[:, None], (len(samples), len(elements.s) - 1))
-    points, seen_radius = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements, everywhere)
+    points, (seen_radius, _, _) = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements, everywhere)
     seen = jnp.stack([jax.vmap(jax.vmap(obstacle.at, in_axes=-1))(points) for obstacle in obstacles])
     seen -= seen_radius[None]
     first = samples[jnp.argmin(seen, axis=1)]
@@ -270,9 +284,26 @@ def _(given: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Array, Array]:
     return t, jnp.where(there.stays, 0.0, -change.slope / jnp.where(there.stays, 1.0, there.growth))
 
 
-def _seen_radius(radius: Value, elements: Elements, t: Float[Array, "q n"]) -> Float[Array, "q n"]:
-    """As which the rod counts at the parts t of the elements."""
-    s = elements.s
+def _seen_radius(
+    radius: Value, elements: Elements, t: Float[Array, "q n"]
+) -> tuple[Float[Array, "q n"], Float[Array, "q n"], Float[Array, "q n"]]:
+    """As which the rod counts at the parts t of the elements, and the first and second derivative of that by t."""
+    s, at_nodes, aside = elements.s, elements.at_nodes[None], 2 * t - 1
+    counts = 1 - THINNER - at_nodes * aside**2, -4 * at_nodes * aside, jnp.broadcast_to(-8 * at_nodes, t.shape)
+    if not isinstance(radius, Along):
+        value, slope, growth = (radius * part for part in counts)
+        return value, slope, growth
     begin, end = (jnp.broadcast_to(side[None], t.shape) for side in (s[:-1], s[1:]))
-    thinner = THINNER + elements.at_nodes[None] * (2 * t - 1) ** 2
-    return (1 - thinner) * value_at(radius, begin + t * (end - begin), begin, end)
+
+    def own(t: Float[Array, "q n"]) -> Float[Array, "q n"]:
+        return value_at(radius, begin + t * (end - begin), begin, end)
+
+    def with_rate(t: Float[Array, "q n"]) -> tuple[Float[Array, "q n"], Float[Array, "q n"]]:
+        return jax.jvp(own, (t,), (jnp.ones_like(t),))
+
+    (value, slope), (_, growth) = jax.jvp(with_rate, (t,), (jnp.ones_like(t),))
+    return (
+        counts[0] * value,
+        counts[1] * value + counts[0] * slope,
+        counts[2] * value + 2 * counts[1] * slope + counts[0] * growth,
+    )

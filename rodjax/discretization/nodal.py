@@ -24,11 +24,9 @@ from rodjax.discretization import potentials
 from rodjax.discretization.contact_gaps import (
     curve,
     gaps_and_normals,
-    has_inner_contacts,
     has_wells,
     pressure_rows,
     rough_obstacles,
-    smooth_obstacles,
     within_elements,
 )
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Linearization
@@ -40,20 +38,17 @@ from rodjax.discretization.node_contacts import (
     contact_model,
     contacts_on_elements,
     contacts_with_itself,
-    forces_within,
     relaxation,
-    shares,
 )
 from rodjax.discretization.node_friction import travelled, with_friction
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.potentials import OnElements, PointForces
+from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.self_contact import comes_through, wide_cells
 from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
 from rodjax.model.scene import has_contacts
-from rodjax.model.supports import Held
 from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
@@ -169,27 +164,7 @@ class NodalForm(PositionForm):
         if self.scene.potentials:
             fields = potentials.on_elements(self.scene, self.field.s, *self.node_lines(point))
         contacts = contacts_on_elements(self, point)
-        if contacts is None:
-            return fields
-        return contacts if fields is None else OnElements(*map(jnp.add, fields, contacts))
-
-    def point_forces(self, point: Any) -> PointForces | None:
-        return forces_within(self, point) if smooth_obstacles(self.scene) else None
-
-    def with_fields(self, point: Any, forces: Float[Array, "3 3 n"]) -> Float[Array, "3 3 n"]:
-        fields = self.fields_on_elements(point)
-        return forces if fields is None else potentials.section_forces(forces, fields, jnp.diff(self.field.s))
-
-    def end_forces(self, point: Any) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        start, end = super().end_forces(point)
-        if not self.scene.potentials and not has_inner_contacts(self):
-            return start, end
-        loads = shares(self, point)
-        if self.scene.potentials:
-            loads = loads - potentials.by_position(self.scene, self.field.s, *self.node_lines(point))
-        # Of those that are held; a given force is one.
-        start = start + loads[0] if isinstance(self.scene.start, Held) else start
-        return start, end - loads[-1] if isinstance(self.scene.end, Held) else end
+        return fields if contacts is None else contacts.added_to(fields)
 
     # --- the search --------------------------------------------------------------------------------------------------
 

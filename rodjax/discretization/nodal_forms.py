@@ -23,6 +23,7 @@ from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.node_contacts import contact_residuals, contacts_at, larger
 from rodjax.discretization.node_friction import by_law
+from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.tangent_field import TangentField
 from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
@@ -191,11 +192,11 @@ class NodalFrames(NodalForm, FrameForm):
         total = jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
         return total if of_fields is None else total + of_fields
 
-    def end_forces(self, point: FramePoint) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    def end_forces(self, point: FramePoint, fields: OnElements | None) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         if self.has_potential:
-            return super().end_forces(point)
+            return super().end_forces(point, fields)
         q = point.quaternions
-        forces = self.with_fields(point, self.forces(q, point.end_force))
+        forces = self.with_fields(self.forces(q, point.end_force), fields)
         found = [forces[:, 0, 0], forces[:, -1, -1]]
         for end, k, sign in ((self.scene.start, 0, -1), (self.scene.end, -1, 1)):
             if isinstance(end, Free):

@@ -6,7 +6,6 @@ has its gaps seen larger by half of its depth (`relaxation`): each step leads it
 """
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -221,17 +220,14 @@ def contacts_on_elements(form: PositionForm, point: Any) -> OnElements | None:
     """The forces of contacts within and between elements, and with other rods, as those of a field along them; `None`
     without such.
     """
-    found = []
-    if smooth_obstacles(form.scene):
-        found.append(_within_on_elements(form, point))
-    exerted = []
+    exerted, found = [], None
     if form.scene.self_contact:
         exerted.append(on_elements(curve(form, point), far_unit(form) * point.nodal.pressures[-1]))
     if form.scene.contact_loads is not None:
         exerted.append((form.scene.contact_loads.on_positions, form.scene.contact_loads.on_tangents))
     for on_positions, on_tangents in exerted:
-        found.append(OnElements(-on_positions, -on_tangents, jnp.zeros_like(on_positions)))
-    return jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *found) if found else None
+        found = OnElements(-on_positions, -on_tangents, jnp.zeros_like(on_positions)).added_to(found)
+    return _within_on_elements(form, point).added_to(found) if smooth_obstacles(form.scene) else found
 
 
 @traced_once
@@ -242,15 +238,8 @@ def _within_on_elements(form: PositionForm, point: Any) -> OnElements:
     of_positions = jax.vmap(lambda t: elements.weights(t)[0])(places.t)
     by_position = -jnp.einsum("qcn,qen->cen", forces, of_positions)
     by_tangent = -jnp.sum(jax.vmap(elements.by_tangents)(places.t, forces), axis=0)
-    return OnElements(by_position, by_tangent, jnp.zeros_like(by_position))
-
-
-def forces_within(form: PositionForm, point: Any) -> PointForces:
-    """The forces of obstacles on the rod within its elements."""
-    elements, places, _ = within_elements(form, point)
-    assert places is not None
-    forces = point.nodal.pressures[inner_rows(form.scene), None, :-1] * places.normals
-    return PointForces(places.t, forces, jax.vmap(lambda t: elements.weights(t)[0][0])(places.t))
+    at_places = PointForces(places.t, forces, of_positions[:, 0])
+    return OnElements(by_position, by_tangent, jnp.zeros_like(by_position), at_places)
 
 
 def shares(form: PositionForm, point: Any) -> Float[Array, "n+1 3"]:

@@ -33,16 +33,6 @@ class NodeEnergy(NamedTuple):
     by_rotations: Float[Array, "b b n+1"]
 
 
-class OnElements(NamedTuple):
-    """Of the fields at both ends of each element: the derivatives of its energy by the positions and the tangents of
-    its nodes, and the force per length there.
-    """
-
-    by_position: Float[Array, "3 2 n"]
-    by_tangent: Float[Array, "3 2 n"]
-    density: Float[Array, "3 2 n"]
-
-
 class PointForces(NamedTuple):
     """Forces of q obstacles within n elements, at the parts t of these, and the first node's share of each."""
 
@@ -59,6 +49,28 @@ class PointForces(NamedTuple):
         jumps = start - jnp.sum(passed[:, None] * self.forces, axis=0)
         end = start - jnp.sum(self.forces, axis=0)
         return jumps - (1 - x) * (1 - 2 * x) * start + x * (1 - x) * (start + end) - x * (2 * x - 1) * end
+
+
+class OnElements(NamedTuple):
+    """Of the fields at both ends of each element: the derivatives of its energy by the positions and the tangents of
+    its nodes, and the force per length there; `points`: what they have at one place of an element.
+    """
+
+    by_position: Float[Array, "3 2 n"]
+    by_tangent: Float[Array, "3 2 n"]
+    density: Float[Array, "3 2 n"]
+    points: PointForces | None = None
+
+    def added_to(self, others: "OnElements | None") -> "OnElements":
+        """To others without such places."""
+        if others is None:
+            return self
+        return OnElements(
+            others.by_position + self.by_position,
+            others.by_tangent + self.by_tangent,
+            others.density + self.density,
+            self.points,
+        )
 
 
 def _beside(
@@ -163,7 +175,8 @@ def on_elements(
         return jax.vmap(of_node)(positions[nodes], tangents.T[nodes], s[nodes], h, on_element)
 
     ends = zip(at_end(0, 1), at_end(1, -1), strict=True)
-    return OnElements(*(jnp.stack([start.T, end.T], axis=1) for start, end in ends))
+    by_position, by_tangent, density = (jnp.stack([start.T, end.T], axis=1) for start, end in ends)
+    return OnElements(by_position, by_tangent, density)
 
 
 def section_forces(forces: Float[Array, "3 3 n"], fields: OnElements, h: Float[Array, "n"]) -> Float[Array, "3 3 n"]:

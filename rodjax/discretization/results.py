@@ -41,7 +41,7 @@ def resultants(form: MixedForm, point: MixedPoint) -> Resultants:
     if isinstance(form.field, QuadraticRotationElements):
         return _on_elements(form, form.field, point)
     assert isinstance(form.field, EdgeTangents)
-    tension, forces = form.edge_tension(point), form.end_forces(point)
+    tension, forces = form.edge_tension(point), form.end_forces(point, None)
     return _on_edges(form.scene, form.field, point.tangents, tension, forces, point.total_twist)
 
 
@@ -51,15 +51,16 @@ def _on_elements(form: MixedForm, field: QuadraticRotationElements, point: Mixed
     scene, rod, tangents = form.scene, form.scene.rod, point.tangents
     nodes = tangents[:, ::2]
     torque = torque_at(rod, point.total_twist)
-    by_start, by_end = _by_ends(form, field, point, torque)
+    fields = form.fields_on_elements(point)
+    by_start, by_end = _by_ends(form, field, point, torque, fields)
     moments = cross(nodes, jnp.concatenate([-by_start[:, :1], by_end], axis=1))
     curvatures = curvature_under(rod, moments)
     curvature = root(dot(curvatures, curvatures))
     moments += torque * nodes
-    forces = form.end_forces(point)
+    forces = form.end_forces(point, fields)
     tension = form.edge_tension(point)[::2]
-    if form.fields_on_elements(point) is not None:
-        sections = form.with_fields(point, form.forces(point))[:, ::2] * field.h[None, None]
+    if fields is not None:
+        sections = form.with_fields(form.forces(point), fields)[:, ::2] * field.h[None, None]
         beside = jnp.pad(sections[:, 0], ((0, 0), (0, 1))) + jnp.pad(sections[:, 1], ((0, 0), (1, 0)))
         tension = dot(beside, nodes) / (jnp.pad(field.h, (0, 1)) + jnp.pad(field.h, (1, 0)))
     number = jnp.arange(len(tension))
@@ -80,18 +81,22 @@ def _on_elements(form: MixedForm, field: QuadraticRotationElements, point: Mixed
 
 
 def _by_ends(
-    form: MixedForm, field: QuadraticRotationElements, point: MixedPoint, torque: Float[Array, ""]
+    form: MixedForm,
+    field: QuadraticRotationElements,
+    point: MixedPoint,
+    torque: Float[Array, ""],
+    fields: OnElements | None,
 ) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
     """The derivatives of L of each element by the tangents of its nodes."""
     by_ends = field.by_end_tangents(form.scene, point.tangents, form.forces(point)[:, ::2], torque)
-    return with_fields_by_tangent(form.fields_on_elements(point), by_ends)
+    return with_fields_by_tangent(fields, by_ends)
 
 
-def element_end_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "3 2 n"]:
+def element_end_moments(form: MixedForm, point: MixedPoint, fields: OnElements | None) -> Float[Array, "3 2 n"]:
     """The section moments at both ends of each element, on its side of the node."""
     tangents, torque = point.tangents, torque_at(form.scene.rod, point.total_twist)
     assert isinstance(form.field, QuadraticRotationElements)
-    by_start, by_end = _by_ends(form, form.field, point, torque)
+    by_start, by_end = _by_ends(form, form.field, point, torque, fields)
     start, end = tangents[:, 0:-1:2], tangents[:, 2::2]
     return jnp.stack([torque * start - cross(start, by_start), torque * end + cross(end, by_end)], axis=1)
 
@@ -115,10 +120,10 @@ def positions_between(
     assert isinstance(field, QuadraticRotationElements)
     rod, tangents = scene.rod, point.tangents
     torque = torque_at(rod, point.total_twist)
-    by_start, by_end = _by_ends(form, field, point, torque)
-    forces = form.with_fields(point, form.forces(point))
-    weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
     fields = form.fields_on_elements(point)
+    by_start, by_end = _by_ends(form, field, point, torque, fields)
+    forces = form.with_fields(form.forces(point), fields)
+    weight = jnp.zeros(3, forces.dtype) if scene.gravity is None else scene.gravity
     weights = [weight[:, None], weight[:, None]]
     cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
 
@@ -158,7 +163,8 @@ def clip_moments(form: MixedForm, point: MixedPoint) -> Float[Array, "clips 3"]:
     moments = [jnp.zeros(3, tangents.dtype)] * len(scene.clips)
     directed = held_nodes(scene, field.clip_nodes)
     if isinstance(field, QuadraticRotationElements):
-        by_ends = _by_ends(form, field, point, torque_at(scene.rod, point.total_twist))
+        torque = torque_at(scene.rod, point.total_twist)
+        by_ends = _by_ends(form, field, point, torque, form.fields_on_elements(point))
         for k, node, _ in directed:
             moments[k] = jnp.cross(tangents[:, 2 * node], by_ends[1][:, node - 1] + by_ends[0][:, node])
     else:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from rodjax.discretization.cells import ElementCells
 from rodjax.discretization.form import Form
 from rodjax.discretization.framed import FrameForm
-from rodjax.discretization.framed_results import end_moments, section_forces
+from rodjax.discretization.framed_results import through_cells
 from rodjax.discretization.hermite import QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.results import element_end_moments
@@ -22,9 +22,11 @@ def is_known_along(form: Form) -> bool:
 def section_loads(form: Form, point: Any) -> tuple[Float[Array, "3 2 n"], Float[Array, "3 2 n"]]:
     """Section forces and section moments at both ends of each element, on its side of the node, nondimensional."""
     if isinstance(form, FrameForm):
-        return section_forces(form, point)[:, ::2], end_moments(form, point)
+        through = through_cells(form, point)
+        return through.forces[:, ::2], through.end_moments
     assert isinstance(form, MixedForm)
-    return form.with_fields(point, form.forces(point))[:, ::2], element_end_moments(form, point)
+    fields = form.fields_on_elements(point)
+    return form.with_fields(form.forces(point), fields)[:, ::2], element_end_moments(form, point, fields)
 
 
 def loads_between(

@@ -29,6 +29,7 @@ from rodjax.linalg.blocks import inverse_of_blocks
 from rodjax.linalg.chain_border import Border, Columns
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count
+from rodjax.linalg.substitution import substituted
 from rodjax.programs.parts import traced_once
 
 # Solutions with soft contacts, after the first one.
@@ -396,14 +397,7 @@ class ChainFactors(eqx.Module):
             return self.solve_softly(f, c)
         hard = dataclasses.replace(self.contacts, contact_compliance=jnp.zeros_like(self.contacts.contact_compliance))
         hard = dataclasses.replace(self.whole, contacts=hard)
-        complement = self._hard_complement()
-
-        def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
-            left = jax.tree.map(jnp.subtract, (f, c), hard.times(*found))
-            return jax.tree.map(jnp.add, found, self._solved_once(left[0], left[1], complement)), None
-
-        found, _ = jax.lax.scan(nearer, self._solved_once(f, c, complement), None, length=HARDENINGS)
-        return found
+        return self._refined(f, c, hard, self._hard_complement(), 1 + HARDENINGS)
 
     def _hard_complement(self) -> Float[Array, "k k"]:
         """With contacts between elements that are all but rigid: a border is no softer for that."""
@@ -421,11 +415,28 @@ class ChainFactors(eqx.Module):
         """With the contact compliance. Contacts within elements couple their nodes so stiffly that elimination loses
         half of the digits; what is left is asked for again.
         """
-        found = self._solved_once(f, c, self.complement)
         if self.contacts.inner is None:
-            return found
-        left = jax.tree.map(jnp.subtract, (f, c), self.whole.times(*found))
-        return jax.tree.map(jnp.add, found, self._solved_once(left[0], left[1], self.complement))
+            return self._solved_once(f, c, self.complement)
+        return self._refined(f, c, self.whole, self.complement, 2)
+
+    def _refined(
+        self,
+        f: Float[Array, "b m"],
+        c: Float[Array, "j"],
+        system: ChainSystem,
+        complement: Float[Array, "k k"],
+        count: int,
+    ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
+        """By so many solutions for what is left; the first one, for all of it, is in the loop too, that a program has
+        one.
+        """
+
+        def nearer(found: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
+            left = jax.tree.map(jnp.subtract, (f, c), system.times(*found))
+            return jax.tree.map(jnp.add, found, self._solved_once(left[0], left[1], complement)), None
+
+        found, _ = jax.lax.scan(nearer, (jnp.zeros_like(f), jnp.zeros_like(c)), None, length=count)
+        return found
 
     def _solved_once(
         self, f: Float[Array, "b m"], c: Float[Array, "j"], complement: Float[Array, "k k"]
@@ -480,16 +491,7 @@ class ChainFactors(eqx.Module):
         right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_positions], axis=1)
         right = jnp.einsum("npq,nqr->npr", self.inverses, right)
 
-        def substituted(beside: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-            coupling, here = given
-            # One loop with the difference, where a product of matrices is a call.
-            here -= jnp.sum(coupling[:, :, None] * beside[None], axis=1)
-            return here, here
-
-        last, reached = jax.lax.scan(substituted, right[0], (self.before, right[1:]))
-        reached = jnp.concatenate([right[:1], reached[:-1]])
-        _, solved = jax.lax.scan(substituted, last, (self.after, reached), reverse=True)
-        z = jnp.concatenate([solved, last[None]])
+        z = substituted(self.after, substituted(self.before, right), backward=True)
         around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
         of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)

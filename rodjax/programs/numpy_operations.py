@@ -448,6 +448,16 @@ def inverse(x: np.ndarray) -> np.ndarray:
     return _or_no_numbers(np.linalg.inv, x)
 
 
+def substitution(couplings: np.ndarray, right: np.ndarray, backward: bool) -> np.ndarray:
+    """As `linalg.substitution` has it."""
+    x = np.array(right)
+    count = couplings.shape[-3]
+    for k in range(count - 1, -1, -1) if backward else range(count):
+        here, beside = (k, k + 1) if backward else (k + 1, k)
+        x[..., here, :, :] -= couplings[..., k, :, :] @ x[..., beside, :, :]
+    return x
+
+
 def negative_counts(x: np.ndarray) -> np.ndarray:
     """How many eigenvalues of each symmetric matrix are negative; none where it has no numbers."""
     is_known = np.isfinite(x).all((-2, -1), keepdims=True)

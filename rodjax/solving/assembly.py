@@ -49,6 +49,7 @@ from rodjax.solving.coupling import (
     end_contacts,
     free_points,
     linearized_with_ends,
+    solved_with_columns,
 )
 from rodjax.solving.harness_contact import BetweenStep, ContactModel, ContactStep, RodsInContact, contact_step, moved_by
 from rodjax.solving.loading import bearing, put_on
@@ -185,8 +186,9 @@ def eliminated(
     if isinstance(form, SlidingForm):
         system, constraint_residual = form.sliding(here, system)
     factors = factor(system, is_regularized=True)
-    rotation, multipliers = factors.solve(push - here.gradient, -constraint_residual)
-    by_motions = jax.vmap(factors.solve, in_axes=-1, out_axes=-1)(coupling.of_gradient, coupling.of_constraints)
+    right = push - here.gradient, -constraint_residual
+    columns = coupling.of_gradient, coupling.of_constraints
+    (rotation, multipliers), by_motions = solved_with_columns(factors.solve, right, columns)
     is_sliding = isinstance(form, SlidingForm)
     is_minimum = form.has_minimum(factors, multipliers) if is_sliding else factors.is_minimum
     return Eliminated(is_minimum, factors.negative, rotation, multipliers, *by_motions)

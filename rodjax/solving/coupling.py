@@ -7,6 +7,7 @@ linearly; its derivatives by the frame of an end are those of a linearisation in
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -219,6 +220,17 @@ def _with_arclengths(rod: RodInBodies, point: SlidingPoint, coupled: Coupling) -
     )
 
 
+def solved_with_columns(
+    solve: Callable[[Array, Array], tuple[Array, Array]], right: tuple[Array, Array], columns: tuple[Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Solutions for a right side, and for those of `Coupling`, which stand along a last axis: side by side, so that a
+    program has the solution once.
+    """
+    sides = (jnp.concatenate([side[..., None], more], axis=-1) for side, more in zip(right, columns, strict=True))
+    x, y = jax.vmap(solve, (-1, -1), -1)(*sides)
+    return (x[..., 0], y[..., 0]), (x[..., 1:], y[..., 1:])
+
+
 def sliding_along(here: SlidingLinearization, coupled: Coupling) -> Coupling:
     """What moves a rod beside obstacles: the motions of its ends, and after these the arclengths of its sliding clips,
     which stay as they are where it does not slide yet.
@@ -331,9 +343,10 @@ def coupling(rod: RodInBodies, form: Form, point: Any, released: Linearization) 
     second = jnp.zeros((2, 6, 2, 6), dtype).at[:, before:, :, before:].set(bent)
     of_gradient = jnp.pad(turned.reshape(b, m, 2, width), ((0, 0), (0, 0), (0, 0), (before, 0)))
     of_constraints = jnp.pad(lacking.reshape(-1, 2, width), ((0, 0), (0, 0), (before, 0)))
+    pulls = form.end_forces(point, form.fields_on_elements(point))
     for number, end, turn in ends:
         arm, carried = rod.arm(number), rod.carried(number)
-        pull = (1.0 if end else -1.0) * form.end_forces(point)[end]
+        pull = (1.0 if end else -1.0) * pulls[end]
         by_turn = turn.first + turn.rotation.T @ released.gradient[:, end]
         first = first.at[number].set(pull @ carried).at[number, 3:].add(by_turn)
         second = second.at[number, 3:, number, 3:].add(turn.second + lifted(pull, arm))

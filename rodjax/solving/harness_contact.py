@@ -33,7 +33,7 @@ from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, with_slips, work
-from rodjax.solving.coupling import Coupling, EndContacts, sliding_along
+from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
 from rodjax.solving.rod_contact import Between, BetweenStep, Columns
 
@@ -210,8 +210,7 @@ def _eliminated(
             count = rod.columns.ends.shape[1]
             force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
             second = second.at[:12, moves:].set(rod.columns.ends).at[moves:, :12].set(rod.columns.ends.T)
-        x, y = factors.solve_softly(f, c)
-        by_motions = jax.vmap(factors.solve_softly, (-1, -1), -1)(of_gradient, of_constraints)
+        (x, y), by_motions = solved_with_columns(factors.solve_softly, (f, c), (of_gradient, of_constraints))
         stiffness = second - jnp.einsum("bmi,bmj->ij", by_rotations, by_motions[0])
         stiffness -= by_multipliers.T @ by_motions[1]
         force -= jnp.einsum("bmi,bm->i", by_rotations, x) + by_multipliers.T @ y

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import is_known
+from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.model.harness import Bodies, Harness, clamped, rotated
 from rodjax.model.scene import Scene
 from rodjax.programs.linear import linear
@@ -176,7 +177,8 @@ class _Near(NamedTuple):
         stiffest = jnp.max(jnp.abs(jnp.diagonal(matrix)[:bodies]))
         is_pressure = np.arange(self.size) >= count
         soft = matrix + jnp.diag(jnp.where(is_pressure, ENDS_COMPLIANCE / stiffest, 0.0).astype(right.dtype))
-        found = jnp.linalg.solve(soft, right)
+        inverse = inverse_matrix(soft)
+        found = inverse @ right
         for _ in range(ENDS_HARDENINGS):
-            found += jnp.linalg.solve(soft, right - matrix @ found)
+            found += inverse @ (right - matrix @ found)
         return found

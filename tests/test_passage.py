@@ -10,7 +10,7 @@ from scenes import box_mesh
 
 import rodjax as rj
 from rodjax import Pin, Rod, Scene
-from rodjax.mechanics.passage import SAMPLES, Before, passage
+from rodjax.mechanics.passage import SAMPLES, Before, Sampled, passage
 from rodjax.model.obstacles import InUnits
 from rodjax.solving.status import Status
 
@@ -39,7 +39,8 @@ def found(before, after, obstacle, raised=0.0):
     """`raised`: by how much the obstacle goes up meanwhile."""
     radius, nowhere = jnp.full(SAMPLES, RADIUS), jnp.full((SAMPLES, 3), jnp.nan)
     here, there = (InUnits(obstacle, jnp.array([0, 0, -up]), jnp.ones(())) for up in (0.0, raised))
-    return judged(Before(jnp.asarray(before), (here,)), jnp.asarray(after), (there,), radius, nowhere)
+    now = Sampled(jnp.asarray(after), radius, nowhere, (there,))
+    return judged(Before(jnp.asarray(before), (here,)), now)
 
 
 SOLID = {

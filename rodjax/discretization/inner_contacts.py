@@ -122,7 +122,7 @@ class Elements(NamedTuple):
 
     def with_derivatives(self, t: Float[Array, "q n"]) -> Float[Array, "3 q 3 n"]:
         """Points at these parts, and their first and second derivatives by t."""
-        return jnp.sum(_shapes_at(t, SHAPES)[:, :, :, None] * self.parts[:, None], axis=1)
+        return jnp.sum(_shapes_at(t, SHAPES)[:, :, :, None] * self.parts[None, :, None], axis=1)
 
     def by_tangents(self, t: Float[Array, "n"], forces: Float[Array, "3 n"]) -> Float[Array, "3 2 n"]:
         """The derivatives of forces . x by the tangents of both nodes."""
@@ -222,7 +222,8 @@ def _shapes_at(t: Float[Array, "*q"], shapes: Float[np.ndarray, "*d k 5"]) -> Ar
     powers = [jnp.ones_like(t), t]
     for _ in range(3):
         powers.append(powers[-1] * t)
-    terms = shapes.astype(t.dtype)[(..., *[None] * t.ndim)] * jnp.stack(powers)
+    coefficients = shapes.astype(t.dtype)[(..., *[None] * t.ndim)]
+    terms = coefficients * jnp.stack(powers)[(None,) * (shapes.ndim - 1)]
     return jnp.sum(terms, axis=shapes.ndim - 1)
 
 

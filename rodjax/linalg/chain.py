@@ -18,6 +18,7 @@ with the contact compliance c. Loads without a potential add rows of their own t
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -258,51 +259,74 @@ class ChainSystem(eqx.Module):
     def times(self, x: Float[Array, "b m"], y: Float[Array, "j"]) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """The matrix times (x, y): the right sides."""
         first, pressures, u, force = self.split(y)
+        b, is_closed = len(x), self.contacts.is_closed
         displacements = jnp.where(self.held[:, None], 0.0, u)
-        f = jnp.einsum("ijm,jm->im", self.diagonal, x) + jnp.einsum("ikm,k->im", self.border, first)
-        f = f.at[:, 1:].add(jnp.einsum("ijm,jm->im", self.lower, x[:, :-1]))
-        f = f.at[:, :-1].add(jnp.einsum("jim,jm->im", self.lower, x[:, 1:]))
-        f = f.at[:, 2::2].add(jnp.einsum("ijm,jm->im", self.across, x[:, :-1:2]))
-        f = f.at[:, :-1:2].add(jnp.einsum("jim,jm->im", self.across, x[:, 2::2]))
-        gap = jnp.diff(displacements, axis=0) - jnp.einsum("ijn,nj->ni", self.cell_compliance, force)
-        for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
-            f = f.at[:, at].add(jnp.einsum("icn,nc->in", self.by_force[:, :, point], force))
-            gap += jnp.einsum("icn,in->nc", self.by_force[:, :, point], x[:, at])
-        is_closed = self.contacts.is_closed
-        pushed = jnp.einsum("nij,nj->ni", self.stiffness, displacements)
-        pushed -= self.contacts.pushed(jnp.where(is_closed, pressures, 0.0))
+        at_nodes = jnp.concatenate([x[:, ::2], displacements.T])
+        of_elements = jnp.concatenate([at_nodes[:, :-1], x[:, 1::2], force.T, at_nodes[:, 1:]])
+        before, middles, gap, after = jnp.split(
+            jnp.einsum("pqn,qn->pn", self.elements, of_elements), [b + 3, 2 * b + 3, 2 * b + 6]
+        )
+        nodes = jnp.einsum("pqn,qn->pn", self.nodes, at_nodes) + _on_nodes(before.T, after.T).T
+        middles += jnp.einsum("ijn,jn->in", self.diagonal[..., 1::2], x[:, 1::2])
+        f, balance, gap = _at_points(nodes[:b], middles), nodes[b:].T, gap.T
+        if len(first):
+            f += jnp.einsum("ikm,k->im", self.border, first)
+        pressing = jnp.where(is_closed, pressures, 0.0)
+        balance -= self.contacts.pushed(pressing)
         if self.contacts.inner is not None or self.contacts.far is not None:
-            f -= self.contacts.turned(jnp.where(is_closed, pressures, 0.0), jnp.zeros_like(f))
+            f -= self.contacts.turned(pressing, jnp.zeros_like(f))
         if self.contacts.far is not None:
             moments, forces = self.contacts.far.curved(x, displacements)
             f += moments
-            pushed += forces
-        none = jnp.zeros_like(force[:1])
-        balance = pushed + jnp.concatenate([none, force]) - jnp.concatenate([force, none])
-        if self.loads is not None:
-            ends = jnp.stack([x[:, :-1:2], x[:, 1::2], x[:, 2::2]], axis=1)
-            by_points = jnp.einsum("aicjn,cjn->ain", self.loads.rotation, ends)
-            for point, at in enumerate((slice(0, -1, 2), slice(1, None, 2), slice(2, None, 2))):
-                f = f.at[:, at].add(by_points[:, point])
-            gap += jnp.einsum("acjn,cjn->na", self.loads.segment_vectors, ends)
-            of_nodes = jnp.einsum("kacjn,cjn->kna", self.loads.balance, ends)
-            balance += _on_nodes(*of_nodes)
-        if self.turning is not None:
-            f = f.at[:, ::2].add(jnp.einsum("icn,nc->in", self.turning, displacements))
-            balance += jnp.einsum("icn,in->nc", self.turning, x[:, ::2])
-        if self.between is not None:
-            b = len(f)
-            at_nodes = jnp.concatenate([x[:, ::2], displacements.T])
-            after = jnp.einsum("ijn,jn->in", self.between, at_nodes[:, :-1])
-            before = jnp.einsum("jin,jn->in", self.between, at_nodes[:, 1:])
-            f = f.at[:, 2::2].add(after[:b]).at[:, :-1:2].add(before[:b])
-            balance += _on_nodes(before[b:].T, after[b:].T)
+            balance += forces
         balance = jnp.where(self.held[:, None], u, balance)
         gaps = -jnp.where(
             is_closed, self.contacts.rates(x, displacements) + self.contacts.contact_compliance * pressures, pressures
         )
         first = jnp.einsum("ikm,im->k", self.border, x) - self.compliance @ first
         return f, jnp.concatenate([first, gaps.reshape(-1), balance.reshape(-1), gap.reshape(-1)])
+
+    @property
+    def elements(self) -> Float[Array, "3b+9 3b+9 n"]:
+        """What couples the unknowns of each element: rotation and place of its first node, rotation of its middle, its
+        force, rotation and place of its last node. Without what `nodes` and the middles have by themselves.
+        """
+        b, n = self.across.shape[1:]
+        identity = jnp.broadcast_to(jnp.eye(3, dtype=self.across.dtype)[..., None], (3, 3, n))
+        first, second = self.lower[..., ::2], self.lower[..., 1::2]
+        start, middle, end = (self.by_force[:, :, k] for k in range(3))
+        rows = [
+            [b + 3, _transposed(first), start, _transposed(self.across), 3],
+            [2 * b + 3, -identity, b + 3],
+            [first, b + 3, middle, _transposed(second), 3],
+            [_transposed(start), -identity, _transposed(middle), -self.cell_compliance, _transposed(end), identity],
+            [self.across, 3, second, end, b + 3],
+            [2 * b + 3, identity, b + 3],
+        ]
+        matrix = jnp.concatenate([_row(parts) for parts in rows])
+        if self.between is not None:
+            matrix = matrix.at[2 * b + 6 :, : b + 3].add(self.between)
+            matrix = matrix.at[: b + 3, 2 * b + 6 :].add(_transposed(self.between))
+        if self.loads is None:
+            return matrix
+        points, places = np.arange(b), np.arange(b, b + 3)
+        points = np.concatenate([points, b + 3 + points, 2 * b + 6 + points])
+        rows = np.concatenate([points, 2 * b + 3 + np.arange(3), places, 2 * b + 6 + places])
+        loads = self.loads
+        added = [loads.rotation.transpose(1, 0, 3, 2, 4), jnp.swapaxes(loads.segment_vectors, 1, 2)]
+        added = [part.reshape(-1, 3 * b, n) for part in (*added, jnp.swapaxes(loads.balance, 2, 3))]
+        return matrix.at[rows[:, None], points[None]].add(jnp.concatenate(added))
+
+    @property
+    def nodes(self) -> Float[Array, "b+3 b+3 n+1"]:
+        """What couples the rotation of each node, and its place, with these."""
+        of_places = self.stiffness.transpose(1, 2, 0)
+        if self.turning is None:
+            turning = jnp.zeros((len(self.diagonal), 3, len(self.held)), of_places.dtype)
+        else:
+            turning = self.turning
+        turns = jnp.concatenate([self.diagonal[..., ::2], turning], axis=1)
+        return jnp.concatenate([turns, jnp.concatenate([_transposed(turning), of_places], axis=1)])
 
     def split(self, y: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
         """What belongs to the border (k,), the contacts (k, p), the nodes (n+1, 3) and the elements (n, 3)."""
@@ -495,8 +519,7 @@ class ChainFactors(eqx.Module):
         around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
         of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)
-        x = jnp.zeros_like(f).at[..., ::2].set(z[:, :b].transpose(1, 2, 0))
-        x = x.at[..., 1::2].set(of_middles.transpose(1, 2, 0))
+        x = _at_points(z[:, :b].transpose(1, 2, 0), of_middles.transpose(1, 2, 0))
         return x, z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
 
 
@@ -511,21 +534,25 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     identity = jnp.eye(3, dtype=dtype)
     start, end, gap = slice(0, b), slice(b, 2 * b), slice(2 * b, 2 * b + 3)  # of an element
     turn, pull, place = slice(0, b), slice(b, b + 3), slice(b + 3, None)  # of the unknowns of a node
-    blocks = jnp.zeros((n + 1, b + 6, b + 6), dtype)
-    blocks = blocks.at[:, turn, turn].set(system.diagonal[..., ::2].transpose(2, 0, 1))
-    blocks = blocks.at[:-1, turn, turn].add(elements[:, start, start]).at[1:, turn, turn].add(elements[:, end, end])
-    blocks = blocks.at[1:, pull, turn].set(elements[:, gap, end]).at[1:, turn, pull].set(elements[:, end, gap])
+    none = jnp.zeros((n + 1, b, 3), dtype)
+    turning = none if system.turning is None else system.turning.transpose(2, 0, 1) * free[:, None, None]
+    turns = system.diagonal[..., ::2].transpose(2, 0, 1) + _on_nodes(elements[:, start, start], elements[:, end, end])
     # The first node has no element before it.
-    blocks = blocks.at[1:, pull, pull].set(elements[:, gap, gap]).at[0, pull, pull].set(-identity)
-    pushed = free[1:, None, None] * identity[None]
-    blocks = blocks.at[1:, pull, place].set(pushed).at[1:, place, pull].set(pushed)
-    blocks = blocks.at[:, place, place].set(jnp.where(system.held[:, None, None], identity[None], system.stiffness))
-    if system.turning is not None:
-        turning = system.turning.transpose(2, 0, 1) * free[:, None, None]
-        blocks = blocks.at[:, turn, place].set(turning).at[:, place, turn].set(turning.transpose(0, 2, 1))
-    below = jnp.zeros((n, b + 6, b + 6), dtype)
-    below = below.at[:, turn, turn].set(elements[:, end, start]).at[:, pull, turn].set(elements[:, gap, start])
-    below = below.at[:, pull, place].set(-free[:-1, None, None] * identity[None])
+    pulling = _after(elements[:, gap, end])
+    pulls = jnp.concatenate([-identity[None], elements[:, gap, gap]])
+    pushed = _after(free[1:, None, None] * identity[None])
+    places = jnp.where(system.held[:, None, None], identity[None], system.stiffness)
+    blocks = _matrices(
+        [turns, _after(elements[:, end, gap]), turning],
+        [pulling, pulls, pushed],
+        [turning.transpose(0, 2, 1), pushed, places],
+    )
+    apart = jnp.zeros((n, 3, b + 6), dtype)
+    below = _matrices(
+        [elements[:, end, start], apart[..., :b].transpose(0, 2, 1), none[1:]],
+        [elements[:, gap, start], apart[..., :3], -free[:-1, None, None] * identity[None]],
+        [apart],
+    )
     above = below.transpose(0, 2, 1)
     if system.loads is not None:
         above = above.at[:, turn, turn].set(elements[:, start, end]).at[:, turn, pull].set(elements[:, start, gap])
@@ -641,6 +668,36 @@ def _eliminated(system: ChainSystem) -> tuple[_Middles, Float[Array, "n rows 2b+
     direct = direct.at[..., :b].add(of_point(0)).at[..., b : 2 * b].add(of_point(2))
     solved = inverse @ columns
     return _Middles(solved, inverse, rows @ inverse), direct - rows @ solved, jnp.zeros((), int)
+
+
+def _transposed(blocks: Float[Array, "i j n"]) -> Float[Array, "j i n"]:
+    return jnp.swapaxes(blocks, 0, 1)
+
+
+def _row(parts: list[Any]) -> Float[Array, "i j n"]:
+    """Of blocks side by side; a number is that of columns that are zero."""
+    like = next(part for part in parts if not isinstance(part, int))
+
+    def filled(part: Any) -> Array:
+        return jnp.zeros((len(like), part, like.shape[2]), like.dtype) if isinstance(part, int) else part
+
+    return jnp.concatenate([filled(part) for part in parts], axis=1)
+
+
+def _matrices(*rows: list[Array]) -> Float[Array, "n i j"]:
+    """Of their blocks, row by row."""
+    return jnp.concatenate([jnp.concatenate(blocks, axis=2) for blocks in rows], axis=1)
+
+
+def _at_points(nodes: Float[Array, "*c n+1"], middles: Float[Array, "*c n"]) -> Float[Array, "*c m"]:
+    """Nodes and middles in turn."""
+    pairs = jnp.stack([nodes[..., :-1], middles], axis=-1).reshape(*middles.shape[:-1], -1)
+    return jnp.concatenate([pairs, nodes[..., -1:]], axis=-1)
+
+
+def _after(of_elements: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:
+    """What nodes have of the element before them."""
+    return jnp.concatenate([jnp.zeros_like(of_elements[:1]), of_elements])
 
 
 def _on_nodes(before: Float[Array, "n *c"], after: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:

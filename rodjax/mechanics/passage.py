@@ -9,6 +9,7 @@ said then but whether it ends within.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,6 +41,22 @@ class Before(eqx.Module):
     obstacles: tuple[Obstacle, ...]
 
 
+class Sampled(NamedTuple):
+    """Where a rod is now, as `Before` has it, in SI units; its radius there; `held`: beside what a support holds this,
+    elsewhere not a number.
+    """
+
+    points: Float[Array, "samples 3"]
+    radius: Float[Array, "samples"]
+    held: Float[Array, "samples 3"]
+    obstacles: tuple[Obstacle, ...]
+
+    @property
+    def before(self) -> Before:
+        """The next place."""
+        return Before(self.points, self.obstacles)
+
+
 class Passage(eqx.Module):
     """The first obstacle, -1 for none, that a rod came through or lies within, which of both, and where, as a part of
     its length; and whether it lies within any.
@@ -55,17 +72,9 @@ class Passage(eqx.Module):
         return self.obstacle < 0
 
 
-def passage(
-    before: Before,
-    points: Float[Array, "samples 3"],
-    obstacles: tuple[Obstacle, ...],
-    radius: Float[Array, "samples"],
-    held: Float[Array, "samples 3"],
-) -> Passage:
-    """Of a rod that is now at `points`; `held`: beside what a support holds this, elsewhere not a number.
-
-    A rod that a support holds within an obstacle may lie as deep beside it.
-    """
+def passage(before: Before, now: Sampled) -> Passage:
+    """A rod that a support holds within an obstacle may lie as deep beside it."""
+    points, radius, held, obstacles = now
     found = [
         _through(old, new, before.points, points, radius, held)
         for old, new in zip(before.obstacles, obstacles, strict=True)

@@ -34,7 +34,7 @@ from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.geometry.interpolation import resampled
-from rodjax.mechanics.passage import SAMPLES, Before
+from rodjax.mechanics.passage import SAMPLES, Before, passage
 from rodjax.model.plane import check_planar, is_planar, plane
 from rodjax.model.scene import (
     Scene,
@@ -78,7 +78,7 @@ from rodjax.solving.result import (
     SolverState,
     build_result,
     estimated_errors,
-    passage_to,
+    sampled,
     warn_if_coarse,
     warn_of_outcome,
     warn_of_single_precision,
@@ -808,19 +808,18 @@ def on_one_side(search: Search, form: Form, found: Found, before: Before | None)
     assert before is not None
     assert search.point.nodal is not None
     positions = search.point.nodal.positions
-    begin, _, _ = begun.samples(positions, search.point)
-    begin = search.units.origin[None] + search.units.length * begin
-    before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin, before.points))
-    passed, now = passage_to(form, found.point, found.state.shape.nodes, found.state.units, before)
+    begin = sampled(begun, search.point, positions, search.units)
+    now = sampled(form, found.point, found.state.shape.nodes, found.state.units)
+    before = dataclasses.replace(before, points=jnp.where(jnp.isnan(before.points), begin.points, before.points))
+    passed = passage(before, now)
 
     def stayed() -> Bool[Array, ""]:
-        begins, _ = passage_to(begun, search.point, positions, search.units, before)
-        return begins.is_sound & ~passed.lies_within
+        return passage(before, begin).is_sound & ~passed.lies_within
 
     is_sound = jax.lax.cond(passed.is_sound, lambda: jnp.array(True), stayed)
     converged = is_converged(found.outcome.status)
     status = jnp.where(converged & ~is_sound, Status.PASSED_THROUGH, found.outcome.status)
-    kept = jax.tree.map(lambda new, old: jnp.where(converged & is_sound, new, old), now, before)
+    kept = jax.tree.map(lambda new, old: jnp.where(converged & is_sound, new, old), now.before, before)
     return eqx.tree_at(
         lambda found: (found.outcome.status, found.state.before),
         found,

@@ -46,7 +46,7 @@ from rodjax.discretization.sliding import NEARLY_OUT
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor
-from rodjax.mechanics.passage import Before, Passage, passage
+from rodjax.mechanics.passage import Before, Passage, Sampled, passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
@@ -904,19 +904,16 @@ def _passage_of(equilibrium: Equilibrium) -> Passage:
         return Passage(
             jnp.full((), -1), jnp.full_like(equilibrium.residual, jnp.nan), jnp.array(False), jnp.array(False)
         )
-    found, _ = passage_to(form, point, state.shape.nodes, state.units, state.before)
+    found = passage(state.before, sampled(form, point, state.shape.nodes, state.units))
     return found
 
 
-def passage_to(
-    form: NodalForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units, before: Before
-) -> tuple[Passage, Before]:
-    """Whether a rod came through an obstacle to a point of a form with these nodes; and what is before the next one."""
+def sampled(form: NodalForm, point: Point, nodes: Float[Array, "n+1 3"], units: Units) -> Sampled:
+    """Where a rod is, at a point of a form with these nodes."""
     points, radius, held = form.samples(nodes, point)
     points, held = (units.origin[None] + units.length * place for place in (points, held))
     obstacles = tuple(obstacle.obstacle for obstacle in form.scene.obstacles if isinstance(obstacle, InUnits))
-    found = passage(before, points, obstacles, units.length * radius, held)
-    return found, Before(points, obstacles)
+    return Sampled(points, units.length * radius, held, obstacles)
 
 
 def warn_if_coarse(equilibrium: Equilibrium) -> None:

@@ -7,7 +7,7 @@ import inspect
 import itertools
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ class _Programs:
             return self.function(*args, **options)
 
         # The same mesh of devices as where JAX transposes, that the two may share what they trace.
-        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()), _without_collector():
             return jax.jit(anew, static_argnames=tuple(self.static)).trace(*args, **options)
 
     @property
@@ -112,6 +112,18 @@ class _Programs:
         if run._cache_size() != known:
             _make_room()
         return result
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Python's garbage collector, which looks through what a trace makes again and again, a tenth of its time."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def _kind(leaf: Any) -> Any:

@@ -26,7 +26,8 @@ from rodjax.discretization.sliding_point import SlidingLinearization, SlidingPoi
 from rodjax.linalg.bordered import BorderedSystem
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import SaddlePointSystem
-from rodjax.model.supports import Clamp, rotate
+from rodjax.model.harness import rotated
+from rodjax.model.supports import Clamp
 from rodjax.units import Units
 
 ENDS = (0, -1)
@@ -50,16 +51,15 @@ class RodInBodies(NamedTuple):
     def form_at(self, motions: Float[Array, "2 6"] | None = None) -> Form:
         """The form with its ends at the poses of the bodies after these motions."""
         scene, form = self.form.scene, self.form
-        ends = []
+        places, bodies, ends = self.position_of_body, self.frame_of_body, []
+        if motions is not None:
+            places, bodies = places + self.length * motions[:, :3], rotated(bodies, motions[:, 3:])
+        places += (bodies @ self.offset[..., None])[..., 0]
+        places, frames = (places - self.units.origin[None]) / self.units.length, bodies @ self.frame
         for end, support in enumerate((scene.start, scene.end)):
             if isinstance(support, Clamp):
-                place, frame = self.position_of_body[end], self.frame_of_body[end]
-                if motions is not None:
-                    place += self.length * motions[end, :3]
-                    frame = rotate(frame, motions[end, 3:])
-                place = (place + frame @ self.offset[end] - self.units.origin) / self.units.length
-                place = jnp.where(self.is_joint[end], place, support.position)
-                frame = jnp.where(self.is_joint[end], frame @ self.frame[end], support.frame)
+                place = jnp.where(self.is_joint[end], places[end], support.position)
+                frame = jnp.where(self.is_joint[end], frames[end], support.frame)
                 support = eqx.tree_at(lambda clamp: (clamp.position, clamp.frame), support, (place, frame))
             ends.append(support)
         if isinstance(form, SlidingForm):

@@ -187,6 +187,15 @@ class NodalForm(PositionForm):
             displacements = travelled(self, nodal.positions, nodal.friction)
         return _merit_of_contacts(contact_model(self, point, self.gaps(there), displacements), others)
 
+    def contact_rate(
+        self, here: Linearization, point: Any, others: NodalChange, rates: Float[Array, "r n+1"]
+    ) -> Float[Array, ""]:
+        """How fast that changes as a step begins, in which gaps change at these rates."""
+        assert here.gaps is not None
+        model = contact_model(self, point, here.gaps, here.reference_displacements)
+        pushing = model.allowed(model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE)
+        return -jnp.sum(pushing * rates)
+
     def gaps(self, point: Any) -> Float[Array, "k n+1"]:
         """In the rows of pressures."""
         gaps, _ = gaps_and_normals(self, point.nodal.positions)
@@ -255,13 +264,10 @@ class NodalForm(PositionForm):
         (before, _), (counted, _) = jax.jvp(
             lambda elements: parts(elements, positions, jnp.zeros_like(change)), (elements,), (rates,)
         )
-        assert here.gaps is not None
         assert isinstance(here.system, ChainSystem)
-        model = contact_model(self, point, here.gaps, here.reference_displacements)
-        # With the new pressures in place of the old ones.
-        pushing = model.allowed(model.pressures + others.pressures - model.gaps / MERIT_COMPLIANCE)
         rows = here.system.contacts
-        rate -= jnp.sum(pushing * rows.rates(rotation, others.displacements))
+        # With the new pressures in place of the old ones.
+        rate += self.contact_rate(here, point, others, rows.rates(rotation, others.displacements))
         if rows.inner is not None or rows.far is not None:
             # The gradient by rotations has the pressures as they are.
             at_rest = rows.rates(rotation, jnp.zeros_like(others.displacements))

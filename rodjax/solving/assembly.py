@@ -46,6 +46,7 @@ from rodjax.solving.coupling import (
     EndContacts,
     RodInBodies,
     end_contact_energy,
+    end_contact_rate,
     end_contacts,
     free_points,
     linearized_with_ends,
@@ -150,6 +151,18 @@ class RodStep(NamedTuple):
         """L after a part of the rotations, under the new forces and pressures, with its ends moved and the energy of
         contacts; what it lacks of its spans; the point there.
         """
+        form, value, constraint_residual, there = self.without_contacts(rod, motions, part)
+        if self.at_ends is not None:
+            assert isinstance(form, NodalForm | SlidingForm)
+            assert self.at_ends_change is not None
+            value += form.contact_energy(there, self.point, self.others)
+            value += end_contact_energy(rod, form, self.at_ends, self.at_ends_change)
+        return value, constraint_residual, there
+
+    def without_contacts(
+        self, rod: RodInBodies, motions: Float[Array, "2 6"], part: Float[Array, ""]
+    ) -> tuple[Form, Float[Array, ""], Float[Array, "c"], Any]:
+        """With the form there."""
         form = rod.form_at(motions)
         others = form.scaled(self.others, part, 1.0)
         there = form.holding(form.retract(self.point, self.bases, part * self.rotation, self.force_change, others))
@@ -157,12 +170,20 @@ class RodStep(NamedTuple):
         scene = form.scene
         if isinstance(form, SlidingForm):
             value -= self.point.excess_at(there.arclengths)
-        if self.at_ends is not None:
-            assert isinstance(form, NodalForm | SlidingForm)
-            assert self.at_ends_change is not None
-            value += form.contact_energy(there, self.point, self.others)
-            value += end_contact_energy(rod, form, self.at_ends, self.at_ends_change)
-        return value + dead_load_energy(total_force(scene), held_position(scene)), constraint_residual, there
+        return form, value + dead_load_energy(total_force(scene), held_position(scene)), constraint_residual, there
+
+    def contact_rate(
+        self, form: NodalForm, here: Linearization, coupling: Coupling, motions: Float[Array, "2 6"]
+    ) -> Float[Array, ""]:
+        """How fast the energy of contacts changes as the step begins."""
+        assert isinstance(here.system, ChainSystem)
+        assert self.at_ends is not None
+        assert self.at_ends_change is not None
+        rates = here.system.contacts.rates(self.rotation, self.others.displacements)
+        if coupling.of_gaps is not None:
+            rates += coupling.of_gaps @ motions.reshape(12)
+        rate = form.contact_rate(here, self.point, self.others, rates)
+        return rate + end_contact_rate(self.at_ends, self.at_ends_change, motions)
 
 
 class Eliminated(NamedTuple):
@@ -973,11 +994,18 @@ def _rates(here: _Here, step: RodStep, of_ends: Float[Array, "k 2 6"]) -> tuple[
     a step begins under the new forces.
     """
 
-    def of_rod(step: RodStep, rod: RodInBodies, of_ends: Float[Array, "2 6"]) -> tuple[Any, Any]:
-        zero = jnp.zeros((), of_ends.dtype)
-        return jax.jvp(lambda part: step.value(rod, part * of_ends, part)[:2], (zero,), (jnp.ones_like(zero),))
+    def of_rod(
+        step: RodStep, rod: RodInBodies, here: Linearization, coupling: Coupling, of_ends: Float[Array, "2 6"]
+    ) -> tuple[Any, Any]:
+        zero, form = jnp.zeros((), of_ends.dtype), rod.form
+        if step.at_ends is None or not isinstance(form, NodalForm):
+            return jax.jvp(lambda part: step.value(rod, part * of_ends, part)[:2], (zero,), (jnp.ones_like(zero),))
+        values, (along, rates) = jax.jvp(
+            lambda part: step.without_contacts(rod, part * of_ends, part)[1:3], (zero,), (jnp.ones_like(zero),)
+        )
+        return values, (along + step.contact_rate(form, here, coupling, of_ends), rates)
 
-    return jax.vmap(of_rod)(step, here.rods, of_ends)
+    return jax.vmap(of_rod)(step, here.rods, here.linearization, here.coupling, of_ends)
 
 
 # --- what follows ----------------------------------------------------------------------------------------------------

@@ -162,6 +162,12 @@ def end_contact_energy(
     return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 
 
+def end_contact_rate(here: EndContacts, change: Float[Array, "o 2"], motions: Float[Array, "2 6"]) -> Float[Array, ""]:
+    """How fast that changes as such a step begins."""
+    pushing = here.pressures + change - here.gaps / MERIT_COMPLIANCE
+    return -jnp.sum(jnp.where(pushing > 0, pushing, 0.0) * jnp.einsum("oei,ei->oe", here.rates, motions))
+
+
 def end_contacts(
     rod: RodInBodies, form: NodalForm | SlidingForm, pressures: Float[Array, "o 2"], coupling: Coupling
 ) -> tuple[EndContacts, Coupling]:

@@ -21,6 +21,7 @@ from rodjax.programs.numpy_rules import OTHERS
 def substituted(
     couplings: Float[Array, "*m n c c"], right: Float[Array, "*m n+1 c r"], *, backward: bool = False
 ) -> Float[Array, "*m n+1 c r"]:
+    """r solutions of each system, which stand along the first axes."""
     return _substitution.bind(couplings, right, backward=backward)
 
 

@@ -215,7 +215,8 @@ def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
     process = subprocess.Popen(
         command,
         cwd=tmp_path,
-        env=os.environ | {"RODJAX_CACHE": "off"},
+        # Python itself would write what it compiles of the packages.
+        env=os.environ | {"RODJAX_CACHE": "off", "PYTHONDONTWRITEBYTECODE": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

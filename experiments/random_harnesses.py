@@ -6,6 +6,10 @@ offsets, masses, forces, dead moments, and supports of every kind; some rods hav
 lie over a floor, half of these over a pipe too; in some all rods may touch. With `--sliding` more rods have clips,
 through which they slide, and do not touch one another; with `--follower` half of the rods bear forces that follow them
 or couples. Prints a line a harness, and how many converge.
+
+With `--bundle` cables of 16 elements lie along one another instead: "twisted", two or three between connectors of which
+one is turned about its axis; "flat", two to four side by side between connectors in different directions. Prints how
+deep they lie in one another, too.
 """
 
 import argparse
@@ -16,6 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.spatial import KDTree
 
 import rodjax as rj
 
@@ -26,7 +31,7 @@ SUPPORTS = ("hinge", "line", "plane", "spring", "pin", "pin on a spring")
 
 
 class Outcome(NamedTuple):
-    """`seconds`: of the processor, with all tracing and compiling."""
+    """`seconds`: of the processor, with all tracing and compiling; `depth`: of cables in one another, in radii."""
 
     seed: int
     name: str
@@ -34,6 +39,7 @@ class Outcome(NamedTuple):
     iterations: int
     segments: list[int]
     seconds: float
+    depth: float | None = None
 
 
 class Drawn:
@@ -181,6 +187,48 @@ def _end(drawn: Drawn, name: str, position: np.ndarray, tangent: np.ndarray) -> 
     return rj.Clamp(position, frame) if kind == "clamp" else rj.Swivel(position, tangent)
 
 
+def bundle_of(seed: int, kind: str) -> tuple[str, rj.Harness]:
+    """Cables of one radius that lie along one another; "twisted" or "flat"."""
+    random = np.random.default_rng(seed)
+    radius, gravity = 10 ** random.uniform(-2.3, -1.7), random.choice([0, 1, 1]) * GRAVITY
+
+    def rod(length: float) -> rj.Rod:
+        return rj.Rod.circular(length, radius, 10 ** random.uniform(6.5, 8.5), poisson_ratio=0.5, density=1200.0)
+
+    cables = {}
+    if kind == "twisted":
+        count = int(random.integers(2, 4))
+        pitch, turn = 2 * radius * random.uniform(1.02, 2), random.uniform(-np.pi, np.pi)
+        length, around = random.uniform(1.0, 1.08), pitch / (2 if count == 2 else np.sqrt(3))
+        for k in range(count):
+            angle, frame = 2 * np.pi * k / count, rj.frame(LEVEL)
+            first, last = (around * np.array([0, np.cos(a), np.sin(a)]) for a in (angle, angle + turn))
+            ends = rj.Clamp(first, frame), rj.Clamp(LEVEL + last, frame)
+            cables[f"c{k}"] = rj.Scene(rod(length * random.uniform(0.995, 1.005)), *ends, gravity)
+        return f"{count} twisted by {turn:.2f} rad", rj.Harness(cables, contact=True)
+    count = int(random.integers(2, 5))
+    pitch = 2 * radius * random.uniform(1.01, 1.3)
+    last = np.array([random.uniform(0.7, 0.95), random.uniform(-0.2, 0.2), random.uniform(-0.2, 0.2)])
+    tangent = np.array([1.0, random.normal(0, 0.4), random.normal(0, 0.4)])
+    frames = rj.frame(LEVEL, d2=UP), rj.frame(tangent, d2=UP)
+    for k in range(count):
+        aside = (k - (count - 1) / 2) * pitch
+        places = (place + aside * np.asarray(frame)[:, 0] for place, frame in zip((0.0, last), frames, strict=True))
+        start, end = (rj.Clamp(place, frame) for place, frame in zip(places, frames, strict=True))
+        cables[f"c{k}"] = rj.Scene(rod(1.1 * random.uniform(1.0, 1.01)), start, end, gravity)
+    return f"{count} side by side", rj.Harness(cables, contact=True)
+
+
+def deepest(result: rj.HarnessEquilibrium) -> float:
+    """By how much cables lie in one another, in radii; by places a thousandth of them apart."""
+    parts, depth = np.linspace(0, 1, 1001), 0.0
+    for first, second in result.rod_contacts:
+        one, other = (np.asarray(result[name].position_at(parts * result[name].s[-1])) for name in (first, second))
+        radius = float(np.asarray(result[first].scene.rod.radius))
+        depth = max(depth, 2 - float(KDTree(one).query(other)[0].min()) / radius)
+    return depth
+
+
 def main(argv: Sequence[str] | None = None) -> list[Outcome]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=40)
@@ -188,17 +236,22 @@ def main(argv: Sequence[str] | None = None) -> list[Outcome]:
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--sliding", action="store_true")
     kind.add_argument("--follower", action="store_true")
+    kind.add_argument("--bundle", choices=["twisted", "flat"])
     arguments = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     found = []
     for seed in range(arguments.seed, arguments.seed + arguments.count):
-        name, harness = harness_of(seed, slides=arguments.sliding, follower=arguments.follower)
+        if arguments.bundle:
+            name, harness = bundle_of(seed, arguments.bundle)
+        else:
+            name, harness = harness_of(seed, slides=arguments.sliding, follower=arguments.follower)
         begin = time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            result = rj.solve(harness)
+            result = rj.solve(harness, segments=16) if arguments.bundle else rj.solve(harness)
         seconds = time.process_time() - begin
-        outcome = Outcome(seed, name, bool(result.converged), int(result.iterations), result.segments, seconds)
+        depth = deepest(result) if arguments.bundle else None
+        outcome = Outcome(seed, name, bool(result.converged), int(result.iterations), result.segments, seconds, depth)
         found.append(outcome)
         why = rj.Status(int(result.status)).message.partition(":")[2]
         told = "converges" if outcome.converged else f"does not converge:{why}, residual {float(result.residual):.1e}"
@@ -210,6 +263,9 @@ def main(argv: Sequence[str] | None = None) -> list[Outcome]:
         f"{len(iterations)} of {len(found)} converge, in {np.median(iterations):.0f} iterations in the median, "
         f"{np.quantile(iterations, 0.9):.0f} in 90 %, {max(iterations)} at most"
     )
+    if arguments.bundle:
+        depths = [outcome.depth for outcome in found if outcome.converged]
+        print(f"deep by {np.median(depths):.1e} radii in the median, {np.max(depths):.1e} at most")
     return found
 
 

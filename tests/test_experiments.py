@@ -388,8 +388,9 @@ def test_random_harnesses(capsys):
     outcomes = script("random_harnesses").main(["--count", "1", "--seed", "3"])
     outcomes += script("random_harnesses").main(["--count", "1", "--seed", "3", "--sliding"])
     outcomes += script("random_harnesses").main(["--count", "1", "--seed", "7", "--follower"])
+    outcomes += script("random_harnesses").main(["--count", "1", "--seed", "55", "--bundle", "twisted"])
     assert all(outcome.converged for outcome in outcomes)
-    assert capsys.readouterr().out.count("1 of 1 converge") == 3
+    assert capsys.readouterr().out.count("1 of 1 converge") == 4
 
 
 @pytest.mark.slow

@@ -115,6 +115,69 @@ def test_beams_that_do_not_reach_one_another_do_not_touch():
     assert "no rods touch one another" in rodjax.describe(apart)
 
 
+# --- rods along one another ------------------------------------------------------------------------------------------
+
+
+def lying_together(apart, reach, stiffer=0.0) -> tuple[Harness, float]:
+    """Two beams side by side, so far apart between the same clamps, pressed together by a load on each that lets them
+    touch from `reach` after the clamps on: q = 72 EI w/reach^4, as of a beam that is pressed on a plane at a distance
+    w, here of 0.02 radii. And q. `stiffer`: of the lower one.
+    """
+    load = 72 * EI * 0.02 * RADIUS / reach**4
+    density, cables = load / (np.pi * RADIUS**2 * 10.0), {}
+    for name, side, modulus in (("upper", 1.0, YOUNGS_MODULUS), ("lower", -1.0, YOUNGS_MODULUS * (1 + stiffer))):
+        heavy = Rod.circular(LENGTH, RADIUS, modulus, poisson_ratio=0.5, density=density)
+        height = side * (RADIUS + jnp.asarray(apart) / 2)
+        ends = [Clamp(jnp.stack([jnp.asarray(x), jnp.zeros(()), height]), ALONG) for x in (0.0, LENGTH)]
+        cables[name] = Scene(heavy, *ends, (0, 0, -10.0 * side))
+    return Harness(cables, contact=True), load
+
+
+@pytest.mark.parametrize(("segments", "rtol"), [(16, 2e-3), (64, 1e-4)])
+def test_beams_pressed_together_touch_along_a_line(segments, rtol):
+    """As one of them on a plane: between the places from which on they touch, where each is pushed by q reach/3, as it
+    is loaded. 8.6e-4 and 4.3e-5 of the force; on 64 elements 26 of them touch.
+    """
+    reach = 0.3
+    harness, load = lying_together(0.04 * RADIUS, reach)
+    found = rodjax.solve(harness, segments=segments)
+    assert found.converged
+    assert found.stable
+    assert found.iterations <= 5  # 3: the places where they touch are known beforehand
+    force = load * (LENGTH - 4 / 3 * reach)
+    np.testing.assert_allclose(found["lower"].contact_forces.sum(0), [0, 0, -force], atol=rtol * force)
+    contacts = found.rod_contacts["upper", "lower"]
+    pushes = np.linalg.norm(contacts.forces, axis=1)
+    first, last = contacts.s[np.flatnonzero(pushes)[[0, -1]]]
+    # The places are known to an element.
+    np.testing.assert_allclose([first, LENGTH - last], reach, atol=LENGTH / segments)
+    np.testing.assert_allclose(contacts.gaps[pushes > 0], 0.0, atol=1e-11)
+    # Where they lie on one another each element bears its load, to the ripple beside the ends.
+    inner = pushes[(contacts.s > 0.42) & (contacts.s < 0.58)] * segments / LENGTH
+    np.testing.assert_allclose(inner, load, rtol=0.15 if segments == 16 else 1e-3)
+
+
+@pytest.mark.slow
+def test_derivatives_of_rods_along_one_another():
+    """By how far they are apart, and the stiffness of one, beside differences."""
+    begin = jnp.array([0.04 * RADIUS, 0.0])
+
+    def numbers(given, guess=None):
+        harness, _ = lying_together(given[0], 0.3, given[1])
+        found = rodjax.solve(harness, segments=16, solver=TIGHT, guess=guess)
+        forces = found["upper"].end_force[2], found.rod_pressures.sum(), found["lower"].start_moment[1]
+        return jnp.stack([*forces, found["lower"].nodes[3, 2], found.energy]), found
+
+    values, found = numbers(begin)
+    assert jnp.any(found.wide_wells & (found.rod_pressures > 0))
+    rates = jax.jacfwd(lambda given: numbers(given)[0])(begin)
+    for k, step in enumerate((1e-3 * RADIUS, 1e-3)):
+        after, before = (numbers(begin.at[k].add(way), guess=found)[0] for way in (step, -step))
+        np.testing.assert_allclose(
+            step * rates[:, k], (after - before) / 2, rtol=1e-5, atol=1e-8 * np.abs(values).max()
+        )
+
+
 @pytest.mark.slow
 def test_a_rod_on_a_floor_that_touches_no_other_is_as_alone(pressed):
     """Of another structure than those that touch."""
@@ -152,7 +215,7 @@ def test_derivatives_of_too_many_contacts_are_no_numbers(pressed, monkeypatch):
     monkeypatch.setattr("rodjax.solving.rod_contact_results.MOST_TOUCHING", 4)
     for count, is_known in ((4, True), (5, False)):
         pressures = jnp.where(jnp.arange(8) < count, 1.0, 0.0)
-        found = touching_rods(pressed.harness, pressed.groups, pressures, pressed.members)
+        found = touching_rods(pressed.harness, pressed.groups, pressures, pressed.wide_wells, pressed.members)
         assert found is not None
         assert bool(jnp.all(jnp.isfinite(found.values))) == is_known
         assert bool(jnp.isfinite(found.force)) == is_known
@@ -179,9 +242,10 @@ def test_no_beam_is_led_through_the_other():
 def test_what_touches_comes_back_from_a_file_to_the_last_bit(pressed, tmp_path):
     rodjax.save(pressed, tmp_path / "harness.vtkhdf")
     with h5py.File(tmp_path / "harness.vtkhdf", "r") as file:
-        assert file["rodjax"].attrs["format"] == 17
+        assert file["rodjax"].attrs["format"] == 18
         for place in (
             "rod_pressures",
+            "wide_wells",
             *(f"cables/1/scene/contact_loads/on_{name}" for name in ("positions", "tangents")),
         ):
             attributes = file[f"rodjax/{place}"].attrs

@@ -43,7 +43,7 @@ from rodjax.discretization.node_contacts import (
 from rodjax.discretization.node_friction import travelled, with_friction
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.potentials import OnElements
-from rodjax.discretization.self_contact import comes_through, wide_cells
+from rodjax.discretization.self_contact import comes_through, exerted, wide_cells
 from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
@@ -118,7 +118,9 @@ class NodalForm(PositionForm):
         before, pressures = point.nodal.is_wide, point.nodal.pressures[-1]
         is_wide = wide_cells(curve(self, point), pressures)
         is_wide = jnp.where(jnp.all(before), is_wide, before | is_wide) | ~is_balanced
-        return _with_wells(point, is_wide), jnp.any((is_wide != before) & (pressures[:-1] > 0))
+        point = _with_wells(point, is_wide)
+        touches = (pressures[:-1] > 0) | (exerted(curve(self, point), pressures).gaps < 0)
+        return point, jnp.any((is_wide != before) & touches)
 
     def ended(self, point: Any) -> Any:
         return _with_wells(point, None) if has_wells(self.scene) else point

@@ -9,24 +9,28 @@ second one alone.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.discretization.self_contact import (
     NOTHING_BEYOND,
     Curve,
     Nearest,
     gap_vectors,
+    growth,
     moving_gaps,
-    narrow_wells,
     nearest,
     on_elements,
+    with_wells,
 )
 
-# As `self_contact.NARROW`, of all cells: of rods that cross, four times that times the radius by the length of an
-# element is the force along them by that of the contact, at most.
+# As `self_contact.NARROW`: of rods that cross, four times that times the radius by the length of an element is the
+# force along them by that of the contact, at most.
 NARROW_OF_PAIRS = 3e-6
+# As `self_contact.GROWS`, of all contacts. A wide well lets rods lie deeper beside its place by this times an eighth of
+# the squared length of an element by the radius [radii], at most.
+GROWS_OF_PAIRS = 0.01
 # Of the elements of a rod, those nearest to another one may touch it: at most so many.
-MOST_OF_PAIR = 16
+MOST_OF_PAIR = 32
 
 
 def joined(first: Curve, second: Curve) -> Curve:
@@ -35,7 +39,7 @@ def joined(first: Curve, second: Curve) -> Curve:
     offset = first.s[-1] + second.s[1] - second.s[0]
     begin, nothing = offset + second.s[0], jnp.full_like(second.s, jnp.inf)
     least = jnp.concatenate([jnp.full_like(first.s[1:], begin), nothing])
-    both = Curve(
+    return Curve(
         jnp.concatenate([first.s, offset + second.s]),
         jnp.concatenate([first.positions, second.positions]),
         jnp.concatenate([first.tangents, second.tangents], axis=1),
@@ -44,7 +48,16 @@ def joined(first: Curve, second: Curve) -> Curve:
         jnp.concatenate([first.radius, first.radius[:1], second.radius]),
         reach=(least, jnp.full_like(least, offset + second.s[-1]), first.s[-1]),
     )
-    return both._replace(wells=narrow_wells(both, NARROW_OF_PAIRS))
+
+
+def with_pair_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
+    """With wide wells in these cells of the first rod."""
+    return with_wells(curve, jnp.pad(is_wide, (0, len(curve.radius) - len(is_wide))), NARROW_OF_PAIRS)
+
+
+def wide_of_pair(curve: Curve, elements: int) -> Bool[Array, "n"]:
+    """Which cells of the first rod, of as many elements as that, are to have wide wells in an equilibrium."""
+    return growth(curve)[:elements] < GROWS_OF_PAIRS
 
 
 class PairContacts(NamedTuple):

@@ -420,23 +420,30 @@ def narrow_wells(curve: Curve, depth: float = NARROW) -> Float[Array, "n"]:
     return 8 * depth * curve.radius / jnp.diff(curve.s) ** 2
 
 
-def with_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
-    """With wide wells in these cells and narrow ones in the others."""
+def with_wells(curve: Curve, is_wide: Bool[Array, "*n"], depth: float = NARROW) -> Curve:
+    """With wide wells in these cells and narrow ones, of this depth, in the others."""
     wide = jnp.minimum(WIDE / curve.radius, narrow_wells(curve, DEEPEST_WELL))
-    return curve._replace(wells=jnp.where(is_wide, wide, narrow_wells(curve)))
+    return curve._replace(wells=jnp.where(is_wide, wide, narrow_wells(curve, depth)))
 
 
 @traced_once
 def wide_cells(curve: Curve, pressures: Float[Array, "n+1"]) -> Bool[Array, "n"]:
     """Which cells are to have wide wells, at these pressures."""
+    pushes = pressures[:-1] > 0
+    first, last = jnp.argmax(pushes), len(pushes) - 1 - jnp.argmax(pushes[::-1])
+    return growth(curve) < jnp.where(last - first <= 1, GROWS_ALONE, GROWS)
+
+
+def growth(curve: Curve) -> Float[Array, "n"]:
+    """The second derivative of the distance along the rod, without the well, where cells with wide wells have their
+    places [1/radius].
+    """
     curve = jax.lax.stop_gradient(with_wells(curve, jnp.ones_like(curve.radius, bool)))
     found = nearest(curve)
     _, _, (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, found.s, found.beyond)
     assert curve.wells is not None
-    growth = aa - curve.wells - jnp.where(found.stays[1], 0.0, ab**2 / jnp.where(bb > 0, bb, 1.0))
-    pushes = pressures[:-1] > 0
-    first, last = jnp.argmax(pushes), len(pushes) - 1 - jnp.argmax(pushes[::-1])
-    return growth * curve.radius < jnp.where(last - first <= 1, GROWS_ALONE, GROWS)
+    alone = aa - curve.wells - jnp.where(found.stays[1], 0.0, ab**2 / jnp.where(bb > 0, bb, 1.0))
+    return alone * curve.radius
 
 
 def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]]:

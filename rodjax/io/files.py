@@ -50,13 +50,13 @@ OLDEST_FORMAT = 7
 HARNESS_FORMAT = 15
 # Of a rod that touches itself.
 SELF_CONTACT_FORMAT = 16
-# Of a harness whose rods may touch one another.
-ROD_CONTACT_FORMAT = 17
+# Of a harness whose rods may touch one another; before it, 17, all wells were narrow.
+ROD_CONTACT_FORMAT = 18
 
 # What files of harnesses lack until format 14, which had no obstacles.
 _OF_CONTACTS = ("contact_forces", "end_pressures")
-# What those lack whose rods do not touch one another.
-_OF_ROD_CONTACTS = "rod_pressures"
+# What those lack whose rods do not touch one another, and what older ones lack.
+_OF_ROD_CONTACTS, _OF_WELLS = ("rod_pressures", "wide_wells"), "wide_wells"
 
 # The name in files of a field that the code names otherwise.
 STORED_AS = {"arclengths": "places"}
@@ -208,6 +208,7 @@ HARNESS_FIELDS = {
 # The same of harnesses whose rods may touch one another.
 ROD_CONTACT_FIELDS = {
     "harness/rod_pressures": ("N", "of contacts between rods, of stacks of these by pair and element of the first one"),
+    "harness/wide_wells": ("1", "whether each of these stays near the middle of its element"),
     "scene/contact_loads/on_positions": ("N", "forces of other rods on the nodes at start and end of each element"),
     "scene/contact_loads/on_tangents": ("N m", "what other rods apply to the tangents of these nodes"),
 }
@@ -525,7 +526,7 @@ def _write_harness(group: h5py.Group, result: HarnessEquilibrium) -> None:
     if result.harness.contact:
         group.attrs["contact"] = np.array(result.harness.contact)
     for name in _harness_arrays():
-        if name != _OF_ROD_CONTACTS or result.harness.contact:
+        if name not in _OF_ROD_CONTACTS or result.harness.contact:
             _write_value(group, name, getattr(result, name), f"harness/{name}")
 
 
@@ -563,10 +564,13 @@ def _read_harness(group: h5py.Group, path: Path) -> HarnessEquilibrium:
     arrays = {
         name: _read_value(group, name, annotation, path, shape, KINDS)
         for name, annotation in _harness_arrays().items()
-        if (written >= HARNESS_FORMAT or name not in _OF_CONTACTS) and (name != _OF_ROD_CONTACTS or harness.contact)
+        if (written >= HARNESS_FORMAT or name not in _OF_CONTACTS)
+        and (harness.contact or name not in _OF_ROD_CONTACTS)
+        and (written >= ROD_CONTACT_FORMAT or name != _OF_WELLS)
     }
     if not harness.contact:
-        arrays[_OF_ROD_CONTACTS] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)
+        arrays["rod_pressures"] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)
+    arrays.setdefault(_OF_WELLS, np.zeros_like(arrays["rod_pressures"], bool))
     if written < HARNESS_FORMAT:
         arrays["contact_forces"] = np.zeros_like(arrays["positions"])
         arrays["end_pressures"] = np.zeros((*shape[:-1], 0), arrays["positions"].dtype)

@@ -344,7 +344,7 @@ class HarnessProblem(eqx.Module):
         self, parameter: Float[Array, ""], place: HarnessPlace, outcome: Outcome, index: Int[Array, ""]
     ) -> HarnessEquilibrium:
         under, result = place.under, self.equilibrium
-        state = under.assembly.begin(place.point.rods, tuple(None for _ in place.rods), (), under.poses)
+        state = under.assembly.begin(place.point.rods, tuple(None for _ in place.rods), (), (), under.poses)
         end = state._replace(
             residual=outcome.residual,
             residuals=place.residuals,

@@ -83,12 +83,15 @@ from rodjax.solving.rod_contact import (
     in_contact,
     loads_of,
     passes,
+    wide_between,
 )
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
 LEAST_STIFFNESS = NEUTRAL
+# Of the shifts of a rod that is not definite, the least one [EI/L^2].
+LEAST_SHIFT = 1e-3
 # Iterations after which a search under loads without a potential is given up: those that end take 5 to 30.
 MOST_UNJUDGED = 40
 
@@ -217,12 +220,14 @@ def eliminated(
 
 class State(NamedTuple):
     """What a turn leaves to the next one; of each group of rods points, pressures of the bodies where these end (`None`
-    of rods that touch nothing), and shifts of their systems; pressures of the contacts of each kind of `Pairs`.
+    of rods that touch nothing), and shifts of their systems; of the contacts of each kind of `Pairs` pressures, and
+    which elements have wide wells.
     """
 
     points: tuple[Any, ...]
     at_ends: tuple[Float[Array, "k o 2"] | None, ...]
     pairs: tuple[Float[Array, "p n"], ...]
+    is_wide: tuple[Bool[Array, "p n"], ...]
     poses: Poses
     shifts: tuple[Float[Array, "k"], ...]
     damping: Float[Array, ""]
@@ -299,8 +304,15 @@ class Assembly(eqx.Module):
         if not self.pairs:
             return ()
         curves = self.curves(self.forms(state.poses), state.points)
-        each = zip(self.pairs, state.pairs, strict=True)
-        return tuple(contacts_between(pairs, curves, pressures) for pairs, pressures in each)
+        each = zip(self.pairs, state.pairs, state.is_wide, strict=True)
+        return tuple(contacts_between(pairs, curves, *of_pairs) for pairs, *of_pairs in each)
+
+    def wide(self, points: tuple[Any, ...], poses: Poses) -> tuple[Bool[Array, "p n"], ...]:
+        """Which elements are to have wide wells in contacts between rods, in an equilibrium."""
+        if not self.pairs:
+            return ()
+        curves = self.curves(self.forms(poses), points)
+        return tuple(wide_between(pairs, curves) for pairs in self.pairs)
 
     def touched(self, contacts: tuple[Contacts, ...]) -> "Assembly":
         """With the loads of contacts between rods."""
@@ -375,16 +387,23 @@ class Assembly(eqx.Module):
         return gradient, jnp.max(jnp.abs(out_of_balance), initial=0.0)
 
     def begin(
-        self, points: tuple[Any, ...], at_ends: tuple[Array | None, ...], pairs: tuple[Array, ...], poses: Poses
+        self,
+        points: tuple[Any, ...],
+        at_ends: tuple[Array | None, ...],
+        pairs: tuple[Array, ...],
+        is_wide: tuple[Array, ...],
+        poses: Poses,
     ) -> State:
-        """A search from points of the rods, pressures of the bodies where these end, and of contacts between rods, and
-        poses of the bodies.
+        """A search from points of the rods, pressures of the bodies where these end, pressures and wells of contacts
+        between rods, and poses of the bodies.
         """
         dtype = poses.positions.dtype
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
         nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
         status = jnp.full((), Status.RUNNING, int)
-        return State(points, at_ends, pairs, poses, nothing, zero, zero, nothing, count, count, count, status, count)
+        return State(
+            points, at_ends, pairs, is_wide, poses, nothing, zero, zero, nothing, count, count, count, status, count
+        )
 
 
 def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> State:
@@ -394,7 +413,9 @@ def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, 
 
     def search(part: Float[Array, ""] | None, begin: State) -> NewtonEnd:
         here = assembly.bearing(part)
-        end = _found(here, here.begin(begin.points, begin.at_ends, begin.pairs, begin.poses), solver, find)
+        end = _found(
+            here, here.begin(begin.points, begin.at_ends, begin.pairs, begin.is_wide, begin.poses), solver, find
+        )
         outcome = Outcome(end.residual, end.iterations, end.evaluations, end.status)
         return NewtonEnd(end, outcome, end.negative == 0)
 
@@ -530,6 +551,8 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
     points_here, changes = _refined(assembly, all_here, state, balance, status)
+    is_wide, differ = _wells(assembly, state, balance, status)
+    changes |= differ
     status = jnp.where(changes, Status.RUNNING, status)
     goes = (status == Status.RUNNING) & trial.is_better & ~changes
     taken = jnp.where(goes, trial.part, 0.0)
@@ -548,6 +571,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         points=points,
         at_ends=at_ends,
         pairs=pairs,
+        is_wide=is_wide,
         poses=poses,
         shifts=rods.shifts,
         damping=_damping(state, trial),
@@ -672,7 +696,7 @@ def _eliminated(
 
     def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
         shift, tries, found = trial
-        larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
+        larger = jnp.maximum(SHIFT_GROWTH * shift, _least_shift(last))
         shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
         push = pushes(shift)[:, None, None] * here.aside
         return shift, tries + 1, jax.vmap(eliminated)(*systems, shift, push)
@@ -691,6 +715,13 @@ def _first_shift(last: Float[Array, "k"], state: State, balance: _Balance) -> Fl
     least = jnp.asarray(NEUTRAL, last.dtype)
     shift = jnp.where(balance.is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
     return jnp.maximum(shift, state.damping)
+
+
+def _least_shift(last: Float[Array, "k"]) -> Float[Array, "k"]:
+    """That is tried where one of nothing is too little: less than last time, as shifts that are much larger than a
+    negative stiffness are crawled along.
+    """
+    return jnp.where(last > NEUTRAL, jnp.clip(last / SHIFT_GROWTH, LEAST_SHIFT, FIRST_SHIFT), FIRST_SHIFT)
 
 
 def _pushing(shift: Float[Array, "k"], state: State, balance: _Balance) -> Float[Array, "k"]:
@@ -789,7 +820,7 @@ def _with_contacts(
     stiffness, force = jnp.pad(stiffness, ((0, slide), (0, slide))), jnp.pad(force, (0, slide))
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
     may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
-    groups, shifts, is_pushed = [], [], rods.is_pushed
+    groups, shifts, least_shifts, is_pushed = [], [], [], rods.is_pushed
     together, chosen = between(touching) if touching else (None, ())
     of_pairs = in_contact(assembly.pairs)
     for number, (group, here, last) in enumerate(zip(assembly.groups, all_here, state.shifts, strict=True)):
@@ -807,10 +838,11 @@ def _with_contacts(
             touched = touched.touched(columns, together.pressures)
         groups.append(touched)
         shifts.append(shift)
+        least_shifts.append(_least_shift(last))
     push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
     pattern = jnp.asarray(_generic(len(force), dtype))
     parts = stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"
-    model = ContactModel(tuple(groups), *parts, together, _is_symmetric(assembly, all_here))
+    model = ContactModel(tuple(groups), tuple(least_shifts), *parts, together, _is_symmetric(assembly, all_here))
     found = contact_step(model, tuple(shifts), state.damping)
     is_definite = rods.is_definite & found.is_found
     for shift in found.shifts:
@@ -1043,6 +1075,28 @@ def _refined(
         changes |= (begins & differs) | (ends & jnp.any(differ))
         points.append(jax.tree.map(lambda new, old: jnp.where(begins | ends, new, old), found, here.points))
     return tuple(points), changes
+
+
+def _wells(
+    assembly: Assembly, state: State, balance: _Balance, status: Int[Array, ""]
+) -> tuple[tuple[Bool[Array, "p n"], ...], Bool[Array, ""]]:
+    """Which elements have wide wells in contacts between rods, as `NodalForm.refined`: all from a start that is not
+    balanced, then those that an equilibrium has; whether the search goes on with these.
+    """
+    if not assembly.pairs:
+        return state.is_wide, jnp.array(False)
+    begins = (state.iterations == 0) & ~balance.is_balanced & (status == Status.RUNNING)
+    ends = is_converged(status)
+
+    def anew() -> tuple[tuple[Array, ...], Bool[Array, ""]]:
+        of_all, changes = zip(assembly.wide(state.points, state.poses), state.is_wide, strict=True), jnp.array(False)
+        # Once wide again, none becomes narrow a second time.
+        found = tuple(jnp.where(jnp.all(before), fresh, before | fresh) | begins for fresh, before in of_all)
+        for here, before in zip(assembly.contacts(state._replace(is_wide=found)), state.is_wide, strict=True):
+            changes |= jnp.any((here.is_wide != before) & (begins | (here.pressures > 0) | (here.gaps < 0)))
+        return found, changes
+
+    return jax.lax.cond(begins | ends, anew, lambda: (state.is_wide, jnp.array(False)))
 
 
 def _damping(state: State, trial: _Trial) -> Float[Array, ""]:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import instance, is_known, leaf
 from rodjax.discretization.first_twist import FirstTwist
@@ -166,6 +166,7 @@ def _as_harness(harness: Harness, guess: Equilibrium) -> HarnessEquilibrium:
         contact_forces=jnp.zeros((len(harness.bodies), 3), guess.energy.dtype),
         end_pressures=no_pressures(harness, ((0,),)),
         rod_pressures=jnp.zeros(0, guess.energy.dtype),
+        wide_wells=jnp.zeros(0, bool),
         harness=harness,
         members=((0,),),
     )
@@ -321,10 +322,10 @@ def _solved(
     pressures = no_pressures(harness, members) if guess is None else guess.end_pressures
     if guess is not None and (guess.members != members or pressures.shape != no_pressures(harness, members).shape):
         pressures = no_pressures(harness, members)
-    of_rods = no_rod_pressures(harness, members, options)
+    of_rods, is_wide = no_rod_pressures(harness, members, options)
     if guess is not None and guess.members == members and guess.rod_pressures.shape == of_rods.shape:
-        of_rods = guess.rod_pressures
-    return _solve(harness, poses, tuple(starts), pressures, of_rods, strain_limit, options, members=members)
+        of_rods, is_wide = guess.rod_pressures, guess.wide_wells
+    return _solve(harness, poses, tuple(starts), pressures, of_rods, is_wide, strain_limit, options, members=members)
 
 
 def _same_memory(one: SolverState, other: SolverState) -> bool:
@@ -372,6 +373,7 @@ def _solve(
     starts: tuple[tuple[SolverState, FirstTwist], ...],
     end_pressures: Float[Array, "c"],
     rod_pressures: Float[Array, "c"],
+    wide_wells: Bool[Array, "c"],
     strain_limit: Float[Array, ""] | float,
     options: tuple[Options, ...],
     members: Members,
@@ -399,9 +401,10 @@ def _solve(
     assembly = Assembly.of(tuple(groups), bodies, pairs)
     counts = [option.segments for option in options]
     between = split_rod_pressures(pairs, counts, rod_pressures / assembly.force)
+    is_wide = split_rod_pressures(pairs, counts, wide_wells)
     solver = options[0].solver
     assert isinstance(solver, Newton)
-    start = assembly.begin(tuple(points), tuple(at_ends), between, poses)
+    start = assembly.begin(tuple(points), tuple(at_ends), between, is_wide, poses)
     is_cold = functools.reduce(jnp.logical_and, [jnp.all(states.end_force == 0) for states, _ in starts])
     if any(isinstance(group.form, SlidingForm) for group in groups):
         assembly, end = _slid(assembly, start, solver, options, is_cold)
@@ -434,7 +437,7 @@ def _slid(
         made = anew(groups, state)
         groups, state = jax.tree.map(lambda old, new: jnp.where(count == 0, old, new), (groups, state), made)
         here = dataclasses.replace(assembly, groups=groups)
-        again = here.begin(state.points, state.at_ends, state.pairs, state.poses)
+        again = here.begin(state.points, state.at_ends, state.pairs, state.is_wide, state.poses)
         begin = again._replace(iterations=state.iterations, evaluations=state.evaluations)
         end = find_assembly(here, begin, solver, options[0].find, is_cold & (count == 0))
         goes_on = jnp.array(False)
@@ -494,6 +497,7 @@ def harness_equilibrium(
     end_pressures = jnp.concatenate(pressures) if pressures else end_pressures
     between = [jnp.zeros(0, end.poses.positions.dtype), *(pressures.reshape(-1) for pressures in end.pairs)]
     rod_pressures = assembly.force * jnp.concatenate(between)
+    wide_wells = jnp.concatenate([jnp.zeros(0, bool), *(is_wide.reshape(-1) for is_wide in end.is_wide)])
     status = end.status
     for rod in rods:
         # A strain beyond the limit in one of them is said of the whole.
@@ -514,6 +518,7 @@ def harness_equilibrium(
         contact_forces=contact_forces(harness, members, end.poses, end_pressures)[0][:, :3],
         end_pressures=end_pressures,
         rod_pressures=rod_pressures,
+        wide_wells=wide_wells,
         harness=harness,
         members=members,
     )

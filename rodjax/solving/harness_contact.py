@@ -34,7 +34,7 @@ from rodjax.linalg.chain import ChainSystem, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, with_slips, work
 from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns
-from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, SHIFT_GROWTH
+from rodjax.solving.newton import MAX_FACTORS, SHIFT_GROWTH
 from rodjax.solving.rod_contact import Between, BetweenStep, Columns
 
 
@@ -299,12 +299,14 @@ class ContactModel(eqx.Module):
     """The model of a step. Its unknowns q: how far the bodies move as their supports let them, then the arclengths of
     sliding clips. `stiffness`, `force`: of the bodies and of the rods that touch nothing.
 
-    `push`: by how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
+    `least_shifts`: of each rod the least shift of those that are tried where one of nothing is too little; `push`: by
+    how much a negative stiffness is answered with a force along its motion; `least`: below it a stiffness is
     negative; `may_reverse`: whether a minimum is sought; `between`: the contacts of rods with one another, `None`
     without such; `has_symmetry`: else steps are exact once the symmetric part of the stiffness is positive.
     """
 
     groups: tuple[RodsInContact, ...]
+    least_shifts: tuple[Float[Array, "k"], ...]
     stiffness: Float[Array, "q q"]
     force: Float[Array, "q"]
     push: Float[Array, ""]
@@ -342,7 +344,13 @@ class ContactModel(eqx.Module):
         return [*found, row[first:]]
 
     def _regularized(
-        self, rods: RodsInContact, is_closed: Array, at: Array, contact_compliance: Array, shift: Float[Array, "k"]
+        self,
+        rods: RodsInContact,
+        least: Float[Array, "k"],
+        is_closed: Array,
+        at: Array,
+        contact_compliance: Array,
+        shift: Float[Array, "k"],
     ) -> tuple[Eliminated, Float[Array, "k"]]:
         """Stiffer until each rod by itself has a minimum; `at`: what contacts would exert at the last iterate."""
         if not self.may_reverse:
@@ -350,7 +358,7 @@ class ContactModel(eqx.Module):
 
         def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
             shift, tries, found = trial
-            larger = jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT)
+            larger = jnp.maximum(SHIFT_GROWTH * shift, least)
             shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
             return shift, tries + 1, _eliminated(rods, is_closed, at, contact_compliance, shift)
 
@@ -371,7 +379,7 @@ class ContactModel(eqx.Module):
         *softness, soft_pairs = self.split(contact_compliance)
         *trials, _ = self.split(trial)
         if self.between is None:
-            each = zip(self.groups, of_groups, trials, softness, memory.shifts, strict=True)
+            each = zip(self.groups, self.least_shifts, of_groups, trials, softness, memory.shifts, strict=True)
             all_found, shifts = zip(*(self._regularized(*given) for given in each), strict=True)
         else:
             closed = self._with_closed(of_pairs)
@@ -458,8 +466,8 @@ class ContactModel(eqx.Module):
             # Where each rod alone has a minimum, the curvature of contacts takes it away.
             none = functools.reduce(jnp.logical_and, [jnp.all(each) for each in alone])
             stiffer = tuple(
-                jnp.where(~is_first & (~each | none), jnp.maximum(SHIFT_GROWTH * shift, FIRST_SHIFT), shift)
-                for shift, each in zip(shifts, alone, strict=True)
+                jnp.where(~is_first & (~each | none), jnp.maximum(SHIFT_GROWTH * shift, least), shift)
+                for shift, least, each in zip(shifts, self.least_shifts, alone, strict=True)
             )
             return stiffer, tries + 1, *of_all(stiffer)
 

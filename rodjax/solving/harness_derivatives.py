@@ -114,7 +114,8 @@ class _Near(NamedTuple):
     @staticmethod
     def of(harness: Harness, result: HarnessEquilibrium) -> "_Near":
         harness, result = jax.lax.stop_gradient((harness, result))
-        touching = touching_rods(harness, result.groups, result.rod_pressures, result.members)
+        of_rods = result.rod_pressures, result.wide_wells
+        touching = touching_rods(harness, result.groups, *of_rods, result.members)
         others, dtype = Bodies.of(harness), result.positions.dtype
         touches = jnp.zeros(0, dtype) if touching is None else touching.values
         nowhere = jnp.concatenate([jnp.zeros(len(others.columns), dtype), touches, result.end_pressures])

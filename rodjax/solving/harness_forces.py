@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from rodjax.checks import leaf
 from rodjax.model.harness import Bodies, Harness, end_radii, floating, joint_ends, rotated
@@ -87,17 +87,19 @@ def split_pressures(harness: Harness, members: Members, pressures: Float[Array, 
     return found
 
 
-def no_rod_pressures(harness: Harness, members: Members, options: tuple[Options, ...]) -> Float[Array, "c"]:
-    """Of contacts between rods, of each kind of pairs by pair and element of its first rod."""
+def no_rod_pressures(
+    harness: Harness, members: Members, options: tuple[Options, ...]
+) -> tuple[Float[Array, "c"], Bool[Array, "c"]]:
+    """Of contacts between rods, of each kind of pairs by pair and element of its first rod; wells, all wide."""
     pairs = pairs_of(harness.contact, members)
     count = sum(len(each.places) * options[each.groups[0]].segments for each in pairs)
-    return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype))
+    return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype)), leaf(np.ones(count, bool))
 
 
 def split_rod_pressures(
-    pairs: tuple[Pairs, ...], counts: Sequence[int], pressures: Float[Array, "c"]
-) -> tuple[Float[Array, "p n"], ...]:
-    """`counts`: of elements of the rods of each group."""
+    pairs: tuple[Pairs, ...], counts: Sequence[int], pressures: Shaped[Array, "c"]
+) -> tuple[Shaped[Array, "p n"], ...]:
+    """Also of what else contacts have. `counts`: of elements of the rods of each group."""
     found, first = [], 0
     for each in pairs:
         shape = len(each.places), counts[each.groups[0]]

@@ -45,6 +45,7 @@ class HarnessEquilibrium(Described):
     - `rod_contacts`: of rods that may touch, by both names in the order of the harness, the `RodContacts` of elements
       of the first one with the second one. Computed when asked for
     - `rod_pressures` [..., c] N: of contacts between rods, by the stacks of both, pair and element of the first one
+    - `wide_wells` [..., c] bool: which of these stay near the middle of their element, as where rods lie along others
     """
 
     # In the place of an equilibrium.
@@ -64,6 +65,7 @@ class HarnessEquilibrium(Described):
     contact_forces: Float[Array, "... j 3"]
     end_pressures: Float[Array, "... c"]
     rod_pressures: Float[Array, "... c"]
+    wide_wells: Bool[Array, "... c"]
     harness: Harness
     members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
@@ -82,7 +84,7 @@ class HarnessEquilibrium(Described):
     def rod_contacts(self) -> dict[tuple[str, str], RodContacts]:
         if not self.harness.contact:
             return {}
-        return rod_contacts(self.harness, self.groups, self.rod_pressures, members=self.members)
+        return rod_contacts(self.harness, self.groups, self.rod_pressures, self.wide_wells, members=self.members)
 
     @property
     def segments(self) -> list[int]:

@@ -23,6 +23,8 @@ from rodjax.discretization.rod_pairs import (
     joined,
     loads_between,
     pair_contacts,
+    wide_of_pair,
+    with_pair_wells,
 )
 from rodjax.discretization.self_contact import Curve, Nearest, comes_through
 from rodjax.linalg.chain import ChainSystem
@@ -33,7 +35,7 @@ from rodjax.solving.coupling import Coupling
 # The numbers of the rods of each group.
 Members = tuple[tuple[int, ...], ...]
 # Of all contacts between rods of two groups, at most so many are sought in the model of a step.
-MOST_BETWEEN = 32
+MOST_BETWEEN = 64
 # Compliance of contacts in the model of a step [L^3/EI]. Where the cells of two elements overlap, both may have a
 # contact at one place; what one of them lacks to touch is below 1e-8 L.
 CONTACT_COMPLIANCE = 1e-9
@@ -71,13 +73,14 @@ def in_contact(pairs: tuple[Pairs, ...]) -> list[int]:
 
 class Contacts(NamedTuple):
     """Of p pairs of rods: their curves, where these are nearest, gaps and pressures of the n elements of the first
-    ones, and what is added to the gaps in a step.
+    ones, which of these have wide wells, and what is added to the gaps in a step.
     """
 
     curves: Curve
     found: Nearest
     gaps: Float[Array, "p n"]
     pressures: Float[Array, "p n"]
+    is_wide: Bool[Array, "p n"]
     relaxed: Float[Array, "p n"]
 
     @property
@@ -191,22 +194,31 @@ def joined_curves(pairs: Pairs, curves: dict[int, Curve]) -> Curve:
     return jax.vmap(joined)(first, second)
 
 
-def contacts_between(pairs: Pairs, curves: dict[int, Curve], pressures: Float[Array, "p n"]) -> Contacts:
-    both, elements = joined_curves(pairs, curves), pressures.shape[1]
+def wide_between(pairs: Pairs, curves: dict[int, Curve]) -> Bool[Array, "p n"]:
+    """Which elements are to have wide wells in an equilibrium."""
+    elements = curves[pairs.groups[0]].radius.shape[1]
+    return jax.vmap(lambda curve: wide_of_pair(curve, elements))(joined_curves(pairs, curves))
 
-    def of_pair(curve: Curve) -> tuple[Nearest, Array]:
+
+def contacts_between(
+    pairs: Pairs, curves: dict[int, Curve], pressures: Float[Array, "p n"], is_wide: Bool[Array, "p n"]
+) -> Contacts:
+    elements = pressures.shape[1]
+
+    def of_pair(curve: Curve, is_wide: Bool[Array, "n"]) -> tuple[Curve, Nearest, Array]:
+        curve = with_pair_wells(curve, is_wide)
         found = found_between(curve, elements)
-        return found, gaps_between(curve, found)
+        return curve, found, gaps_between(curve, found)
 
-    found, gaps = jax.vmap(of_pair)(both)
-    return Contacts(both, found, gaps, pressures, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
+    both, found, gaps = jax.vmap(of_pair)(joined_curves(pairs, curves), is_wide)
+    return Contacts(both, found, gaps, pressures, is_wide, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
 
 
 def contact_energy(
     pairs: Pairs, curves: dict[int, Curve], here: Contacts, change: Float[Array, "p n"]
 ) -> Float[Array, ""]:
     """As of `NodalForm.contact_energy`, where a step leads that begins here and changes the pressures."""
-    there = contacts_between(pairs, curves, here.pressures)
+    there = contacts_between(pairs, curves, here.pressures, here.is_wide)
     pushing = here.pressures + change - (there.gaps + here.relaxed) / MERIT_COMPLIANCE
     return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.rod_pairs import found_between, joined
+from rodjax.discretization.rod_pairs import NARROW_OF_PAIRS, found_between, joined, with_pair_wells
 from rodjax.discretization.self_contact import (
     Curve,
     Nearest,
@@ -22,6 +22,7 @@ from rodjax.discretization.self_contact import (
     moving_gaps,
     seen_distance,
     side_at,
+    with_wells,
 )
 from rodjax.model.along import value_at
 from rodjax.model.harness import Harness
@@ -71,6 +72,7 @@ def mean_length(groups: tuple[Equilibrium, ...]) -> Float[Array, ""]:
 
 
 def split_pressures_of(pairs: tuple[Pairs, ...], groups: tuple[Equilibrium, ...], pressures: Array) -> list[Array]:
+    """Or wells."""
     found, first = [], 0
     for each in pairs:
         shape = len(each.places), groups[each.groups[0]].s.shape[1] - 1
@@ -81,7 +83,11 @@ def split_pressures_of(pairs: tuple[Pairs, ...], groups: tuple[Equilibrium, ...]
 
 @functools.partial(compiled, static_argnames=("members",))
 def rod_contacts(
-    harness: Harness, groups: tuple[Equilibrium, ...], rod_pressures: Float[Array, "... c"], members: Members
+    harness: Harness,
+    groups: tuple[Equilibrium, ...],
+    rod_pressures: Float[Array, "... c"],
+    wide_wells: Bool[Array, "... c"],
+    members: Members,
 ) -> dict[tuple[str, str], RodContacts]:
     """By the names of both rods, those of pairs in the order of the harness."""
     mapped = functools.partial(
@@ -89,30 +95,33 @@ def rod_contacts(
     )
     for _ in range(rod_pressures.ndim - 1):
         mapped = jax.vmap(mapped)
-    found = mapped(groups, rod_pressures)
+    found = mapped(groups, rod_pressures, wide_wells)
     return {pair: found[pair] for pair in harness.contact_names}
 
 
 def _rod_contacts(
     groups: tuple[Equilibrium, ...],
     rod_pressures: Float[Array, "c"],
+    wide_wells: Bool[Array, "c"],
     names: tuple[str, ...],
     pairs: tuple[Pairs, ...],
     members: Members,
 ) -> dict[tuple[str, str], RodContacts]:
     length = mean_length(groups)
     curves, found = curves_of_results(groups, in_contact(pairs), length), {}
-    for each, pressures in zip(pairs, split_pressures_of(pairs, groups, rod_pressures), strict=True):
+    split = (split_pressures_of(pairs, groups, each) for each in (rod_pressures, wide_wells))
+    for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements = pressures.shape[1]
 
-        def of_pair(curve: Curve, pressures: Array, elements: int = elements) -> RodContacts:
+        def of_pair(curve: Curve, pressures: Array, is_wide: Array, elements: int = elements) -> RodContacts:
+            curve = with_pair_wells(curve, is_wide)
             places = exerted_at(curve, jnp.pad(pressures, (0, 1)), found_between(curve, elements))
             offset = curve.s[elements + 1]
             return RodContacts(
                 places.s * length, (places.beyond - offset) * length, places.gaps * length, places.forces.T
             )
 
-        stacked = jax.vmap(of_pair)(joined_curves(each, curves), pressures)
+        stacked = jax.vmap(of_pair)(joined_curves(each, curves), pressures, is_wide)
         for k, (first, second) in enumerate(each.places):
             numbers = members[each.groups[0]][first], members[each.groups[1]][second]
             found[names[numbers[0]], names[numbers[1]]] = jax.tree.map(lambda leaf, k=k: leaf[k], stacked)
@@ -121,13 +130,14 @@ def _rod_contacts(
 
 class _Touch(NamedTuple):
     """Of t contacts between rods of two groups: the place of both rods in their groups, their elements there, and the
-    element of the first one whose contact it is; whether the place within the element stays; two directions across the
-    force; whether it is there; and its number among all pressures.
+    element of the first one whose contact it is, and whether that has a wide well; whether the place within the element
+    stays; two directions across the force; whether it is there; and its number among all pressures.
     """
 
     rods: Int[Array, "2 t"]
     elements: Int[Array, "2 t"]
     cell: Int[Array, "t"]
+    is_wide: Bool[Array, "t"]
     stays: Bool[Array, "2 t"]
     across: Float[Array, "2 3 t"]
     along: Float[Array, "3 t"]
@@ -186,11 +196,13 @@ class TouchingRods(eqx.Module):
         for pairs, touch, (forces, places), (before, begin) in parts:
             joined_pairs = [curves[number] for number in pairs.groups]
 
-            def of_contact(rods, elements, cell, stays, across, force, place, begin, joined_pairs=joined_pairs):
+            def of_contact(
+                rods, elements, cell, is_wide, stays, across, force, place, begin, joined_pairs=joined_pairs
+            ):
                 first, second = (
                     jax.tree.map(lambda leaf, k=k: leaf[k], curve) for curve, k in zip(joined_pairs, rods, strict=True)
                 )
-                curve, count = joined(first, second), len(first.s)
+                curve, count = with_wells(joined(first, second), is_wide, NARROW_OF_PAIRS), len(first.s)
                 here, there = elements[:1], count + elements[1:]
                 a, b = (first.s[-1] * place[:1]), curve.s[count] + second.s[-1] * place[1:]
                 distance, slopes, _ = seen_distance(curve, cell[None], here, there, a, b)
@@ -200,8 +212,8 @@ class TouchingRods(eqx.Module):
                 slopes = jnp.where(stays, place - begin, jnp.concatenate(slopes))
                 return jnp.concatenate([gap, across @ (force - (force @ normal) * normal), slopes])
 
-            lacking = jax.vmap(of_contact, (1, 1, 0, 1, 2, 1, 1, 1), 1)(
-                touch.rods, touch.elements, touch.cell, touch.stays, touch.across, forces, places, begin
+            lacking = jax.vmap(of_contact, (1, 1, 0, 0, 1, 2, 1, 1, 1), 1)(
+                touch.rods, touch.elements, touch.cell, touch.is_wide, touch.stays, touch.across, forces, places, begin
             )
             change = jnp.concatenate([(forces - before) / self.force, places - begin])
             found.append(jnp.where(touch.exists[None], lacking, change).reshape(-1))
@@ -223,7 +235,11 @@ def _at(s: Array, nodes: Array, tangents: Array, element: Array, place: Array):
 
 
 def touching_rods(
-    harness: Harness, groups: tuple[Equilibrium, ...], rod_pressures: Float[Array, "c"], members: Members
+    harness: Harness,
+    groups: tuple[Equilibrium, ...],
+    rod_pressures: Float[Array, "c"],
+    wide_wells: Bool[Array, "c"],
+    members: Members,
 ) -> TouchingRods | None:
     """At a result; `None` of a harness whose rods do not touch. `values` are NaN where too many push."""
     pairs = pairs_of(harness.contact, members)
@@ -233,17 +249,19 @@ def touching_rods(
     curves = curves_of_results(groups, in_contact(pairs), length)
     force = jnp.maximum(jnp.max(rod_pressures), jnp.finfo(length.dtype).tiny)
     touches, values, first = [], [], 0
-    for each, pressures in zip(pairs, split_pressures_of(pairs, groups, rod_pressures), strict=True):
+    split = (split_pressures_of(pairs, groups, each) for each in (rod_pressures, wide_wells))
+    for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements, both = pressures.shape[1], joined_curves(each, curves)
 
-        def of_pair(curve: Curve, elements: int = elements) -> tuple[Nearest, Array, Array, Array]:
+        def of_pair(curve: Curve, is_wide: Array, elements: int = elements) -> tuple[Nearest, Array, Array, Array]:
+            curve = with_pair_wells(curve, is_wide)
             found = found_between(curve, elements)
             _, a, b = moving_gaps(curve, found)
             _, normal = direction(side_at(curve, found.element, a), side_at(curve, found.other, b))
             ends = curve.s[elements], curve.s[-1] - curve.s[elements + 1]
             return found, a / ends[0], (b - curve.s[elements + 1]) / ends[1], normal
 
-        found, a, b, normal = jax.vmap(of_pair)(both)
+        found, a, b, normal = jax.vmap(of_pair)(both, is_wide)
         pick = jnp.argsort(-pressures.reshape(-1))[:MOST_TOUCHING]
         force = jnp.where(jnp.sum(pressures > 0) > MOST_TOUCHING, jnp.nan, force)
         pair, cell = pick // elements, pick % elements
@@ -254,7 +272,8 @@ def touching_rods(
         across = jnp.stack([side, jnp.cross(normal, side, axis=0)])
         both_elements = jnp.stack([found.element[pair, cell], found.other[pair, cell] - elements - 1])
         stays, pushing = found.stays[pair, :, cell].T, pressures[pair, cell]
-        touches.append(_Touch(rods, both_elements, cell, stays, across, normal, pushing > 0, first + pick))
+        of_cell = cell, is_wide[pair, cell], stays
+        touches.append(_Touch(rods, both_elements, *of_cell, across, normal, pushing > 0, first + pick))
         each_place = jnp.stack([a[pair, cell], b[pair, cell]])
         values.append(jnp.concatenate([pushing[None] * normal / force, each_place]).reshape(-1))
         first += pressures.size

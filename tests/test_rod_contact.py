@@ -157,6 +157,14 @@ def test_beams_pressed_together_touch_along_a_line(segments, rtol):
     np.testing.assert_allclose(inner, load, rtol=0.15 if segments == 16 else 1e-3)
 
 
+def test_more_contacts_than_are_sought_are_told():
+    """52 of 128 elements touch."""
+    harness, _ = lying_together(0.04 * RADIUS, 0.3)
+    with pytest.warns(rodjax.NotConvergedWarning, match="touch one another on more elements than are sought together"):
+        found = rodjax.solve(harness, segments=128, solver=Newton(max_iterations=5))
+    assert found.status == rodjax.Status.CROWDED
+
+
 @pytest.mark.slow
 def test_derivatives_of_rods_along_one_another():
     """By how far they are apart, and the stiffness of one, beside differences."""

@@ -320,6 +320,8 @@ def gap_vectors(
     side = _perpendicular(normal)
     weight = (pushing / jnp.sqrt(d))[None, None]
     a_stays, b_stays = found.stays
+    # Where the distance is flat along the other part, its place may be the nearest one no longer after its last steps.
+    b_stays |= bb <= 0
     safe_bb = jnp.where(b_stays, 1.0, bb)
     coupling = jnp.where(b_stays, 0.0, ab / safe_bb)
     growth = aa - coupling * ab

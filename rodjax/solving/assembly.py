@@ -75,6 +75,7 @@ from rodjax.solving.rod_contact import (
     Columns,
     Contacts,
     Pairs,
+    are_crowded,
     between,
     columns_of,
     contact_energy,
@@ -550,6 +551,9 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
+    is_given_up = (status == Status.MAX_ITERATIONS) | (status == Status.LINE_SEARCH_FAILED)
+    for contacts_of_pairs in touching:
+        status = jnp.where(is_given_up & are_crowded(contacts_of_pairs), Status.CROWDED, status)
     points_here, changes = _refined(assembly, all_here, state, balance, status)
     is_wide, differ = _wells(assembly, state, balance, status)
     changes |= differ

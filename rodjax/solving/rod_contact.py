@@ -18,6 +18,7 @@ from rodjax.discretization.contact_gaps import curve
 from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.discretization.rod_pairs import (
+    MOST_OF_PAIR,
     found_between,
     gaps_between,
     joined,
@@ -221,6 +222,12 @@ def contact_energy(
     there = contacts_between(pairs, curves, here.pressures, here.is_wide)
     pushing = here.pressures + change - (there.gaps + here.relaxed) / MERIT_COMPLIANCE
     return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
+
+
+def are_crowded(contacts: Contacts) -> Bool[Array, ""]:
+    """Whether more elements touch than are sought in the model of a step."""
+    count = jnp.sum((contacts.pressures > 0) | (contacts.gaps < 0), axis=1)
+    return jnp.any(count > MOST_OF_PAIR) | (jnp.sum(count) > MOST_BETWEEN)
 
 
 def passes(pairs: Pairs, before: Contacts, curves: dict[int, Curve]) -> Bool[Array, ""]:

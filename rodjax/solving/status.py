@@ -25,6 +25,7 @@ class Status(enum.IntEnum):
     PASSED_THROUGH = 10
     OUT_OF_RANGE = 12
     SLID_OUT = 13
+    CROWDED = 14
 
     @property
     def message(self) -> str:
@@ -41,6 +42,8 @@ class Status(enum.IntEnum):
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
             Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
             "positive, an arclength beyond the rod, or jumps of `Steps` too near to one another for the mesh",
+            Status.CROWDED: "not converged: rods of a harness touch one another on more elements than are sought "
+            "together, 32 of a pair of cables: fewer `segments` may do",
             Status.SLID_OUT: "not converged: a rod slides out of a clip",
             Status.PASSED_THROUGH: "not converged: from its start the rod came through an obstacle, or lies within one",
         }[self]

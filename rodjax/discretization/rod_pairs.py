@@ -55,9 +55,11 @@ def with_pair_wells(curve: Curve, is_wide: Bool[Array, "n"]) -> Curve:
     return with_wells(curve, jnp.pad(is_wide, (0, len(curve.radius) - len(is_wide))), NARROW_OF_PAIRS)
 
 
-def wide_of_pair(curve: Curve, elements: int) -> Bool[Array, "n"]:
-    """Which cells of the first rod, of as many elements as that, are to have wide wells in an equilibrium."""
-    return growth(curve)[:elements] < GROWS_OF_PAIRS
+def growth_of_pair(curve: Curve, elements: int) -> Float[Array, "n"]:
+    """Of the cells of the first rod, as many as that: they have wide wells below `GROWS_OF_PAIRS` in an equilibrium,
+    below `GROWS` as a search begins.
+    """
+    return growth(curve)[:elements]
 
 
 class PairContacts(NamedTuple):

@@ -438,14 +438,14 @@ def wide_cells(curve: Curve, pressures: Float[Array, "n+1"]) -> Bool[Array, "n"]
 
 def growth(curve: Curve) -> Float[Array, "n"]:
     """The second derivative of the distance along the rod, without the well, where cells with wide wells have their
-    places [1/radius].
+    places [1/radius]; of those apart by the half of their distance in the place of the radius.
     """
     curve = jax.lax.stop_gradient(with_wells(curve, jnp.ones_like(curve.radius, bool)))
     found = nearest(curve)
-    _, _, (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, found.s, found.beyond)
+    distance, _, (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, found.s, found.beyond)
     assert curve.wells is not None
     alone = aa - curve.wells - jnp.where(found.stays[1], 0.0, ab**2 / jnp.where(bb > 0, bb, 1.0))
-    return alone * curve.radius
+    return alone * jnp.maximum(curve.radius, distance / 2)
 
 
 def _samples(s: Float[Array, "n+1"]) -> tuple[Float[Array, "k"], Int[Array, "k"]]:

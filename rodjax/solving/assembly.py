@@ -29,7 +29,8 @@ from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import generic_field
 from rodjax.discretization.nodal import NodalForm
-from rodjax.discretization.self_contact import Curve
+from rodjax.discretization.rod_pairs import GROWS_OF_PAIRS
+from rodjax.discretization.self_contact import GROWS, Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SETTLED, SlidingForm
 from rodjax.discretization.sliding_point import SlidingLinearization
@@ -81,10 +82,10 @@ from rodjax.solving.rod_contact import (
     contact_energy,
     contacts_between,
     curves_of,
+    growth_between,
     in_contact,
     loads_of,
     passes,
-    wide_between,
 )
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
@@ -222,13 +223,14 @@ def eliminated(
 class State(NamedTuple):
     """What a turn leaves to the next one; of each group of rods points, pressures of the bodies where these end (`None`
     of rods that touch nothing), and shifts of their systems; of the contacts of each kind of `Pairs` pressures, and
-    which elements have wide wells.
+    which elements have wide wells, and whether these are those of an equilibrium.
     """
 
     points: tuple[Any, ...]
     at_ends: tuple[Float[Array, "k o 2"] | None, ...]
     pairs: tuple[Float[Array, "p n"], ...]
     is_wide: tuple[Bool[Array, "p n"], ...]
+    has_ended: Bool[Array, ""]
     poses: Poses
     shifts: tuple[Float[Array, "k"], ...]
     damping: Float[Array, ""]
@@ -308,12 +310,10 @@ class Assembly(eqx.Module):
         each = zip(self.pairs, state.pairs, state.is_wide, strict=True)
         return tuple(contacts_between(pairs, curves, *of_pairs) for pairs, *of_pairs in each)
 
-    def wide(self, points: tuple[Any, ...], poses: Poses) -> tuple[Bool[Array, "p n"], ...]:
-        """Which elements are to have wide wells in contacts between rods, in an equilibrium."""
-        if not self.pairs:
-            return ()
+    def growth(self, points: tuple[Any, ...], poses: Poses) -> tuple[Float[Array, "p n"], ...]:
+        """By which it is told which elements have wide wells in contacts between rods."""
         curves = self.curves(self.forms(poses), points)
-        return tuple(wide_between(pairs, curves) for pairs in self.pairs)
+        return tuple(growth_between(pairs, curves) for pairs in self.pairs)
 
     def touched(self, contacts: tuple[Contacts, ...]) -> "Assembly":
         """With the loads of contacts between rods."""
@@ -402,8 +402,24 @@ class Assembly(eqx.Module):
         zero, count = jnp.zeros((), dtype), jnp.zeros((), int)
         nothing = tuple(jnp.zeros(len(group.body), dtype) for group in self.groups)
         status = jnp.full((), Status.RUNNING, int)
+        # All are wide where no equilibrium tells which are.
+        has_ended = ~functools.reduce(jnp.logical_and, map(jnp.all, is_wide), jnp.array(True))
         return State(
-            points, at_ends, pairs, is_wide, poses, nothing, zero, zero, nothing, count, count, count, status, count
+            points,
+            at_ends,
+            pairs,
+            is_wide,
+            has_ended,
+            poses,
+            nothing,
+            zero,
+            zero,
+            nothing,
+            count,
+            count,
+            count,
+            status,
+            count,
         )
 
 
@@ -555,7 +571,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     for contacts_of_pairs in touching:
         status = jnp.where(is_given_up & are_crowded(contacts_of_pairs), Status.CROWDED, status)
     points_here, changes = _refined(assembly, all_here, state, balance, status)
-    is_wide, differ = _wells(assembly, state, balance, status)
+    is_wide, has_ended, differ = _wells(assembly, state, balance, status)
     changes |= differ
     status = jnp.where(changes, Status.RUNNING, status)
     goes = (status == Status.RUNNING) & trial.is_better & ~changes
@@ -576,6 +592,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         at_ends=at_ends,
         pairs=pairs,
         is_wide=is_wide,
+        has_ended=has_ended,
         poses=poses,
         shifts=rods.shifts,
         damping=_damping(state, trial),
@@ -1083,24 +1100,27 @@ def _refined(
 
 def _wells(
     assembly: Assembly, state: State, balance: _Balance, status: Int[Array, ""]
-) -> tuple[tuple[Bool[Array, "p n"], ...], Bool[Array, ""]]:
-    """Which elements have wide wells in contacts between rods, as `NodalForm.refined`: all from a start that is not
-    balanced, then those that an equilibrium has; whether the search goes on with these.
+) -> tuple[tuple[Bool[Array, "p n"], ...], Bool[Array, ""], Bool[Array, ""]]:
+    """Which elements have wide wells in contacts between rods: from a start that is not balanced all but those where
+    rods cross, then those that an equilibrium has; whether it has come to these, and whether the search goes on.
     """
     if not assembly.pairs:
-        return state.is_wide, jnp.array(False)
+        return state.is_wide, state.has_ended, jnp.array(False)
     begins = (state.iterations == 0) & ~balance.is_balanced & (status == Status.RUNNING)
     ends = is_converged(status)
 
     def anew() -> tuple[tuple[Array, ...], Bool[Array, ""]]:
-        of_all, changes = zip(assembly.wide(state.points, state.poses), state.is_wide, strict=True), jnp.array(False)
-        # Once wide again, none becomes narrow a second time.
-        found = tuple(jnp.where(jnp.all(before), fresh, before | fresh) | begins for fresh, before in of_all)
-        for here, before in zip(assembly.contacts(state._replace(is_wide=found)), state.is_wide, strict=True):
+        found, changes = [], jnp.array(False)
+        for growth, before in zip(assembly.growth(state.points, state.poses), state.is_wide, strict=True):
+            # Once wide again, none becomes narrow a second time.
+            is_wide = (growth < GROWS_OF_PAIRS) | (before & state.has_ended)
+            found.append(jnp.where(begins, growth < GROWS, is_wide))
+        for here, before in zip(assembly.contacts(state._replace(is_wide=tuple(found))), state.is_wide, strict=True):
             changes |= jnp.any((here.is_wide != before) & (begins | (here.pressures > 0) | (here.gaps < 0)))
-        return found, changes
+        return tuple(found), changes
 
-    return jax.lax.cond(begins | ends, anew, lambda: (state.is_wide, jnp.array(False)))
+    is_wide, changes = jax.lax.cond(begins | ends, anew, lambda: (state.is_wide, jnp.array(False)))
+    return is_wide, jnp.where(begins, False, state.has_ended | ends), changes
 
 
 def _damping(state: State, trial: _Trial) -> Float[Array, ""]:

@@ -21,10 +21,10 @@ from rodjax.discretization.rod_pairs import (
     MOST_OF_PAIR,
     found_between,
     gaps_between,
+    growth_of_pair,
     joined,
     loads_between,
     pair_contacts,
-    wide_of_pair,
     with_pair_wells,
 )
 from rodjax.discretization.self_contact import Curve, Nearest, comes_through
@@ -195,10 +195,10 @@ def joined_curves(pairs: Pairs, curves: dict[int, Curve]) -> Curve:
     return jax.vmap(joined)(first, second)
 
 
-def wide_between(pairs: Pairs, curves: dict[int, Curve]) -> Bool[Array, "p n"]:
-    """Which elements are to have wide wells in an equilibrium."""
+def growth_between(pairs: Pairs, curves: dict[int, Curve]) -> Float[Array, "p n"]:
+    """By which it is told which elements are to have wide wells."""
     elements = curves[pairs.groups[0]].radius.shape[1]
-    return jax.vmap(lambda curve: wide_of_pair(curve, elements))(joined_curves(pairs, curves))
+    return jax.vmap(lambda curve: growth_of_pair(curve, elements))(joined_curves(pairs, curves))
 
 
 def contacts_between(

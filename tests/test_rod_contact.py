@@ -267,6 +267,11 @@ def test_what_touches_comes_back_from_a_file_to_the_last_bit(pressed, tmp_path):
         again = rodjax.solve(loaded.harness, segments=8, solver=TIGHT, guess=loaded)
     assert again.iterations == 0
     np.testing.assert_array_equal(again.rod_pressures, pressed.rod_pressures)
+    # Of format 17, in which all wells were narrow.
+    with h5py.File(tmp_path / "harness.vtkhdf", "r+") as file:
+        file["rodjax"].attrs["format"] = 17
+        del file["rodjax/wide_wells"]
+    np.testing.assert_array_equal(rodjax.load(tmp_path / "harness.vtkhdf").wide_wells, np.zeros(8, bool))
 
 
 def test_a_scene_file_says_which_cables_touch(tmp_path):

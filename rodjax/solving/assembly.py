@@ -404,23 +404,8 @@ class Assembly(eqx.Module):
         status = jnp.full((), Status.RUNNING, int)
         # All are wide where no equilibrium tells which are.
         has_ended = ~functools.reduce(jnp.logical_and, map(jnp.all, is_wide), jnp.array(True))
-        return State(
-            points,
-            at_ends,
-            pairs,
-            is_wide,
-            has_ended,
-            poses,
-            nothing,
-            zero,
-            zero,
-            nothing,
-            count,
-            count,
-            count,
-            status,
-            count,
-        )
+        of_contacts, counts = (pairs, is_wide, has_ended), (count, count, count, status, count)
+        return State(points, at_ends, *of_contacts, poses, nothing, zero, zero, nothing, *counts)
 
 
 def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, is_cold: Bool[Array, ""]) -> State:
@@ -430,9 +415,8 @@ def find_assembly(assembly: Assembly, begin: State, solver: Newton, find: Find, 
 
     def search(part: Float[Array, ""] | None, begin: State) -> NewtonEnd:
         here = assembly.bearing(part)
-        end = _found(
-            here, here.begin(begin.points, begin.at_ends, begin.pairs, begin.is_wide, begin.poses), solver, find
-        )
+        start = here.begin(begin.points, begin.at_ends, begin.pairs, begin.is_wide, begin.poses)
+        end = _found(here, start, solver, find)
         outcome = Outcome(end.residual, end.iterations, end.evaluations, end.status)
         return NewtonEnd(end, outcome, end.negative == 0)
 

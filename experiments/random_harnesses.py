@@ -259,6 +259,9 @@ def main(argv: Sequence[str] | None = None) -> list[Outcome]:
             f"{seed}: {told}, {outcome.iterations} iterations, {outcome.segments}, {seconds:.1f} s: {name}", flush=True
         )
     iterations = [outcome.iterations for outcome in found if outcome.converged]
+    if not iterations:
+        print(f"none of {len(found)} converges")
+        return found
     print(
         f"{len(iterations)} of {len(found)} converge, in {np.median(iterations):.0f} iterations in the median, "
         f"{np.quantile(iterations, 0.9):.0f} in 90 %, {max(iterations)} at most"

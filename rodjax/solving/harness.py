@@ -58,7 +58,6 @@ from rodjax.solving.harness_forces import (
     no_pressures,
     no_rod_pressures,
     split_pressures,
-    split_rod_pressures,
     stacked,
 )
 from rodjax.solving.harness_result import HarnessEquilibrium
@@ -76,7 +75,7 @@ from rodjax.solving.result import (
     warn_if_coarse,
     warn_of_outcome,
 )
-from rodjax.solving.rod_contact import Members, in_contact, pairs_of
+from rodjax.solving.rod_contact import Members, in_contact, pairs_of, split_by_pairs
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 from rodjax.warn import warn
@@ -400,8 +399,8 @@ def _solve(
     bodies, pairs = Bodies.of(harness), pairs_of(harness.contact, members)
     assembly = Assembly.of(tuple(groups), bodies, pairs)
     counts = [option.segments for option in options]
-    between = split_rod_pressures(pairs, counts, rod_pressures / assembly.force)
-    is_wide = split_rod_pressures(pairs, counts, wide_wells)
+    between = split_by_pairs(pairs, counts, rod_pressures / assembly.force)
+    is_wide = split_by_pairs(pairs, counts, wide_wells)
     solver = options[0].solver
     assert isinstance(solver, Newton)
     start = assembly.begin(tuple(points), tuple(at_ends), between, is_wide, poses)

@@ -1,12 +1,11 @@
 """What acts on the bodies of a harness: rods, springs, dead loads, and obstacles where rods end in them."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float
 
 from rodjax.checks import leaf
 from rodjax.model.harness import Bodies, Harness, end_radii, floating, joint_ends, rotated
@@ -14,7 +13,7 @@ from rodjax.model.scene import has_contacts
 from rodjax.solving.assembly import Poses
 from rodjax.solving.equilibrium import Options
 from rodjax.solving.result import Equilibrium
-from rodjax.solving.rod_contact import Members, Pairs, in_contact, pairs_of
+from rodjax.solving.rod_contact import Members, in_contact, pairs_of
 
 
 def stacked(parts: list[Any]) -> Any:
@@ -94,18 +93,6 @@ def no_rod_pressures(
     pairs = pairs_of(harness.contact, members)
     count = sum(len(each.places) * options[each.groups[0]].segments for each in pairs)
     return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype)), leaf(np.ones(count, bool))
-
-
-def split_rod_pressures(
-    pairs: tuple[Pairs, ...], counts: Sequence[int], pressures: Shaped[Array, "c"]
-) -> tuple[Shaped[Array, "p n"], ...]:
-    """Also of what else contacts have. `counts`: of elements of the rods of each group."""
-    found, first = [], 0
-    for each in pairs:
-        shape = len(each.places), counts[each.groups[0]]
-        found.append(pressures[first : first + shape[0] * shape[1]].reshape(shape))
-        first += shape[0] * shape[1]
-    return tuple(found)
 
 
 def contact_forces(

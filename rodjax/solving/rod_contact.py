@@ -7,12 +7,13 @@ their systems (`columns_of`): gradients of gaps and vectors of their curvature, 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rodjax.discretization.contact_gaps import curve
 from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
@@ -70,6 +71,20 @@ def pairs_of(contact: tuple[tuple[int, int], ...], members: Members) -> tuple[Pa
 def in_contact(pairs: tuple[Pairs, ...]) -> list[int]:
     """The numbers of the groups of which a rod may touch another one."""
     return sorted({group for between in pairs for group in between.groups})
+
+
+def split_by_pairs(
+    pairs: tuple[Pairs, ...], counts: Sequence[int], of_contacts: Shaped[Array, "c"]
+) -> tuple[Shaped[Array, "p n"], ...]:
+    """Pressures or wells of all contacts, of each kind of pairs by pair and element of its first rod. `counts`: of
+    elements of the rods of each group.
+    """
+    found, first = [], 0
+    for each in pairs:
+        shape = len(each.places), counts[each.groups[0]]
+        found.append(of_contacts[first : first + shape[0] * shape[1]].reshape(shape))
+        first += shape[0] * shape[1]
+    return tuple(found)
 
 
 class Contacts(NamedTuple):

@@ -30,7 +30,7 @@ from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, under_contact
 from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium
-from rodjax.solving.rod_contact import Members, Pairs, in_contact, joined_curves, pairs_of
+from rodjax.solving.rod_contact import Members, Pairs, in_contact, joined_curves, pairs_of, split_by_pairs
 
 # Of the contacts between rods of two groups, at most so many that push have derivatives; of more they are NaN.
 MOST_TOUCHING = 32
@@ -71,16 +71,6 @@ def mean_length(groups: tuple[Equilibrium, ...]) -> Float[Array, ""]:
     return jnp.mean(jnp.concatenate([group.s[:, -1] for group in groups]))
 
 
-def split_pressures_of(pairs: tuple[Pairs, ...], groups: tuple[Equilibrium, ...], pressures: Array) -> list[Array]:
-    """Or wells."""
-    found, first = [], 0
-    for each in pairs:
-        shape = len(each.places), groups[each.groups[0]].s.shape[1] - 1
-        found.append(pressures[first : first + shape[0] * shape[1]].reshape(shape))
-        first += shape[0] * shape[1]
-    return found
-
-
 @functools.partial(compiled, static_argnames=("members",))
 def rod_contacts(
     harness: Harness,
@@ -109,7 +99,8 @@ def _rod_contacts(
 ) -> dict[tuple[str, str], RodContacts]:
     length = mean_length(groups)
     curves, found = curves_of_results(groups, in_contact(pairs), length), {}
-    split = (split_pressures_of(pairs, groups, each) for each in (rod_pressures, wide_wells))
+    counts = [group.s.shape[1] - 1 for group in groups]
+    split = (split_by_pairs(pairs, counts, each) for each in (rod_pressures, wide_wells))
     for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements = pressures.shape[1]
 
@@ -249,7 +240,8 @@ def touching_rods(
     curves = curves_of_results(groups, in_contact(pairs), length)
     force = jnp.maximum(jnp.max(rod_pressures), jnp.finfo(length.dtype).tiny)
     touches, values, first = [], [], 0
-    split = (split_pressures_of(pairs, groups, each) for each in (rod_pressures, wide_wells))
+    counts = [group.s.shape[1] - 1 for group in groups]
+    split = (split_by_pairs(pairs, counts, each) for each in (rod_pressures, wide_wells))
     for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements, both = pressures.shape[1], joined_curves(each, curves)
 

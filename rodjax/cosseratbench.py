@@ -20,7 +20,8 @@ class RodjaxSolver:
     """The equilibrium between ends that do not move: the first frame is the given shape, all others are it.
 
     `scenario` and what `run` returns are a `Scenario` and a `Trajectory` of cosseratbench. Its runner reports as
-    unsupported what raises `NotImplementedError` here: dynamics, driven ends, rods that nothing holds, and friction.
+    unsupported what raises `NotImplementedError` here: dynamics, driven ends, rods that nothing holds, and friction but
+    of obstacles on one rod with two free ends, which lies where it is given: from there it slips.
     """
 
     name = "rodjax"
@@ -65,9 +66,9 @@ class RodjaxSolver:
     def scene(self, scenario: Any, segments: int) -> rodjax.Scene | rodjax.Harness:
         if not scenario.quasi_static:
             raise NotImplementedError("dynamics")
-        frictions = [each.friction for each in (*scenario.rods, *scenario.obstacles)]
-        if any(frictions):
-            # It has a memory, of which a shape to begin with says nothing.
+        is_rough = any(each.friction for each in (*scenario.rods, *scenario.obstacles))
+        if is_rough and (len(scenario.rods) > 1 or scenario.rods[0].friction or not lies_free(scenario.rods[0])):
+            # It has a memory, of which a shape to begin with says nothing where something else holds the rod.
             raise NotImplementedError("friction")
         scenes = [scene(scenario, rod, segments) for rod in scenario.rods]
         if len(scenes) == 1:
@@ -79,7 +80,7 @@ def scene(scenario: Any, rod: Any, segments: int) -> rodjax.Scene:
     """Of one rod of the scenario."""
     if rod.start_motion is not None or rod.end_motion is not None:
         raise NotImplementedError("driven ends")
-    if bench.EndCondition.FREE is rod.start is rod.end:
+    if lies_free(rod) and not any(given.friction for given in scenario.obstacles):
         raise NotImplementedError("a rod that nothing holds")
     material = rod.material
     body = rodjax.Rod.circular(
@@ -96,11 +97,16 @@ def scene(scenario: Any, rod: Any, segments: int) -> rodjax.Scene:
     )
 
 
+def lies_free(rod: Any) -> bool:
+    return bench.EndCondition.FREE is rod.start is rod.end
+
+
 def obstacle(given: Any) -> rodjax.Plane | rodjax.Cylinder:
+    friction = float(given.friction)
     if isinstance(given, bench.scenario.Plane):
-        return rodjax.Plane(given.point, given.unit_normal)
+        return rodjax.Plane(given.point, given.unit_normal, friction=friction)
     half = given.length / 2 * given.unit_axis
-    return rodjax.Cylinder(given.center - half, given.center + half, given.radius)
+    return rodjax.Cylinder(given.center - half, given.center + half, given.radius, friction=friction)
 
 
 def support(rod: Any, end: Any, segments: int) -> Support:

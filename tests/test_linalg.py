@@ -313,13 +313,26 @@ def random_loads(elements: int) -> LoadRows:
 
 
 @pytest.mark.parametrize("elements", [4, 7])
-@pytest.mark.parametrize("is_backward", [False, True])
+@pytest.mark.parametrize("order", [{}, {"is_backward": True}, {"is_loose": True}], ids=lambda order: "".join(order))
 @pytest.mark.parametrize("loads", [None, random_loads])
 @pytest.mark.parametrize("others", [None, with_inner_contacts, with_far_contacts])
-def test_chains_are_solved_and_their_signs_counted(elements, is_backward, loads, others):
+def test_chains_are_solved_and_their_signs_counted(elements, order, loads, others):
     """Also with loads that have no potential, without symmetry, and with contacts within and between elements."""
-    system = dataclasses.replace(random_chain(elements), is_backward=is_backward, loads=loads and loads(elements))
+    system = dataclasses.replace(random_chain(elements), loads=loads and loads(elements), **order)
     check_chain(system if others is None else others(system))
+
+
+def test_a_chain_with_two_free_ends_is_solved():
+    """Of which nothing holds or touches the first node, that has a pivot with the force of the element beyond it."""
+    system = random_chain(7)
+    nothing = ContactRows(
+        jnp.zeros_like(system.contacts.normals), jnp.asarray(1e-5), jnp.zeros_like(system.contacts.is_closed)
+    )
+    held, ends = jnp.arange(8) == 3, jnp.array([0, -1])
+    stiffness = system.stiffness.at[ends].set(0.0)
+    turning = system.turning.at[..., ends].set(0.0)
+    changed = {"held": held, "stiffness": stiffness, "turning": turning, "contacts": nothing, "is_loose": True}
+    check_chain(dataclasses.replace(system, **changed))
 
 
 @pytest.mark.parametrize("is_closed", [False, True])

@@ -30,6 +30,7 @@ from rodjax.model.loads import DistributedForce, PointCouple, Potential, acting,
 from rodjax.model.scene import (
     Scene,
     dead_forces,
+    has_free_ends,
     has_node_positions,
     held_at_both_ends,
     loads_at_nodes,
@@ -433,11 +434,12 @@ def _seen_by_spans(
     scene: Scene, end_force: Float[Array, "3 1"], clip_forces: Float[Array, "3 clips"]
 ) -> Float[Array, "3 spans"]:
     """The force at s = L as each span sees it, with those of the clips beyond; where the start is free, zero in the
-    first, and with those before.
+    first, and with those before where the end is held.
     """
-    if isinstance(scene.start, Free):
+    if isinstance(scene.start, Free) and not has_free_ends(scene):
         return jnp.pad(-jnp.cumsum(clip_forces, axis=1), ((0, 0), (1, 0)))
-    return end_force + jnp.pad(jnp.cumsum(clip_forces[:, ::-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
+    seen = end_force + jnp.pad(jnp.cumsum(clip_forces[:, ::-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
+    return seen.at[:, 0].set(0.0) if has_free_ends(scene) else seen
 
 
 def _energy_at(scene: Scene, start: Start, positions: Float[Array, "k 3"]) -> Float[Array, ""]:

@@ -16,7 +16,7 @@ from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, T
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.self_contact import Curve, wide_cells, with_wells
 from rodjax.geometry.vectors import root
-from rodjax.model.obstacles import InUnits, Obstacle
+from rodjax.model.obstacles import Obstacle, friction_coefficient
 from rodjax.model.scene import Scene, slides
 from rodjax.programs.parts import traced_once
 
@@ -30,11 +30,6 @@ LEAST_COMPLIANCE = 5e4
 # by the compliance of the piece between them, which is larger than this. With 1e-10 too many digits are lost. Pressures
 # are multipliers, so that it does not stay in the result.
 FAR_COMPLIANCE = 1e-9
-
-
-def friction_coefficient(obstacle: Obstacle) -> Any:
-    """The coefficient of friction of an obstacle of a nondimensional scene."""
-    return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction
 
 
 def smooth_obstacles(scene: Scene) -> tuple[int, ...]:

@@ -1,12 +1,17 @@
-"""Gravity and dead forces on a polyline. Their potential is linear in the nodes, so that the forces do not vary."""
+"""Gravity and dead forces: on the nodes of a polyline, and through a rod.
+
+Their potential is linear in the nodes, so that the forces do not vary.
+"""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.loads import DistributedForce, loaded_length
-from rodjax.model.scene import Scene, dead_forces
+from rodjax.model.scene import Scene, dead_forces, has_free_ends
 from rodjax.model.supports import Free, Held
 from rodjax.units import Units
 
@@ -53,11 +58,44 @@ def total_force(scene: Scene) -> Float[Array, "3"]:
     return sum(forces, jnp.zeros(3, scene.rod.length.dtype))
 
 
-def forces_beyond_edges(scene: Scene, node_forces: Float[Array, "3 n+1"]) -> Float[Array, "3 n"]:
-    """The sum of the forces on the nodes beyond each edge; where the start is free, less all of them."""
+def counted_from(
+    scene: Scene, clip_nodes: Int[Array, "clips"] | None, before: Float[Array, "... n"], total: Any = 1.0
+) -> Float[Array, "... n"]:
+    """What of a load counts in the force through each cell, by what lies `before` it and by the `total`: what is
+    beyond. Where the start is free that less all of it; where both ends are, so in the first span alone. The rest of
+    the force is that of a span between held places; a span with a free end has none.
+    """
+    if not has_free_ends(scene):
+        return total - before if isinstance(scene.start, Held) else -before
+    if clip_nodes is None:
+        return total - before
+    return jnp.where(jnp.arange(before.shape[-1]) < clip_nodes[0], -before, total - before)
+
+
+def forces_beyond_points(
+    scene: Scene,
+    clip_nodes: Int[Array, "clips"] | None,
+    loads: list[tuple[Float[Array, "3"], Float[Array, "p n"], Any]],
+    nothing: Float[Array, "p n"],
+) -> Float[Array, "3 p n"]:
+    """The dead forces at the points of cells: of loads, each with what of it lies before the points and with all of it,
+    and on free ends.
+    """
+    for end, before in ((scene.start, nothing + 1.0), (scene.end, nothing)):
+        if isinstance(end, Free) and end.force is not None and not end.follower:
+            loads = [*loads, (end.force, before, 1.0)]
+    forces = [force[:, None, None] * counted_from(scene, clip_nodes, *of_load)[None] for force, *of_load in loads]
+    return sum(forces, jnp.zeros((3, *nothing.shape), nothing.dtype))
+
+
+def forces_beyond_edges(
+    scene: Scene, node_forces: Float[Array, "3 n+1"], clip_nodes: Int[Array, "clips"] | None = None
+) -> Float[Array, "3 n"]:
+    """The sum of the forces on the nodes beyond each edge, or less those before it: see `counted_from`."""
     if isinstance(scene.start, Held):
         return jnp.cumsum(node_forces[:, :0:-1], axis=1)[:, ::-1]
-    return -jnp.cumsum(node_forces[:, :-1], axis=1)
+    total = jnp.sum(node_forces, axis=1, keepdims=True)
+    return counted_from(scene, clip_nodes, jnp.cumsum(node_forces[:, :-1], axis=1), total)
 
 
 def _trapezoidal_weights(count: int, dtype) -> Float[Array, "n+1"]:

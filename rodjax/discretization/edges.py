@@ -178,7 +178,8 @@ class EdgeTangents(eqx.Module):
         return by_side[..., 0, :]
 
     def loads_beyond(self, scene: Scene) -> Float[Array, "3 1 n"]:
-        return forces_beyond_edges(scene, forces_on_nodes(scene, self.segments, self.arclengths).T)[:, None]
+        on_nodes = forces_on_nodes(scene, self.segments, self.arclengths).T
+        return forces_beyond_edges(scene, on_nodes, self.clip_nodes)[:, None]
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 n"], lengths: Float[Array, "n"]) -> Float[Array, ""]:
         """Largest component of the force on a free node."""

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization.element_points import interleaved
 from rodjax.discretization.form import Form, Linearization, Point
 from rodjax.discretization.hermite import QuadraticRotationElements
+from rodjax.discretization.layout import from_held
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.mixed_point import MixedPoint
 from rodjax.discretization.motion import Motion, turn_about
@@ -34,7 +35,6 @@ from rodjax.linalg.saddle_point import factor_and_solve
 from rodjax.mechanics.energy import axial_strain_under, bending_moment_at, curvature_under, torque_at
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import slides
-from rodjax.model.supports import Held
 
 # Steps of the integration of an element: an even number.
 STEPS = 4
@@ -254,7 +254,7 @@ def errors_of_elements(form: MixedForm, point: MixedPoint, axis: Float[Array, "3
     )
     segment_vectors = (segment_vectors + change - form.edges(point)).T + gap
     sums = partial_sums(segment_vectors)
-    displacements = sums if isinstance(scene.start, Held) else sums - sums[:, -1:]
+    displacements = from_held(scene, form.clip_nodes, sums)
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
     retracted = form.retract(point, here.bases, motion.rotation, force_change)
     axial = _axial_error(form, form, retracted, point)

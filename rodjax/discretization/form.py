@@ -15,7 +15,7 @@ from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.potentials import OnElements, at_both, section_forces
 from rodjax.geometry.vectors import dot
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
-from rodjax.model.scene import Scene
+from rodjax.model.scene import Scene, has_free_ends
 from rodjax.model.supports import Free, Held
 
 # Shift of the Hessian in every factorisation [EI/L^2 per rad and length]. An equilibrium with neutral modes, such as
@@ -342,15 +342,15 @@ class Form(eqx.Module):
 
     def end_forces(self, point: Any, fields: OnElements | None) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The section forces at s = 0 and s = L; `fields`: those on elements."""
-        total, given = total_force(self.scene), jnp.zeros(3, point.tangents.dtype)
-        for end in (self.scene.start, self.scene.end):
-            if isinstance(end, Free) and end.force is not None:
-                given = end.force
+        total, none = total_force(self.scene), jnp.zeros(3, point.tangents.dtype)
+        start_given, end_given = (
+            end.force if isinstance(end, Free) and end.force is not None else none
+            for end in (self.scene.start, self.scene.end)
+        )
         first, last = point.end_force[:, 0], point.end_force[:, -1]
-        if isinstance(self.scene.start, Free):
-            start, end = -given, last - total
-        else:
-            start, end = first + total, given if isinstance(self.scene.end, Free) else last
+        start = -start_given if isinstance(self.scene.start, Free) else first + total
+        end = last - total if isinstance(self.scene.start, Free) else last
+        end = end_given if isinstance(self.scene.end, Free) else end
         if fields is None:
             return start, end
         on_nodes = at_both(fields.by_position)
@@ -361,10 +361,15 @@ class Form(eqx.Module):
     @abstractmethod
     def tangents_in_clips(self, point: Any) -> Float[Array, "3 clips"]: ...
 
+    def clip_forces(self, point: Any) -> Float[Array, "3 clips"]:
+        """Of each clip on the rod."""
+        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
+        # In the first span all loads count as those before: see `dead_loads.counted_from`.
+        return forces.at[:, 0].add(-total_force(self.scene)) if has_free_ends(self.scene) else forces
+
     def axial_forces(self, point: Any) -> Float[Array, "slides"]:
         """The axial forces of the sliding clips on the rod."""
-        forces = point.end_force[:, :-1] - point.end_force[:, 1:]
-        along = dot(forces, self.tangents_in_clips(point))
+        along = dot(self.clip_forces(point), self.tangents_in_clips(point))
         return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
 
     def force_components(self, multipliers: Float[Array, "k"]) -> Float[Array, "c"]:

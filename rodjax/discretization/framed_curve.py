@@ -31,7 +31,7 @@ from rodjax.geometry.rotations import (
 )
 from rodjax.geometry.vectors import dot
 from rodjax.model.scene import Scene, held_at_both_ends, scene_axes
-from rodjax.model.supports import Clamp, Directed, Held, Swivel
+from rodjax.model.supports import Clamp, Clip, Directed, Held, Swivel
 
 
 class FramedCurve(Shape):
@@ -278,7 +278,7 @@ def _neighbours(arclengths: Float[Array, "m"]) -> tuple[Float[Array, "m"], Float
 
 
 def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurve:
-    """The rod at rest in the place to which one of its ends is held; in any place between two pins."""
+    """The rod at rest in the place to which one of its ends, else the first clip, is held; in any between two pins."""
     start, end = scene.start, scene.end
     poses = scene.rod.stress_free.poses(ElementCells(s).arclengths)
     q, positions = poses.quaternions, poses.positions[:, ::2]
@@ -287,15 +287,19 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     # By the end that holds more.
     from_end = not isinstance(start, Held) or (isinstance(end, Clamp) and not isinstance(start, Directed))
     k, support = (-1, end) if from_end else (0, start)
-    assert isinstance(support, Held)
+    at_node = k
+    if not isinstance(support, Held):
+        support = scene.clips[0]
+        at_node = jnp.argmin(jnp.abs(s - support.at))
+        k = 2 * at_node
     held = product(from_frame(scene_axes(scene)), q[:, k])
-    if isinstance(support, Clamp):
+    if isinstance(support, Clamp | Clip) and support.frame is not None:
         held = from_frame(support.frame)
-    elif isinstance(support, Swivel):
+    elif isinstance(support, Swivel | Clip) and support.tangent is not None:
         held = align_tangent(held, support.tangent)
     turn = product(held, inverse(q[:, k]))
     nodes = support.position[:, None] + rotated(
-        jnp.broadcast_to(turn[:, None], (4, len(s))), positions - positions[:, k, None]
+        jnp.broadcast_to(turn[:, None], (4, len(s))), positions - positions[:, at_node, None]
     )
     return FramedCurve(nodes.T, product(jnp.broadcast_to(turn[:, None], q.shape), q), s)
 

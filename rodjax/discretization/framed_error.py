@@ -26,12 +26,12 @@ from rodjax.discretization.framed_results import (
     strains_at_ends,
     through_cells,
 )
+from rodjax.discretization.layout import from_held
 from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.geometry.rotations import columns, inverse, product, rotated, tangent, unit
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.blocks import short_sum
 from rodjax.model.scene import slides
-from rodjax.model.supports import Held
 
 
 class Pose(eqx.Module):
@@ -93,7 +93,7 @@ def errors_of_frames(form: FrameForm, point: FramePoint, axis: Float[Array, "3"]
 
     _, way_changes = jax.jvp(reached, (zero,), (one,))
     sums = jnp.concatenate([jnp.zeros_like(way_changes[:, :1]), jnp.cumsum(way_changes, axis=1)], axis=1)
-    displacements = sums if isinstance(form.scene.start, Held) else sums - sums[:, -1:]
+    displacements = from_held(form.scene, form.clip_nodes, sums)
     sizes = [jnp.sqrt(dot(defect, defect)) for defect in (gap, turn, couple)]
 
     # A difference, as a derivative of these would be a third one of the energy.

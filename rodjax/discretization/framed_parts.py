@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import Cells, ElementCells, JointCells, strains_between
+from rodjax.discretization.dead_loads import forces_beyond_points
 from rodjax.discretization.layout import SpanForces
 from rodjax.discretization.rest_correction import RestCorrection
 from rodjax.model.along import Along
 from rodjax.model.loads import DistributedForce, length_before, loaded_length
 from rodjax.model.scene import Scene, dead_forces
-from rodjax.model.supports import Free, Held
 
 
 def parts_of(scene: Scene, field: Cells) -> dict[str, Any]:
@@ -48,22 +48,14 @@ def _at_rest(
 
 
 def _dead_loads(scene: Scene, cells: Cells) -> Float[Array, "3 k n"]:
-    """What the dead loads beyond each strain point exert on it; where the start is free, less all of them."""
-    starts_held = isinstance(scene.start, Held)
     s = cells.strain_arclengths
-    forces, one = jnp.zeros((3, *s.shape), s.dtype), jnp.ones((), s.dtype)
+    one = jnp.ones((), s.dtype)
+    loads = []
     if scene.gravity is not None:
         mass = scene.rod.mass_per_length
-        before = mass.integral(s) if isinstance(mass, Along) else s
-        forces += scene.gravity[:, None, None] * (1.0 - before if starts_held else -before)[None]
+        loads.append((scene.gravity, mass.integral(s) if isinstance(mass, Along) else s, 1.0))
     for load in scene.distributed:
         if isinstance(load, DistributedForce) and not load.follower:
-            before = length_before(load, s)
-            forces += load.force[:, None, None] * (loaded_length(load, one) - before if starts_held else -before)[None]
-    for load in dead_forces(scene):
-        before = cells.parts_before(load.at)
-        forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
-    for end, sign in ((scene.start, -1), (scene.end, 1)):
-        if isinstance(end, Free) and end.force is not None and not end.follower:
-            forces += sign * end.force[:, None, None]
-    return forces
+            loads.append((load.force, length_before(load, s), loaded_length(load, one)))
+    loads += [(load.force, 1.0 - cells.parts_before(load.at), 1.0) for load in dead_forces(scene)]
+    return forces_beyond_points(scene, cells.clip_nodes, loads, jnp.zeros_like(s))

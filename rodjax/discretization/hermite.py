@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.discretization.dead_loads import forces_beyond_points
 from rodjax.discretization.element_bending import SIMPSON, bending_energies, by_chords
 from rodjax.discretization.element_pairs import (
     ARC_WEIGHTS,
@@ -45,7 +46,7 @@ from rodjax.linalg.blocks import partial_sums
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.mechanics.strain import swept_angle
 from rodjax.model.scene import Scene
-from rodjax.model.supports import Clamp, Directed, Free, Held
+from rodjax.model.supports import Clamp, Directed
 from rodjax.programs.parts import traced_once
 
 
@@ -231,19 +232,10 @@ class QuadraticRotationElements(eqx.Module):
     # --- places and loads --------------------------------------------------------------------------------------------
 
     def loads_beyond(self, scene: Scene) -> Float[Array, "3 3 n"]:
-        starts_held = isinstance(scene.start, Held)
-        forces = jnp.zeros((3, 3, len(self.h)), self.s.dtype)
+        loads = [(load.force, 1.0 - parts_before(self.s, load.at), 1.0) for load in scene.point_forces]
         if scene.gravity is not None:
-            arclengths = jnp.stack(of_elements(self.arclengths))
-            forces += scene.gravity[:, None, None] * (1.0 - arclengths if starts_held else -arclengths)[None]
-        for load in scene.point_forces:
-            before = parts_before(self.s, load.at)
-            forces += load.force[:, None, None] * (before if starts_held else before - 1.0)[None]
-        if isinstance(scene.start, Free) and scene.start.force is not None:
-            forces -= scene.start.force[:, None, None]
-        if isinstance(scene.end, Free) and scene.end.force is not None:
-            forces += scene.end.force[:, None, None]
-        return forces
+            loads.append((scene.gravity, jnp.stack(of_elements(self.arclengths)), 1.0))
+        return forces_beyond_points(scene, self.clip_nodes, loads, jnp.zeros((3, len(self.h)), self.s.dtype))
 
     def residual(self, scene: Scene, gradient: Float[Array, "3 m"], lengths: Float[Array, "m"]) -> Float[Array, ""]:
         """Largest component of the moment left at a point, per length of rod."""

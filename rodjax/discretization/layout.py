@@ -158,6 +158,8 @@ def held_positions(
         positions, nodes = [start.position, *positions], [0, *nodes]
     if isinstance(end, Held):
         positions, nodes = [*positions, end.position], [*nodes, len(s) - 1]
+    if not positions:
+        return jnp.zeros((3, 0), s.dtype), jnp.zeros(0, int)
     return jnp.stack(positions, axis=1), jnp.array(nodes)
 
 
@@ -167,6 +169,8 @@ def nodes_along(
     """Nodes at the arclengths `s` along the edges, at held places to the last digit."""
     positions, held = held_positions(scene, s, clip_nodes)
     nodes = partial_sums(edges.T)
+    if not len(held):
+        return nodes.T
     missing = positions - jnp.stack([nodes[:, held[k]] for k in range(len(held))], axis=1)
     if len(held) == 1:
         nodes += missing
@@ -179,6 +183,17 @@ def nodes_along(
     for k in range(len(held)):
         nodes = jnp.where(number == held[k], positions[:, k, None], nodes)
     return nodes.T
+
+
+def from_held(
+    scene: Scene, clip_nodes: Int[Array, "clips"] | None, displacements: Float[Array, "3 n+1"]
+) -> Float[Array, "3 n+1"]:
+    """Displacements that are zero at the start, less that of an end that is held instead, or of the first clip."""
+    if isinstance(scene.start, Held):
+        return displacements
+    if isinstance(scene.end, Held):
+        return displacements - displacements[:, -1:]
+    return displacements if clip_nodes is None else displacements - displacements[:, clip_nodes[0], None]
 
 
 def force_parts(scene: Scene, segments: int) -> int:

@@ -274,9 +274,9 @@ class NodalForm(PositionForm):
             # The gradient by rotations has the pressures as they are.
             at_rest = rows.rates(rotation, jnp.zeros_like(others.displacements))
             rate += jnp.sum(point.nodal.contact_forces * at_rest)
-        if self.scene.potentials:
-            by_position = potentials.by_position(self.scene, self.field.s, *self.node_lines(point))
-            rate += jnp.sum(by_position * others.displacements)
+        of_energies = self.of_energies_at_nodes(point)
+        if of_energies is not None:
+            rate -= jnp.sum(of_energies * others.displacements.T)
         return gaps.reshape(-1), gap_rates.reshape(-1), energy - before, rate - counted
 
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:

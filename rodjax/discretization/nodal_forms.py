@@ -30,7 +30,7 @@ from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import product, short_sum
 from rodjax.linalg.chain import ChainSystem, LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene, with_pins
+from rodjax.model.scene import Scene, has_free_ends, with_pins
 from rodjax.model.supports import Free, Held
 from rodjax.programs.parts import traced_once
 
@@ -109,7 +109,8 @@ class NodalTangents(NodalForm, MixedForm):
             contacts.rows,
             self.is_held,
             turning=None if fields is None else fields.turning,
-            is_backward=not isinstance(self.scene.start, Held),
+            is_backward=isinstance(self.scene.end, Held) and not isinstance(self.scene.start, Held),
+            is_loose=has_free_ends(self.scene),
         )
         return Linearization(
             bases=bases,
@@ -277,7 +278,8 @@ class NodalFrames(NodalForm, FrameForm):
             self.is_held,
             None if self.has_potential else self._load_rows(point),
             None if fields is None else fields.turning,
-            is_backward=not isinstance(self.scene.start, Held),
+            is_backward=isinstance(self.scene.end, Held) and not isinstance(self.scene.start, Held),
+            is_loose=has_free_ends(self.scene),
         )
         gaps = self.gap_of_elements(point, cells.segment_vectors.T)
         held = dataclasses.replace(self, ends_move=False)

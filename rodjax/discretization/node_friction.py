@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.contact_gaps import friction_coefficient, gaps_and_normals, rough_obstacles
+from rodjax.discretization.contact_gaps import gaps_and_normals, rough_obstacles
 from rodjax.discretization.friction import LEAST_SLIP, directions, lengths, pulled, tangential
 from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
-from rodjax.model.obstacles import InUnits
+from rodjax.model.obstacles import InUnits, friction_coefficient
 
 
 def travelled(form: PositionForm, positions: Float[Array, "n+1 3"], friction: Friction) -> Float[Array, "n+1 3"]:

@@ -19,14 +19,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization import potentials
+from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import Form, Linearization
 from rodjax.discretization.layout import CellForces, SpanForces
 from rodjax.discretization.nodal_point import Nodal
 from rodjax.discretization.potentials import NodeEnergy
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.vectors import dot
 from rodjax.mechanics.passage import SAMPLES
 from rodjax.model.along import Value, largest_beside, value_at
+from rodjax.model.scene import has_free_ends, held_position
 from rodjax.model.supports import Clamp, Held
 
 # Where it is looked whether a rod has come through: beside nodes and middles of most meshes, by this part of a step.
@@ -81,17 +82,14 @@ class PositionForm(Form):
     def multipliers_turned(
         self, point: Any, axis: Float[Array, "3"], multipliers: Float[Array, "k"]
     ) -> Float[Array, "k"]:
-        positions, _ = self.held_positions
-        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.positions - positions[:, 0][None])
+        arms = jnp.where(self.is_held[:, None], 0.0, point.nodal.positions - held_position(self.scene)[None])
         by_node = jnp.cross(axis[None], arms).reshape(-1)
         of_force = self.force_turned(point, axis)
         return multipliers.at[-len(by_node) - len(of_force) :].set(jnp.concatenate([by_node, of_force]))
 
-    def axial_forces(self, point: Any) -> Float[Array, "slides"]:
-        nodes = self.clip_nodes
-        assert nodes is not None
-        along = dot(self.applied(point)[:, nodes], self.tangents_in_clips(point))
-        return along[np.array([k for k, clip in enumerate(self.scene.clips) if clip.sliding])]
+    def clip_forces(self, point: Any) -> Float[Array, "3 clips"]:
+        assert self.clip_nodes is not None
+        return self.applied(point)[:, self.clip_nodes]
 
     def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return super().is_closed(self.force_components(constraint_residual), tolerance)
@@ -109,6 +107,8 @@ class PositionForm(Form):
         loads = self.loads_on_nodes(point)
         if loads is None:
             return forces
+        if self._on_first_node is not None:
+            loads -= self._on_first_node.T
         if isinstance(self.scene.start, Held):
             return forces + jnp.cumsum(loads[:, :0:-1], axis=1)[:, ::-1]
         return forces - jnp.cumsum(loads[:, :-1], axis=1)
@@ -165,14 +165,30 @@ class PositionForm(Form):
     # --- loads and fields --------------------------------------------------------------------------------------------
 
     def loads_on_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
-        """The forces of fields, and of other rods, on the nodes; `None` without such."""
-        loads = None
-        if self.scene.potentials:
-            loads = -potentials.by_position(self.scene, self.field.s, *self.node_lines(point)).T
+        """The forces of fields, and of other rods, on the nodes, and what `_on_first_node` has; `None` without such."""
+        loads = self.of_energies_at_nodes(point)
         if self.scene.contact_loads is None:
             return loads
         of_rods = potentials.at_both(self.scene.contact_loads.on_positions)
         return of_rods if loads is None else loads + of_rods
+
+    def of_energies_at_nodes(self, point: Any) -> Float[Array, "3 n+1"] | None:
+        """The forces on the nodes that have an energy there; `None` without such."""
+        loads = None if self._on_first_node is None else self._on_first_node.T
+        if not self.scene.potentials:
+            return loads
+        of_fields = -potentials.by_position(self.scene, self.field.s, *self.node_lines(point)).T
+        return of_fields if loads is None else of_fields + loads
+
+    @property
+    def _on_first_node(self) -> Float[Array, "n+1 3"] | None:
+        """Of a rod whose ends are both free, all dead loads, on its first node or in its first clip: in the forces
+        through elements they count from there (`dead_loads.counted_from`). `None` where an end is held.
+        """
+        if not has_free_ends(self.scene):
+            return None
+        first = 0 if self.clip_nodes is None else self.clip_nodes[0]
+        return jnp.zeros((len(self.field.s), 3), self.field.s.dtype).at[first].set(total_force(self.scene))
 
     def node_lines(self, point: Any) -> tuple[Float[Array, "n+1 3"], Float[Array, "3 n+1"]]:
         """The positions and tangents of the nodes."""
@@ -180,24 +196,32 @@ class PositionForm(Form):
 
     def at_nodes(self, point: Any) -> NodeEnergy | None:
         """Energies of fields at the nodes and their derivatives by the unknowns, with those of the work of other rods,
-        whose energy is not counted; `None` without such.
+        whose energy is not counted, and that of `_on_first_node`; `None` without such.
         """
-        if not self.scene.potentials and self.scene.contact_loads is None:
-            return None
-        fields, axes = None, self.node_axes(point)
+        parts, axes, tangents = [], self.node_axes(point), point.tangents[:, ::2]
         if self.scene.potentials:
-            fields = potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), axes)
-        if self.scene.contact_loads is None:
-            return fields
-        pulls = potentials.at_both(self.scene.contact_loads.on_tangents)
-        of_rods = potentials.of_pulls(pulls, point.tangents[:, ::2], axes)
-        return of_rods if fields is None else NodeEnergy(*map(jnp.add, fields, of_rods))
+            parts.append(potentials.at_nodes(self.scene, self.field.s, *self.node_lines(point), axes))
+        if self.scene.contact_loads is not None:
+            pulls = potentials.at_both(self.scene.contact_loads.on_tangents)
+            parts.append(potentials.of_pulls(pulls, tangents, axes))
+        if self._on_first_node is not None:
+            without = potentials.of_pulls(jnp.zeros_like(tangents), tangents, axes)
+            parts.append(without._replace(energy=self._energy_of_first(point, self._on_first_node)))
+        return NodeEnergy(*(sum(those[1:], those[0]) for those in zip(*parts, strict=True))) if parts else None
+
+    def _energy_of_first(self, point: Any, force: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
+        return -jnp.sum(force * point.nodal.positions, axis=1)
+
+    def _energy_at_nodes(self, point: Any) -> Float[Array, ""]:
+        """Of fields, and of `_on_first_node`."""
+        energy = jnp.zeros((), point.tangents.dtype)
+        if self.scene.potentials:
+            energy += jnp.sum(potentials.node_energies(self.scene, self.field.s, *self.node_lines(point)))
+        force = self._on_first_node
+        return energy if force is None else energy + jnp.sum(self._energy_of_first(point, force))
 
     def load_energy(self, point: Any) -> Float[Array, ""]:
-        energy = super().load_energy(point)  # pyright: ignore
-        if not self.scene.potentials:
-            return energy
-        return energy + jnp.sum(potentials.node_energies(self.scene, self.field.s, *self.node_lines(point)))
+        return super().load_energy(point) + self._energy_at_nodes(point)  # pyright: ignore
 
     def applied(self, point: Any) -> Float[Array, "3 n+1"]:
         """The forces that clips, contacts and supports apply at the nodes."""
@@ -209,8 +233,7 @@ class PositionForm(Form):
         """L without contacts, and the residual of the closure of each element."""
         energy, segment_vectors = self.in_cells_at(point)
         energy += jnp.sum(point.end_force.T * jnp.diff(point.nodal.positions, axis=0))
-        if self.scene.potentials:
-            energy += jnp.sum(potentials.node_energies(self.scene, self.field.s, *self.node_lines(point)))
+        energy += self._energy_at_nodes(point)
         return energy, self.gap_of_elements(point, segment_vectors).reshape(-1)
 
     def gap_of_elements(self, point: Any, segment_vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

@@ -37,6 +37,9 @@ from rodjax.programs.parts import traced_once
 HARDENINGS = 5
 # In these, contacts between elements have this part of their compliance.
 HARD = 1e-4
+# Of a rod with two free ends the stiffness that holds its last node while it is factorised [EI/L^3]: displacements that
+# nothing else holds, as along a floor, are regular by it.
+LOOSE = 1e-4
 
 
 class InnerRows(eqx.Module):
@@ -176,7 +179,8 @@ class ChainSystem(eqx.Module):
     none. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
     `between`: what rotations and place (b, 3) of the last node of an element have by those of its first, beside H;
     `None` for none. `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or
-    touches has no pivot. `loads`: `None` where all have a potential.
+    touches has no pivot. `is_loose`: both ends are free, and elimination takes the force of an element with the node
+    before it; the last node is held softly (`LOOSE`). `loads`: `None` where all have a potential.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -193,6 +197,7 @@ class ChainSystem(eqx.Module):
     turning: Float[Array, "b 3 n+1"] | None = None
     between: Float[Array, "b+3 b+3 n"] | None = None
     is_backward: bool = eqx.field(static=True, default=False)
+    is_loose: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> "ChainSystem":
         """The same system of the rod counted from its end: the forces through the elements have the other sign.
@@ -367,6 +372,9 @@ class ChainSystem(eqx.Module):
     def condensed(self) -> "ChainSystem":
         """Without the pressures, as elimination goes along the rod."""
         system = self.contacts.condensed(self)
+        if self.is_loose:
+            softly = LOOSE * jnp.eye(3, dtype=system.stiffness.dtype)
+            system = dataclasses.replace(system, stiffness=system.stiffness.at[-1].add(softly))
         return system.mirrored() if self.is_backward else system
 
 
@@ -438,11 +446,12 @@ class ChainFactors(eqx.Module):
     ) -> tuple[Float[Array, "b m"], Float[Array, "j"]]:
         """With the contact compliance. Contacts within elements couple their nodes so stiffly that elimination loses
         half of the digits, and so it does with contacts where there is no symmetry; what is left is asked for again.
+        So is what holds a loose rod, three times.
         """
-        loses = self.contacts.inner is not None or (self.system.loads is not None and self.contacts.is_closed.size > 0)
-        if not loses:
+        without_symmetry = self.system.loads is not None and self.contacts.is_closed.size > 0
+        if not (self.whole.is_loose or self.contacts.inner is not None or without_symmetry):
             return self._solved_once(f, c, self.complement)
-        return self._refined(f, c, self.whole, self.complement, 2)
+        return self._refined(f, c, self.whole, self.complement, 4 if self.whole.is_loose else 2)
 
     def _refined(
         self,
@@ -502,7 +511,7 @@ class ChainFactors(eqx.Module):
     def _without_border(
         self, f: Float[Array, "b r m"], nodes: Float[Array, "r n+1 3"], gaps: Float[Array, "r n 3"]
     ) -> tuple[Float[Array, "b r m"], Float[Array, "r n+1 3"], Float[Array, "r n 3"]]:
-        middles, b = self.middles, len(f)
+        system, middles, b = self.system, self.middles, len(f)
         of_nodes, of_middles = f[..., ::2].transpose(2, 0, 1), f[..., 1::2].transpose(2, 0, 1)
         reduction = middles.reduction(of_middles)
         none = jnp.zeros_like(of_nodes[:1])
@@ -513,15 +522,17 @@ class ChainFactors(eqx.Module):
         of_positions = nodes.transpose(1, 2, 0)
         if middles.left is not None:
             of_positions -= _on_nodes(reduction[:, 2 * b + 3 : 2 * b + 6], reduction[:, 2 * b + 6 :])
-        right = jnp.concatenate([rotations, jnp.pad(forces, ((1, 0), (0, 0), (0, 0))), of_positions], axis=1)
+        with_force = _before if system.is_loose else _after
+        right = jnp.concatenate([rotations, with_force(forces), of_positions], axis=1)
         right = jnp.einsum("npq,nqr->npr", self.inverses, right)
 
         z = substituted(self.after, substituted(self.before, right), backward=True)
-        around = jnp.concatenate([z[:-1, :b], z[1:, : b + 3]], axis=1)
+        forces = (z[:-1] if system.is_loose else z[1:])[:, b : b + 3]
+        around = jnp.concatenate([z[:-1, :b], z[1:, :b], forces], axis=1)
         of_middles = jnp.einsum("npq,nqr->npr", middles.inverse, of_middles)
         of_middles -= jnp.einsum("npq,nqr->npr", middles.solved, around)
         x = _at_points(z[:, :b].transpose(1, 2, 0), of_middles.transpose(1, 2, 0))
-        return x, z[:, b + 3 :].transpose(2, 0, 1), z[1:, b : b + 3].transpose(2, 0, 1)
+        return x, z[:, b + 3 :].transpose(2, 0, 1), forces.transpose(2, 0, 1)
 
 
 @traced_once
@@ -538,30 +549,36 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     none = jnp.zeros((n + 1, b, 3), dtype)
     turning = none if system.turning is None else system.turning.transpose(2, 0, 1) * free[:, None, None]
     turns = system.diagonal[..., ::2].transpose(2, 0, 1) + _on_nodes(elements[:, start, start], elements[:, end, end])
-    # The first node has no element before it.
-    pulling = _after(elements[:, gap, end])
-    pulls = jnp.concatenate([-identity[None], elements[:, gap, gap]])
-    pushed = _after(free[1:, None, None] * identity[None])
+    # A force is with the node after its element, and the first node has none; with the one before if that is loose.
+    near, far = (start, end) if system.is_loose else (end, start)
+    with_force = _before if system.is_loose else _after
+    moved = [-free[:-1, None, None] * identity[None], free[1:, None, None] * identity[None]]
+    moved_near, moved_far = moved if system.is_loose else moved[::-1]
+    pulling, pushed = with_force(elements[:, gap, near]), with_force(moved_near)
+    pulls = with_force(elements[:, gap, gap]).at[-1 if system.is_loose else 0].set(-identity)
     places = jnp.where(system.held[:, None, None], identity[None], system.stiffness)
     blocks = _matrices(
-        [turns, _after(elements[:, end, gap]), turning],
+        [turns, with_force(elements[:, near, gap]), turning],
         [pulling, pulls, pushed],
         [turning.transpose(0, 2, 1), pushed, places],
     )
+    # From a node to the one that has the force between them, and back.
     apart = jnp.zeros((n, 3, b + 6), dtype)
-    below = _matrices(
-        [elements[:, end, start], apart[..., :b].transpose(0, 2, 1), none[1:]],
-        [elements[:, gap, start], apart[..., :3], -free[:-1, None, None] * identity[None]],
+    onto = _matrices(
+        [elements[:, near, far], apart[..., :b].transpose(0, 2, 1), none[1:]],
+        [elements[:, gap, far], apart[..., :3], moved_far],
         [apart],
     )
-    above = below.transpose(0, 2, 1)
+    back = onto.transpose(0, 2, 1)
     if system.loads is not None:
-        above = above.at[:, turn, turn].set(elements[:, start, end]).at[:, turn, pull].set(elements[:, start, gap])
+        back = back.at[:, turn, turn].set(elements[:, far, near]).at[:, turn, pull].set(elements[:, far, gap])
         before, after = elements[:, 2 * b + 3 : 2 * b + 6], elements[:, 2 * b + 6 :]
         blocks = blocks.at[:-1, place, turn].add(before[..., start]).at[1:, place, turn].add(after[..., end])
-        blocks = blocks.at[1:, place, pull].add(after[..., gap])
-        below = below.at[:, place, turn].set(after[..., start])
-        above = above.at[:, place, turn].set(before[..., end]).at[:, place, pull].add(before[..., gap])
+        on_near, on_far = (before, after) if system.is_loose else (after, before)
+        blocks = blocks.at[slice(-1) if system.is_loose else slice(1, None), place, pull].add(on_near[..., gap])
+        onto = onto.at[:, place, turn].set(on_near[..., far])
+        back = back.at[:, place, turn].set(on_far[..., near]).at[:, place, pull].add(on_far[..., gap])
+    below, above = (back, onto) if system.is_loose else (onto, back)
     if system.between is not None:
         between = system.between.transpose(2, 0, 1)
         for rows, columns, part in (
@@ -573,14 +590,17 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
             below = below.at[:, rows, columns].add(part)
             above = above.at[:, columns, rows].add(part.transpose(0, 2, 1))
 
-    # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them.
-    stiffness = jnp.trace(system.stiffness, axis1=1, axis2=2) / 3
-    unit = jnp.sqrt(jnp.where(system.held | (stiffness < 1), 1.0, stiffness))
-    scale = jnp.concatenate(
-        [jnp.ones((n + 1, b), dtype), jnp.tile(unit[:, None], 3), jnp.tile(1 / unit[:, None], 3)], 1
-    )
+    # Contacts are stiffer than rods by many orders: pivots are inverted, and their signs counted, in units of them. A
+    # node that has the force beyond it is as stiff as all before it.
+    def scale_of(places: Float[Array, "*k 3 3"]) -> Float[Array, "*k c"]:
+        stiffness = jnp.trace(places, axis1=-2, axis2=-1)[..., None] / 3
+        unit = jnp.sqrt(jnp.where(stiffness < 1, 1.0, stiffness))
+        turns, three = (jnp.ones((*stiffness.shape[:-1], count), dtype) for count in (b, 3))
+        return jnp.concatenate([turns, unit * three, three / unit], axis=-1)
 
     def inverted(block: Array, scale: Array) -> tuple[Array, Array]:
+        if system.is_loose:
+            scale = scale_of(block[place, place])
         pivot = scale[:, None] * block * scale[None]
         return pivot, scale[:, None] * inverse_matrix(pivot) * scale[None]
 
@@ -589,12 +609,13 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
         pivot, here = inverted(block - below @ before @ above, scale)
         return here, (pivot, here)
 
+    scale = scale_of(places)
     begin, first = inverted(blocks[0], scale[0])
     _, (pivots, inverses) = jax.lax.scan(eliminated, first, (blocks[1:], below, above, scale[1:]))
     pivots, inverses = jnp.concatenate([begin[None], pivots]), jnp.concatenate([first[None], inverses])
     is_symmetric = system.loads is None and contacts.pushes is None
     if is_symmetric:
-        # Each force is a multiplier, and so is that of the element before the first node.
+        # Each force is a multiplier, and so is that of the element that a node at an end lacks.
         negative += negative_count(jax.lax.stop_gradient(pivots)) - 3 * (n + 1)
     border = _border_of(system, contacts)
     blank, no_complement = border.columns(), jnp.zeros((border.size, border.size), dtype)
@@ -699,6 +720,11 @@ def _at_points(nodes: Float[Array, "*c n+1"], middles: Float[Array, "*c n"]) -> 
 def _after(of_elements: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:
     """What nodes have of the element before them."""
     return jnp.concatenate([jnp.zeros_like(of_elements[:1]), of_elements])
+
+
+def _before(of_elements: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:
+    """What nodes have of the element beyond them."""
+    return jnp.concatenate([of_elements, jnp.zeros_like(of_elements[:1])])
 
 
 def _on_nodes(before: Float[Array, "n *c"], after: Float[Array, "n *c"]) -> Float[Array, "n+1 *c"]:

@@ -271,15 +271,17 @@ def sought(
         hardest = jnp.min(contact_compliance)
         is_late = (state.count + 1 == FIRST_FACTORS) & ~is_same
         harder = jnp.where(state.level > HARDENING * hardest, state.level / HARDENING, 0.0)
+        # With softer contacts the model may have no minimum where it has one.
+        is_too_soft = ~is_minimum & (state.level > hardest)
+        level = jnp.where(is_late & (hardest < MOST_COMPLIANT), MOST_COMPLIANT, jnp.where(is_same, harder, state.level))
+        motion = jax.tree.map(lambda here, change: here + part * change, state.motion, change)
+        kept, found = (state.motion, state.memory, state.trial, state.is_closed), (motion, memory, trial, is_closed)
         return Sought(
-            jax.tree.map(lambda here, change: here + part * change, state.motion, change),
-            memory,
-            trial,
-            is_closed,
-            jnp.where(is_late & (hardest < MOST_COMPLIANT), MOST_COMPLIANT, jnp.where(is_same, harder, state.level)),
+            *jax.tree.map(lambda old, new: jnp.where(is_too_soft, old, new), kept, found),
+            jnp.where(is_too_soft, harder, level),
             is_minimum,
-            (is_same & (state.level <= hardest)) | ~is_minimum,
-            jnp.where(is_late | is_same, 0, state.since + 1),
+            ((is_same & (state.level <= hardest)) | ~is_minimum) & ~is_too_soft,
+            jnp.where(is_late | is_same | is_too_soft, 0, state.since + 1),
             state.count + 1,
         )
 

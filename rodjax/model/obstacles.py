@@ -249,6 +249,11 @@ class InUnits(Obstacle):
         return self.obstacle.at(self.origin + self.length * point) / self.length
 
 
+def friction_coefficient(obstacle: Obstacle) -> Any:
+    """Of an obstacle in any units; `None` without friction."""
+    return obstacle.obstacle.friction if isinstance(obstacle, InUnits) else obstacle.friction
+
+
 def has_other_side(obstacle: Obstacle) -> bool:
     """Whether a rod could come through it: not through half of all space."""
     return not isinstance(obstacle.obstacle if isinstance(obstacle, InUnits) else obstacle, Plane)

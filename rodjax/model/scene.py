@@ -22,7 +22,7 @@ from rodjax.model.loads import (
     Potential,
     check_potential,
 )
-from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles
+from rodjax.model.obstacles import InUnits, Obstacle, checked_obstacles, friction_coefficient
 from rodjax.model.rod import Rod
 from rodjax.model.summaries import scene_text
 from rodjax.model.supports import Clamp, Clip, Free, Held, Hinge, Movable, Pin, Slider, Spring, Support, Swivel, rotate
@@ -155,8 +155,11 @@ def _of_one_precision(parts: Any) -> Any:
 def _check_supports(scene: Scene) -> None:
     ends = (scene.start, scene.end)
     pair = f"{type(scene.start).__name__} at the start and {type(scene.end).__name__} at the end"
-    if not any(isinstance(end, Held | Movable) for end in ends):
-        raise ValueError(f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin")
+    if has_free_ends(scene) and not (scene.clips or has_friction(scene) or scene.potentials):
+        raise ValueError(
+            f"{pair} hold no position: the rod would fly off; make one a Clamp, Swivel or Pin, or hold the rod by a "
+            "Clip, by obstacles with friction or by a potential"
+        )
     for end, other in (ends, ends[::-1]):
         if not isinstance(end, Free):
             continue
@@ -164,8 +167,11 @@ def _check_supports(scene: Scene) -> None:
         loaded = scene.gravity is not None or scene.point_forces or end.force is not None or along
         if isinstance(other, Pin) and not loaded and not scene.clips:
             raise ValueError(f"{pair}: without gravity or a force the rod can turn freely about the pin")
-        if end.moment is not None and not isinstance(other, Clamp | Movable):
-            raise ValueError(f"{pair}: a moment on a free end needs a Clamp at the other end to resist it")
+        resists = isinstance(other, Clamp | Movable) or any(clip.frame is not None for clip in scene.clips)
+        if end.moment is not None and not resists:
+            raise ValueError(
+                f"{pair}: a moment on a free end needs a Clamp at the other end, or a Clip with a frame, to resist it"
+            )
     if scene.turns is not None and not all(isinstance(end, Clamp) for end in ends):
         raise ValueError(f"turns need a Clamp at both ends, got {pair}, which leaves the rod free to spin")
     if scene.turns is not None and any(clip.frame is not None for clip in scene.clips):
@@ -320,11 +326,17 @@ def frame_between(
     return rotate(frame, fraction * rotation_vector(frame, other))
 
 
+def has_free_ends(scene: Scene) -> bool:
+    """Whether nothing is at either end, so that clips, obstacles or fields hold the rod."""
+    return isinstance(scene.start, Free) and isinstance(scene.end, Free)
+
+
 def held_position(scene: Scene) -> Float[Array, "3"]:
-    """The position of the start where it is held, else of the end."""
-    held = scene.start if isinstance(scene.start, Held) else scene.end
-    assert isinstance(held, Held), "a scene holds at least one position"
-    return held.position
+    """The position of the start where it is held, else of the end, else of the first clip, else the origin."""
+    for held in (scene.start, scene.end, *scene.clips):
+        if isinstance(held, Held | Clip):
+            return held.position
+    return jnp.zeros(3, scene.rod.length.dtype)
 
 
 def scene_axes(scene: Scene) -> Float[Array, "3 3"]:
@@ -472,7 +484,7 @@ def has_contacts(scene: Scene) -> bool:
 
 def has_friction(scene: Scene) -> bool:
     """Whether an obstacle has friction, so that an equilibrium depends on how the rod came there."""
-    return any(obstacle.friction is not None for obstacle in scene.obstacles)
+    return any(friction_coefficient(obstacle) is not None for obstacle in scene.obstacles)
 
 
 def _follows(end: Support) -> bool:

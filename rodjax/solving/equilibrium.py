@@ -40,6 +40,7 @@ from rodjax.model.scene import (
     Scene,
     dead_end_moment,
     has_contacts,
+    has_free_ends,
     has_friction,
     has_node_positions,
     has_potential,
@@ -357,6 +358,13 @@ def _pressures(scene: Scene, options: Options, state: SolverState | None = None)
     return jnp.full(shape, jnp.nan, scene.rod.length.dtype)
 
 
+def _lying(scene: Scene, units: Units, nodes: Float[Array, "n+1 3"], friction: Friction | None) -> Friction | None:
+    """That of a rod which nothing else holds: it lies where its guess is."""
+    if scene.clips or not has_free_ends(scene):
+        return friction
+    return _friction(scene, units.origin[None] + units.length * nodes)
+
+
 def _from_rest(scene: Scene, options: Options) -> Friction | None:
     nodes = jnp.zeros((options.segments + 1, 3), scene.rod.length.dtype)
     friction = _friction(scene, nodes)
@@ -620,6 +628,7 @@ def _unsettled_state(
         return state, FirstTwist(no_twist)
     if isinstance(guess, Guess):
         shape = kind.through(guess.nodes(scaled, units, pieces))
+        friction = _lying(scene, units, shape.nodes, friction)
         twist = FirstTwist(guess.total_twist)
         arclengths = sliding_arclengths(scaled)
         state = SolverState(shape, no_force, units, arclengths, before=before, pressures=pressures, friction=friction)
@@ -671,6 +680,7 @@ def _first_frames(given: Scene, guess: Guess | Equilibrium | None, options: Opti
         return state(shape), FirstTwist(rest_twist(scene))
     if isinstance(guess, Guess):
         shape = framed_through(scene, guess.nodes(scene, units, pieces), of_joints)
+        friction = _lying(given, units, shape.nodes, friction)
         return state(shape), FirstTwist(guess.total_twist)
     shape, first = guess.state.shape, last_twist(guess)
     if _sliding(guess.scene) == _sliding(scene):

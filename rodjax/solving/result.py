@@ -50,7 +50,16 @@ from rodjax.mechanics.passage import Before, Passage, Sampled, passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.obstacles import InUnits
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, has_contacts, has_node_positions, has_potential, nondimensional, slid, slides
+from rodjax.model.scene import (
+    Scene,
+    has_contacts,
+    has_free_ends,
+    has_node_positions,
+    has_potential,
+    nondimensional,
+    slid,
+    slides,
+)
 from rodjax.model.summaries import value_text
 from rodjax.model.supports import Held
 from rodjax.programs.compilation import compiled
@@ -265,6 +274,8 @@ class Equilibrium(eqx.Module):
             return jnp.zeros((*self.s.shape[:-1], 0, 3), self.s.dtype)
         if has_node_positions(self.scene):
             return _node_forces(self)[0]
+        if has_free_ends(self.scene):
+            return _clip_forces(self)
         seen = self.state.end_force * self.state.units.force[..., None, None]
         return jnp.swapaxes(seen[..., :-1] - seen[..., 1:], -1, -2)
 
@@ -524,6 +535,12 @@ def _deepest(equilibrium: Equilibrium) -> Float[Array, ""]:
     form, point = form_and_point(equilibrium)
     assert isinstance(form, NodalForm)
     return jnp.max(depths_of_elements(form, point))
+
+
+@over_leading_axes
+def _clip_forces(equilibrium: Equilibrium) -> Float[Array, "clips 3"]:
+    form, point = form_and_point(equilibrium)
+    return form.clip_forces(point).T * equilibrium.state.units.force
 
 
 @over_leading_axes

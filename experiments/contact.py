@@ -6,10 +6,13 @@ Prints how many converge, iterations, and which of the rest are too short for th
 of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
 scenes as the cables become heavier, beside paths. Of friction the pull of a taut
 cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a floor, and back, beside its
-closed form.
+closed form; of ropes over a cylinder, which nothing else holds, how many are found at rest.
 """
 
 import dataclasses
+import importlib
+import importlib.util
+import itertools
 import sys
 import time
 import warnings
@@ -151,6 +154,23 @@ def capstan(friction: float = 0.3, segments: int = 160, stiffness: float = 1e-6)
     )
 
 
+def hung_over(segments: tuple[int, ...] = (50, 80, 100, 120)) -> None:
+    """Ropes that friction alone holds over a cylinder: cosseratbench's capstan, where that is installed."""
+    if importlib.util.find_spec("cosseratbench") is None:
+        print("hung over a cylinder: skipped, cosseratbench is not installed")
+        return
+    capstan = importlib.import_module("cosseratbench.experiments.capstan").capstan
+    solver = importlib.import_module("rodjax.cosseratbench").RodjaxSolver()
+    for part in (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.02, 1.1):
+        cases = itertools.product(segments, (0.1, 0.3, 0.6))
+        found = [solver.equilibrium(capstan.build(part, friction), count) for count, friction in cases]
+        iterations = [int(result.iterations) for result in found if result.converged]
+        print(
+            f"hung over a cylinder, the longer side {part:g} of the longest that holds: {len(iterations)} of {len(found)} "
+            f"at rest{f', iterations median {np.median(iterations):g}, most {max(iterations)}' if iterations else ''}"
+        )
+
+
 def out_of_a_floor(segments: int = 64) -> None:
     """A heavy cable whose first shape lies in a floor, also a thin one."""
     for radius in (RADIUS, 3e-4):
@@ -229,6 +249,7 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore")
     capstan()
     capstan(friction=0.8)
+    hung_over()
     dragged()
     let_down()
     warm()

@@ -29,6 +29,7 @@ from rodjax.discretization.contact_gaps import (
     rough_obstacles,
     within_elements,
 )
+from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Linearization
 from rodjax.discretization.friction import tangential
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
@@ -48,7 +49,7 @@ from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
-from rodjax.model.scene import has_contacts
+from rodjax.model.scene import has_contacts, has_free_ends, has_friction
 from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
@@ -57,6 +58,8 @@ TOUCHES = 1e-2
 # tangent planes, and a node that slides on a surface leaves it by the square of its way: with contacts as stiff as
 # those of the model, the merit would refuse all but short steps.
 MERIT_COMPLIANCE = 1e-4
+# The longest way of a node in a step of a rod that friction alone holds [L].
+LONGEST_WAY = 0.02
 
 
 class NodalForm(PositionForm):
@@ -89,6 +92,13 @@ class NodalForm(PositionForm):
         pushes = (retracted.pressures[: len(gaps)] > 0) & ~self.is_held[None]
         positions = retracted.positions - jnp.einsum("kn,knc->nc", jnp.where(pushes, beyond, 0.0), there)
         return dataclasses.replace(retracted, positions=positions)
+
+    def longest_step(self, point: Any, others: NodalChange) -> Float[Array, ""] | None:
+        """Where friction alone holds the rod, its model may have it fly off: the part of a step that leaves it near."""
+        if not has_free_ends(self.scene) or self.scene.clips or not has_friction(self.scene):
+            return None
+        way = jnp.sqrt(jnp.max(jnp.sum(others.displacements**2, axis=1)))
+        return LONGEST_WAY / jnp.maximum(way, LONGEST_WAY)
 
     def accepted(self, point: Any, here: Linearization) -> Any:
         assert here.gaps is not None
@@ -133,7 +143,9 @@ class NodalForm(PositionForm):
         pressures: Float[Array, "k n+1"] | None,
         friction: Friction | None,
     ) -> Any:
-        """NaN pressures, which are unknown, follow from the forces through the elements."""
+        """NaN pressures, which are unknown, follow from the forces through the elements; of a rod with two free ends,
+        whose friction has no bound without them, they are at least those of its weight where it rests.
+        """
         nothing = jnp.zeros((pressure_rows(self.scene), len(nodes)), nodes.dtype)
         rough = rough_obstacles(self.scene)
         if rough and friction is None:
@@ -147,6 +159,10 @@ class NodalForm(PositionForm):
             return point
         gaps, normals = gaps_and_normals(self, nodal.positions)
         pushing = jnp.einsum("cn,knc->kn", self.applied(point), normals)
+        if has_free_ends(self.scene):
+            h = jnp.diff(self.field.s) / 2
+            resting = -jnp.einsum("c,knc->kn", total_force(self.scene), normals)
+            pushing = jnp.maximum(pushing, resting * (jnp.pad(h, (0, 1)) + jnp.pad(h, (1, 0)))[None])
         pushing = jnp.where((pushing > 0) & (gaps < TOUCHES * self.radius[None]), pushing, 0.0)
         pushing = jnp.concatenate([pushing, nothing[len(pushing) :]])
         known = nothing + jnp.nan if pressures is None else pressures

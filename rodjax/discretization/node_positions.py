@@ -10,6 +10,7 @@ along straight lines. `nodal.NodalForm` adds contacts.
 """
 
 import dataclasses
+import functools
 from abc import abstractmethod
 from typing import Any
 
@@ -207,7 +208,9 @@ class PositionForm(Form):
         if self._on_first_node is not None:
             without = potentials.of_pulls(jnp.zeros_like(tangents), tangents, axes)
             parts.append(without._replace(energy=self._energy_of_first(point, self._on_first_node)))
-        return NodeEnergy(*(sum(those[1:], those[0]) for those in zip(*parts, strict=True))) if parts else None
+        if not parts:
+            return None
+        return functools.reduce(lambda one, other: NodeEnergy(*map(jnp.add, one, other)), parts)
 
     def _energy_of_first(self, point: Any, force: Float[Array, "n+1 3"]) -> Float[Array, "n+1"]:
         return -jnp.sum(force * point.nodal.positions, axis=1)

@@ -555,8 +555,10 @@ def factor_chain(system: ChainSystem) -> ChainFactors:
     moved = [-free[:-1, None, None] * identity[None], free[1:, None, None] * identity[None]]
     moved_near, moved_far = moved if system.is_loose else moved[::-1]
     pulling, pushed = with_force(elements[:, gap, near]), with_force(moved_near)
-    pulls = with_force(elements[:, gap, gap]).at[-1 if system.is_loose else 0].set(-identity)
     places = jnp.where(system.held[:, None, None], identity[None], system.stiffness)
+    # In the unit of the node, as below, no larger than the rest of its pivot.
+    lacking = -identity / jnp.maximum(1.0, jnp.trace(places[-1]) / 3) if system.is_loose else -identity
+    pulls = with_force(elements[:, gap, gap]).at[-1 if system.is_loose else 0].set(lacking)
     blocks = _matrices(
         [turns, with_force(elements[:, near, gap]), turning],
         [pulling, pulls, pushed],

@@ -276,8 +276,12 @@ def sought(
         level = jnp.where(is_late & (hardest < MOST_COMPLIANT), MOST_COMPLIANT, jnp.where(is_same, harder, state.level))
         motion = jax.tree.map(lambda here, change: here + part * change, state.motion, change)
         kept, found = (state.motion, state.memory, state.trial, state.is_closed), (motion, memory, trial, is_closed)
+        motion, memory, trial, is_closed = jax.tree.map(lambda old, new: jnp.where(is_too_soft, old, new), kept, found)
         return Sought(
-            *jax.tree.map(lambda old, new: jnp.where(is_too_soft, old, new), kept, found),
+            motion,
+            memory,
+            trial,
+            is_closed,
             jnp.where(is_too_soft, harder, level),
             is_minimum,
             ((is_same & (state.level <= hardest)) | ~is_minimum) & ~is_too_soft,

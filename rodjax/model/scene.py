@@ -44,7 +44,8 @@ class Scene(eqx.Module):
 
     - `rod`: `Rod`.
     - `start`, `end`: what holds s = 0 and s = L: `Clamp`, `Swivel`, `Pin` or `Free`; `Hinge`, `Slider` or `Spring`,
-        whose pose `rodjax.solve` finds; `Joint` in a scene of a `Harness`.
+        whose pose `rodjax.solve` finds; `Joint` in a scene of a `Harness`. Both may be `Free` where clips hold the
+        rod, or, of a solve with a guess, obstacles with friction or potentials do.
     - `gravity`: (3,) [m/s^2], or `None` for no weight.
     - `point_forces`: `PointForce`s along the rod.
     - `turns`: whole turns of the end frame beyond the total twist in (-pi, pi] of the initial shape; where that is an

@@ -88,7 +88,8 @@ class Free(Support):
 
     `force`: (3,) [N]; `moment`: (3,) [N m]; an omitted one is zero and not computed. A dead moment has no potential in
     three dimensions: its virtual work enters the equilibrium, but no work of it the `energy` of a result. `follower`:
-    both are given along the material frame (d1, d2, t) of the end instead, and turn with it: no potential either.
+    both are given along the material frame (d1, d2, t) of the end instead, and turn with it: no potential either. A
+    rod may be free at both ends where a `Clip`, an obstacle with friction or a `Potential` holds it.
     """
 
     force: Float[Array, "3"] | None

@@ -31,7 +31,8 @@ class Guess(eqx.Module):
     """An initial shape; it need not match the supports, the length or the mesh.
 
     Beside obstacles it tells on which side the rod passes them. Without clips it is led out of obstacles first, and
-    between two supports drawn in where it is longer than the rod.
+    between two supports drawn in where it is longer than the rod. A rod with two free ends and no clip, which friction
+    may hold, lies where its guess is: from there it slips.
 
     `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
     frames allow on this shape, the solution has the one nearest to this.

@@ -103,7 +103,8 @@ def solve(
 
     Friction of obstacles has a memory (`rodjax.solve_path`): where the guess is an `Equilibrium`, the solve is one step
     from there, and slips are counted from its nodes, in global axes, on another mesh from the same places of the rod.
-    Else it is from rest, as if all obstacles were without friction. `stable` and `index` speak of motions with the
+    Else it is from rest, as if all obstacles were without friction; but a rod with two free ends and no clip lies where
+    its guess is, and slips from there. `stable` and `index` speak of motions with the
     pressures that bound friction held.
 
     Where the solve does not converge the result says so, and outside `jit` a `NotConvergedWarning` gives the reason.

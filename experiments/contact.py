@@ -166,8 +166,8 @@ def hung_over(segments: tuple[int, ...] = (50, 80, 100, 120)) -> None:
         found = [solver.equilibrium(capstan.build(part, friction), count) for count, friction in cases]
         iterations = [int(result.iterations) for result in found if result.converged]
         print(
-            f"hung over a cylinder, the longer side {part:g} of the longest that holds: {len(iterations)} of {len(found)} "
-            f"at rest{f', iterations median {np.median(iterations):g}, most {max(iterations)}' if iterations else ''}"
+            f"hung over a cylinder, {part:g} of the longest side that holds: {len(iterations)} of {len(found)} at rest"
+            f"{f', iterations median {np.median(iterations):g}, most {max(iterations)}' if iterations else ''}"
         )
 
 

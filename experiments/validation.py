@@ -691,10 +691,11 @@ solvers, by its own runner, meshes and metrics; rodjax takes part by `rodjax.cos
   goes there. It meets the reference where the upper rope is let down with `find="equilibrium"`. Solvers in time stay at
   the reference if they keep the symmetry to the last bit (PyElastica with 51 elements), else they slide (with 50
   elements 6 mm in 8 s). The kink at the contact is resolved by a node there (50 elements), not within an element (51).
-- *Capstan*: friction alone holds a rope over a cylinder, its longer side a part of the longest that holds (capstan equation
-  with the rope's weight); `slide` [m] is by how far its light end rises. Those that hold stay where they are given, but for
-  what bending and contact change of the given shape. Beyond the longest there is no equilibrium, and rodjax finds none;
-  at 0.95 of it, where nearly all of the rope slips, it does with coefficients of 0.1 and 0.6, and not with 0.3.
+- *Capstan*: friction alone holds a rope over a cylinder, its longer side a part of the longest that holds (capstan
+  equation with the rope's weight); `slide` [m] is by how far its light end rises. Those that hold stay where they are
+  given, but for what bending and contact change of the given shape. Beyond the longest there is no equilibrium, and
+  rodjax finds none; at 0.95 of it, where nearly all of the rope slips, it does with coefficients of 0.1 and 0.6, and
+  not with 0.3.
 - *Twist*: the experiment measures, by how fast six rods buckle in time, the twist at which the straight rod becomes
   unstable: here `rodjax.critical_point` finds it, for the same reference (Greenhill's problem under tension). What is
   left of the difference is the extension, which the reference lacks.

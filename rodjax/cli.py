@@ -32,6 +32,7 @@ from rodjax.io.harness_file import HarnessFile, is_harness_file, read_harness_fi
 from rodjax.io.scene_file import SceneFile, SceneFileError, read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
+from rodjax.model.scene import Scene, has_no_place
 from rodjax.notes import note, told
 from rodjax.programs import kept
 from rodjax.programs.tasks import TaskError
@@ -279,6 +280,7 @@ def _solve(arguments: argparse.Namespace) -> int:
     if is_harness_file(arguments.scene):
         return _solve_harness(arguments)
     file = read_scene_file(arguments.scene)
+    _check_places(arguments.scene, file.scenes)
     with warnings.catch_warnings(record=True) as caught:
         # Said below, in the command's own way.
         warnings.simplefilter("ignore", NotConvergedWarning)
@@ -308,12 +310,21 @@ def _solve(arguments: argparse.Namespace) -> int:
     return 3
 
 
+def _check_places(path: Path, scenes: Sequence[Scene]) -> None:
+    if any(map(has_no_place, scenes)):
+        raise CommandError(
+            f"{path}: no end and no clip is held, and a file has no guess that would tell where the rod lies; "
+            "rodjax.solve takes one"
+        )
+
+
 def _solve_harness(arguments: argparse.Namespace) -> int:
     if arguments.dxf:
         raise CommandError(
             f"--dxf is for one cable: {arguments.scene} has several; rodjax.write_dxf takes each of them"
         )
     file = read_harness_file(arguments.scene)
+    _check_places(arguments.scene, file.harness.scenes)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", NotConvergedWarning)
         warnings.simplefilter("ignore", MeshWarning)

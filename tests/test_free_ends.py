@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
+import rodjax.cli
 from rodjax import Clamp, Clip, Free, Guess, Rod, Scene
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -117,11 +118,15 @@ def test_friction_holds_a_rod_that_lies_on_a_floor():
         assert not rj.solve(lying(1.05 * bound), segments=64, guess=LINE).converged
 
 
-def test_what_holds_nothing_is_refused():
+def test_what_holds_nothing_is_refused(tmp_path, capsys):
     with pytest.raises(ValueError, match="hold the rod by a Clip, by obstacles with friction or by a potential"):
         lying(0.0, friction=0)
     with pytest.raises(ValueError, match="guess must be given where no end or clip is held"):
         rj.solve(lying(0.0), segments=8)
+    rj.write_scene(lying(0.0), tmp_path / "lying.toml")
+    assert rodjax.cli.main(["solve", str(tmp_path / "lying.toml")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no end and no clip is held, and a file has no guess" in line
 
 
 @pytest.mark.slow

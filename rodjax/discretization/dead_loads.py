@@ -59,7 +59,7 @@ def total_force(scene: Scene) -> Float[Array, "3"]:
 
 
 def counted_from(
-    scene: Scene, clip_nodes: Int[Array, "clips"] | None, before: Float[Array, "... n"], total: Any = 1.0
+    scene: Scene, clip_nodes: Int[Array, "clips"] | None, before: Float[Array, "... n"], total: Any
 ) -> Float[Array, "... n"]:
     """What of a load counts in the force through each cell, by what lies `before` it and by the `total`: what is
     beyond. Where the start is free that less all of it; where both ends are, so in the first span alone. The rest of

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.model.loads import DistributedForce
-from rodjax.model.scene import Scene, dead_forces, has_free_ends, scene_axes
+from rodjax.model.scene import Scene, dead_forces, has_no_place, scene_axes
 from rodjax.model.supports import Directed, Free, Held, Pin, Support, Swivel
 
 
@@ -22,7 +22,7 @@ def first_shape(scene: Scene, segments: int) -> Float[Array, "n+1 3"]:
     start, end = scene.start, scene.end
     if scene.clips:
         return _through_clips(scene, u)
-    if has_free_ends(scene):
+    if has_no_place(scene):
         raise ValueError("guess must be given where no end or clip is held, as nothing else tells where the rod lies")
     if not isinstance(start, Held):
         assert isinstance(end, Held), "a scene holds at least one position"

@@ -49,7 +49,7 @@ from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.linalg.unilateral import Unilateral, minimized
-from rodjax.model.scene import has_contacts, has_free_ends, has_friction
+from rodjax.model.scene import has_contacts, has_free_ends, has_friction, has_no_place
 from rodjax.programs.parts import traced_once
 
 # A start touches where its gap is below this part of the radius, as nodes do beside a middle of a coarser mesh.
@@ -95,7 +95,7 @@ class NodalForm(PositionForm):
 
     def longest_step(self, point: Any, others: NodalChange) -> Float[Array, ""] | None:
         """Where friction alone holds the rod, its model may have it fly off: the part of a step that leaves it near."""
-        if not has_free_ends(self.scene) or self.scene.clips or not has_friction(self.scene):
+        if not has_no_place(self.scene) or not has_friction(self.scene):
             return None
         way = jnp.sqrt(jnp.max(jnp.sum(others.displacements**2, axis=1)))
         return LONGEST_WAY / jnp.maximum(way, LONGEST_WAY)

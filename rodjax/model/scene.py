@@ -332,6 +332,11 @@ def has_free_ends(scene: Scene) -> bool:
     return isinstance(scene.start, Free) and isinstance(scene.end, Free)
 
 
+def has_no_place(scene: Scene) -> bool:
+    """Whether no end and no clip tells where the rod lies, so that a solve needs a guess."""
+    return has_free_ends(scene) and not scene.clips
+
+
 def held_position(scene: Scene) -> Float[Array, "3"]:
     """The position of the start where it is held, else of the end, else of the first clip, else the origin."""
     for held in (scene.start, scene.end, *scene.clips):

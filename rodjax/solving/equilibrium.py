@@ -40,8 +40,8 @@ from rodjax.model.scene import (
     Scene,
     dead_end_moment,
     has_contacts,
-    has_free_ends,
     has_friction,
+    has_no_place,
     has_node_positions,
     has_potential,
     needs_frames,
@@ -360,7 +360,7 @@ def _pressures(scene: Scene, options: Options, state: SolverState | None = None)
 
 def _lying(scene: Scene, units: Units, nodes: Float[Array, "n+1 3"], friction: Friction | None) -> Friction | None:
     """That of a rod which nothing else holds: it lies where its guess is."""
-    if scene.clips or not has_free_ends(scene):
+    if not has_no_place(scene):
         return friction
     return _friction(scene, units.origin[None] + units.length * nodes)
 

@@ -13,7 +13,7 @@ from rodjax.discretization.first_shape import first_shape, hanging_arc
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.interpolation import resampled
 from rodjax.mechanics.taut import drawn_in, led_out
-from rodjax.model.scene import Scene, has_free_ends, nondimensional, scene_axes
+from rodjax.model.scene import Scene, has_no_place, nondimensional, scene_axes
 from rodjax.model.supports import Directed, Held
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.programs.compilation import compiled
@@ -66,7 +66,7 @@ def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -
     nodes = resampled(points, segments)
     start, end, radius = scene.start, scene.end, scene.rod.radius
     has_mesh = any(map(_is_mesh, jax.tree.leaves(scene.obstacles, is_leaf=_is_mesh)))
-    if not scene.obstacles or has_mesh or scene.clips or has_free_ends(scene):
+    if not scene.obstacles or has_mesh or scene.clips or has_no_place(scene):
         return nodes
     assert radius is not None, "a rod beside obstacles has a radius"
     thickest, length = jnp.max(getattr(radius, "values", radius)), scene.rod.length
@@ -90,7 +90,7 @@ def other_guess(scene: Scene, *, planar: bool) -> Guess | None:
     free end that began in its shape at rest, straight. `None` with clips, and where there is no other.
     """
     has_free_end = not (isinstance(scene.start, Held) and isinstance(scene.end, Held))
-    if scene.clips or has_free_ends(scene) or (scene.rod.rest_shape is None if has_free_end else planar):
+    if scene.clips or has_no_place(scene) or (scene.rod.rest_shape is None if has_free_end else planar):
         return None
     return Guess(_other_points(scene))
 

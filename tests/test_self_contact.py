@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 import rodjax
-from rodjax.discretization import self_contact
-from rodjax.discretization.self_contact import Curve
+from rodjax.discretization import nearest_places, self_contact
+from rodjax.discretization.curve_distance import Curve
 from rodjax.solving.harness import solve_harness
 
 LENGTH, RADIUS = 1.0, 0.02
@@ -38,7 +38,7 @@ def test_first_and_second_derivatives_of_gaps_are_those_of_jax():
     """That the places move along the rod as the nodes do is part of the second ones."""
     elements = 12
     curve, axes = coil(elements)
-    found = self_contact.nearest(curve)
+    found = nearest_places.nearest(curve)
     rng = np.random.default_rng(1)
     pressures = jnp.asarray(np.where(found.exists, rng.uniform(0.5, 2.0, elements), 0.0))
     unit = jnp.asarray(0.3)

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rodjax.discretization.curve_distance import Curve, with_wells
 from rodjax.discretization.inner_contacts import PARTING, SAG, SAME_CURVATURE, THINNER, Elements, Places
+from rodjax.discretization.nearest_places import wide_cells
 from rodjax.discretization.node_positions import PositionForm
-from rodjax.discretization.self_contact import Curve, wide_cells, with_wells
 from rodjax.geometry.vectors import root
 from rodjax.model.obstacles import Obstacle, friction_coefficient
 from rodjax.model.scene import Scene, slides

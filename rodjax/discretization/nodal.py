@@ -32,6 +32,7 @@ from rodjax.discretization.contact_gaps import (
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Linearization
 from rodjax.discretization.friction import tangential
+from rodjax.discretization.nearest_places import comes_through, wide_cells
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.node_contacts import (
     GAP_WEIGHT,
@@ -44,7 +45,7 @@ from rodjax.discretization.node_contacts import (
 from rodjax.discretization.node_friction import travelled, with_friction
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.potentials import OnElements
-from rodjax.discretization.self_contact import comes_through, exerted, wide_cells
+from rodjax.discretization.self_contact import exerted
 from rodjax.discretization.step_passage import stays_outside
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem

@@ -11,23 +11,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.self_contact import (
-    NOTHING_BEYOND,
-    Curve,
-    Nearest,
-    gap_vectors,
-    growth,
-    moving_gaps,
-    nearest,
-    on_elements,
-    with_wells,
-)
+from rodjax.discretization.curve_distance import Curve, with_wells
+from rodjax.discretization.nearest_places import Nearest, growth, nearest
+from rodjax.discretization.self_contact import NOTHING_BEYOND, gap_vectors, moving_gaps, on_elements
 
-# As `self_contact.NARROW`: of rods that cross, four times that times the radius by the length of an element is the
+# As `curve_distance.NARROW`: of rods that cross, four times that times the radius by the length of an element is the
 # force along them by that of the contact, at most.
 NARROW_OF_PAIRS = 3e-6
-# As `self_contact.GROWS`, of all contacts. A wide well lets rods lie deeper beside its place by this times an eighth of
-# the squared length of an element by the radius [radii], at most.
+# As `nearest_places.GROWS`, of all contacts. A wide well lets rods lie deeper beside its place by this times an eighth
+# of the squared length of an element by the radius [radii], at most.
 GROWS_OF_PAIRS = 0.01
 # Of the elements of a rod, those nearest to another one may touch it: at most so many.
 MOST_OF_PAIR = 32

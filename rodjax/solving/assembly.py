@@ -25,12 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.discretization.curve_distance import Curve
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import NEUTRAL, Form, Linearization
 from rodjax.discretization.joints import generic_field
+from rodjax.discretization.nearest_places import GROWS
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.rod_pairs import GROWS_OF_PAIRS
-from rodjax.discretization.self_contact import GROWS, Curve
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding import SETTLED, SlidingForm
 from rodjax.discretization.sliding_point import SlidingLinearization

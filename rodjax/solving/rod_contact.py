@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from rodjax.discretization.contact_gaps import curve
+from rodjax.discretization.curve_distance import Curve
+from rodjax.discretization.nearest_places import Nearest, comes_through
 from rodjax.discretization.nodal import MERIT_COMPLIANCE, NodalForm
 from rodjax.discretization.node_contacts import GAP_WEIGHT, LEAST_RELAXED, LIES_ON
 from rodjax.discretization.rod_pairs import (
@@ -28,7 +30,6 @@ from rodjax.discretization.rod_pairs import (
     pair_contacts,
     with_pair_wells,
 )
-from rodjax.discretization.self_contact import Curve, Nearest, comes_through
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.far_rows import SIGNS
 from rodjax.model.loads import ContactLoads

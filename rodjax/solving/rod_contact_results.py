@@ -13,17 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.discretization.curve_distance import Curve, direction, seen_distance, side_at, with_wells
+from rodjax.discretization.nearest_places import Nearest
 from rodjax.discretization.rod_pairs import NARROW_OF_PAIRS, found_between, joined, with_pair_wells
-from rodjax.discretization.self_contact import (
-    Curve,
-    Nearest,
-    direction,
-    exerted_at,
-    moving_gaps,
-    seen_distance,
-    side_at,
-    with_wells,
-)
+from rodjax.discretization.self_contact import exerted_at, moving_gaps
 from rodjax.model.along import value_at
 from rodjax.model.harness import Harness
 from rodjax.model.loads import ContactLoads

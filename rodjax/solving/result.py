@@ -37,12 +37,12 @@ from rodjax.discretization.framed_results import strains_beside_nodes
 from rodjax.discretization.hermite import Curve, QuadraticRotationElements
 from rodjax.discretization.mixed import MixedForm
 from rodjax.discretization.motion import neutral_axis
+from rodjax.discretization.moving_mesh import NEARLY_OUT
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import Friction, Nodal
 from rodjax.discretization.node_contacts import SLIPS, STICKS, exerted_by_itself, exerted_by_obstacles, shares
 from rodjax.discretization.potentials import at_both
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.sliding import NEARLY_OUT
 from rodjax.geometry.interpolation import cubic
 from rodjax.geometry.vectors import dot, root
 from rodjax.linalg.saddle_point import factor

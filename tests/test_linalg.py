@@ -11,8 +11,10 @@ from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.linalg.bordered import BorderedFactors, Vectors
-from rodjax.linalg.chain import ChainFactors, ChainSystem, ContactRows, InnerRows, LoadRows
+from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.chain_border import Border
+from rodjax.linalg.chain_factors import ChainFactors
+from rodjax.linalg.chain_rows import ContactRows, InnerRows, LoadRows
 from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count

@@ -28,7 +28,8 @@ from rodjax.discretization.tangent_field import TangentField
 from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import product, short_sum
-from rodjax.linalg.chain import ChainSystem, LoadRows
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_rows import LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene, has_free_ends, with_pins
 from rodjax.model.supports import Free, Held

@@ -32,7 +32,8 @@ from rodjax.discretization.node_friction import friction_at, friction_bounds, sl
 from rodjax.discretization.node_positions import PositionForm
 from rodjax.discretization.potentials import OnElements, PointForces, at_both
 from rodjax.discretization.self_contact import Exerted, SelfContacts, exerted, on_elements, self_contacts
-from rodjax.linalg.chain import ChainSystem, ContactRows, InnerRows
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_rows import ContactRows, InnerRows
 from rodjax.linalg.unilateral import Unilateral
 from rodjax.programs.parts import traced_once
 

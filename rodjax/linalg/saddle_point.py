@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.blocks import inverse_of_blocks, product, short_sum, transpose_product
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
-from rodjax.linalg.chain import ChainFactors, ChainSystem, factor_chain
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_factors import ChainFactors, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.programs.parts import traced_once
 

@@ -27,7 +27,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.chain import ChainSystem, ContactRows, factor_chain
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_factors import factor_chain
+from rodjax.linalg.chain_rows import ContactRows
 
 # The most factorisations; those before softer contacts are tried, of MOST_COMPLIANT [L^3/EI] and then harder by
 # HARDENING at a time; with each compliance the first so many are followed by whole steps; steps of each line search.

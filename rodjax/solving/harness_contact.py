@@ -30,7 +30,8 @@ from rodjax.discretization.nodal import NodalForm, first_closed, held_back
 from rodjax.discretization.node_contacts import contact_model
 from rodjax.discretization.sliding import SlidingForm, at_its_arclengths
 from rodjax.discretization.sliding_point import SlidingLinearization
-from rodjax.linalg.chain import ChainSystem, factor_chain
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_factors import factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, with_slips, work
 from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns

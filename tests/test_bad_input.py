@@ -1342,7 +1342,7 @@ def test_a_full_disk_leaves_the_old_picture(world, monkeypatch):
 PRINT_IN_VAIN = """
 import sys
 import rodjax.cli
-rodjax.cli._solve = lambda arguments: print("result") or 0
+rodjax.cli.run_solve = lambda arguments: print("result") or 0
 sys.exit(rodjax.cli.main(["solve", "scene.toml"]))
 """
 

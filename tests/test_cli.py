@@ -130,7 +130,7 @@ def test_an_output_that_cannot_be_written_exits_with_2(tmp_path, capsys, monkeyp
     def full_disk(equilibrium, path):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("rodjax.cli.save", full_disk)
+    monkeypatch.setattr("rodjax.commands.solve.save", full_disk)
     assert main(["solve", HANGING, "-o", str(tmp_path / "a.vtkhdf")]) == 2
     err = capsys.readouterr().err
     assert err.startswith("rodjax: No space left on device")

@@ -29,6 +29,7 @@ ORDER = (
     ("window",),
     ("cluster", "demo", "warm"),
     ("rodjax",),
+    ("commands",),
     ("cli", "cosseratbench"),
     ("__main__",),
 )

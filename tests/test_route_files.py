@@ -370,12 +370,12 @@ def test_a_report_of_a_route_knows_what_was_asked(found, files):
 
 def test_a_route_that_is_not_found_exits_with_3(found, files, capsys, monkeypatch):
     """With --view it is shown all the same."""
-    monkeypatch.setattr("rodjax.cli.find_spec", lambda name: None)
+    monkeypatch.setattr("rodjax.commands.route.find_spec", lambda name: None)
     assert main(["route", "brake_line.toml", "--view"]) == 2
     assert "--view needs viser, got none: pip install 'rodjax[view]'" in capsys.readouterr().err
     assert not found  # nothing was sought
     shown = []
-    monkeypatch.setattr("rodjax.cli.find_spec", lambda name: name)
+    monkeypatch.setattr("rodjax.commands.route.find_spec", lambda name: name)
     monkeypatch.setattr("rodjax.window.opening.session_of", lambda route, segments: route)
     monkeypatch.setattr("rodjax.window.opening.show", lambda *args, **options: shown.append((args, options)))
     found["feasible"] = False

@@ -13,7 +13,7 @@ from rodjax.discretization.contact_gaps import gaps_and_normals, within_elements
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.linalg.chain import ChainSystem
-from rodjax.solving.assembly import RodStep
+from rodjax.solving.assembly_step import RodStep
 from rodjax.solving.coupling import RodInBodies, linearized_with_ends
 from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of, sliding_search
 

@@ -8,7 +8,7 @@ import pytest
 
 import rodjax
 from rodjax import Clamp, Free, Harness, Joint, Newton, Plane, Potential, Rod, Scene
-from rodjax.solving import assembly
+from rodjax.solving import assembly_step
 
 GRAVITY = (0.0, 0.0, -9.81)
 ALONG = rodjax.frame((1, 0, 0))
@@ -184,7 +184,7 @@ def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
     """Of rods with positions of nodes, whose ends move with a body, under the new forces of the step. A slope that is
     another one is no number here, with which no step is taken.
     """
-    known = assembly._slopes
+    known = assembly_step._slopes
 
     def checked(whole, all_here, steps, gradient):
         def energy(part):
@@ -201,7 +201,7 @@ def test_the_slope_of_a_step_is_the_rate_of_the_energy(monkeypatch):
         is_same = jnp.abs(slope - expected) <= 1e-9 * jnp.abs(expected) + 2e-11
         return jnp.where(is_same, slope, jnp.nan), rate
 
-    monkeypatch.setattr(assembly, "_slopes", checked)
+    monkeypatch.setattr(assembly_step, "_slopes", checked)
     result = rodjax.solve(cut(plain, obstacles=[FLOOR]), segments=5, solver=TIGHT)
     assert result.converged
     assert result.iterations > 3

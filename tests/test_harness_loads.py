@@ -24,7 +24,7 @@ from rodjax import (
     PointForce,
     Scene,
 )
-from rodjax.solving.assembly import MOST_UNJUDGED
+from rodjax.solving.assembly_newton import MOST_UNJUDGED
 
 TIGHT = Newton(tolerance=1e-11)
 # Of the bent rod of 1 m: EI/L and EI/L^2 are 0.05.

@@ -1,7 +1,7 @@
 """The linearised equations of all rods and bodies of a harness as one system: its factors, metric and motions.
 
 The system of each rod between clamps is factorised by itself, and what is left for the motions of the bodies is small
-and dense, as in `rodjax.solving.assembly`. In the metric the squares of the turns of all rods count by the parts of
+and dense, as in `rodjax.solving.condensation`. In the metric the squares of the turns of all rods count by the parts of
 their lengths in that of all, with the ends that turn with bodies.
 """
 
@@ -20,7 +20,8 @@ from rodjax.discretization.motion import Metric, Motion
 from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.model.supports import Clamp
-from rodjax.solving.assembly import LEAST_STIFFNESS, Assembly, Rods
+from rodjax.solving.assembly import Assembly, Rods
+from rodjax.solving.condensation import LEAST_STIFFNESS
 from rodjax.solving.coupling import ENDS, Coupling, RodInBodies, coupling, held
 
 

@@ -29,7 +29,8 @@ from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, has_contacts, has_friction, nondimensional, slid, slides, under_contact
 from rodjax.model.supports import Clamp, Joint
 from rodjax.programs.compilation import compiled
-from rodjax.solving.assembly import Assembly, Poses, Rods, State, find_assembly
+from rodjax.solving.assembly import Assembly, Poses, Rods, State
+from rodjax.solving.assembly_newton import find_assembly
 from rodjax.solving.equilibrium import (
     DEFAULT_RTOL,
     MOST_MESHES,

@@ -25,8 +25,9 @@ from rodjax.linalg.saddle_point import factor
 from rodjax.linalg.small_matrices import solved_where_regular
 from rodjax.solving.assembly import Assembly, State
 from rodjax.solving.assembly_balance import Balance, Here, changed_in_contact
+from rodjax.solving.contact_elimination import RodsInContact, moved_by
 from rodjax.solving.coupling import Coupling, free_points, solved_with_columns
-from rodjax.solving.harness_contact import ContactModel, ContactStep, RodsInContact, contact_step, moved_by
+from rodjax.solving.harness_contact import ContactModel, ContactStep, contact_step
 from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, MAX_PUSHES, NEAR, PUSH, SHIFT_GROWTH, Find
 from rodjax.solving.rod_contact import Columns, Contacts, between, columns_of, in_contact
 

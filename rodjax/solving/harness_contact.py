@@ -1,10 +1,9 @@
 """Which contacts of a harness are closed: the minimum of the model of a step, of all its rods and bodies together.
 
 As `linalg.unilateral` has it: a solution is one factorisation of each rod with the contacts closed that are so at the
-last iterate, eliminated to the motions of the bodies. Contacts of a rod know of its nodes and of the motions of its two
-ends; contacts of a body, where a rod ends in it, of these motions alone. Where the stiffness of the bodies is negative
-along a motion, it is reversed for the rest of the search, and a rod without a minimum becomes stiffer, so that the
-model only gains stiffness while its minimum is sought.
+last iterate, eliminated to the motions of the bodies. Where the stiffness of the bodies is negative along a motion, it
+is reversed for the rest of the search, and a rod without a minimum becomes stiffer, so that the model only gains
+stiffness while its minimum is sought.
 
 Arclengths at which rods slide through clips are sought as motions of the bodies are, with columns and rows of their own
 for each rod.
@@ -22,215 +21,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.form import Linearization
-from rodjax.discretization.nodal import NodalForm, first_closed, held_back
-from rodjax.discretization.node_contacts import contact_model
-from rodjax.discretization.sliding import SlidingForm, at_its_arclengths
-from rodjax.discretization.sliding_point import SlidingLinearization
-from rodjax.linalg.chain import ChainSystem
-from rodjax.linalg.chain_factors import factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
-from rodjax.linalg.unilateral import Unilateral, closed_softly, sought, with_pressures, with_slips, work
-from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns
+from rodjax.linalg.unilateral import Unilateral, sought
+from rodjax.solving.contact_elimination import Eliminated, RodsInContact, along_rod, eliminated
 from rodjax.solving.newton import MAX_FACTORS, SHIFT_GROWTH
-from rodjax.solving.rod_contact import Between, BetweenStep, Columns
-
-
-class RodsInContact(eqx.Module):
-    """Rods of one structure beside obstacles, stacked along a first axis of every array.
-
-    `contacts`: at nodes and within elements; `f`, `c`: right sides without them; `at_ends`: contacts of the bodies in
-    which the rods end; `first`: the derivative of L by the motions of the ends and arclengths of sliding clips, which
-    move a rod, without contacts; `by_q`: how these follow from the unknowns of all; `shares`: the unit of energy of
-    each rod, in that of the bodies; `columns`: of contacts with other rods, `None` without such.
-    """
-
-    system: ChainSystem
-    coupling: Coupling
-    contacts: Unilateral
-    f: Float[Array, "k b m"]
-    c: Float[Array, "k j"]
-    at_ends: EndContacts
-    first: Float[Array, "k 12+a"]
-    by_q: Float[Array, "k 12+a q"]
-    shares: Float[Array, "k"]
-    columns: Columns | None = None
-
-    @staticmethod
-    def of(
-        forms: NodalForm | SlidingForm,
-        points: Any,
-        here: Linearization,
-        coupling: Coupling,
-        at_ends: EndContacts,
-        pushes: Float[Array, "k b m"],
-        by_q: Float[Array, "k 12+a q"],
-        shares: Float[Array, "k"],
-    ) -> "RodsInContact":
-        def of_rod(form: Any, point: Any, here: Linearization, coupling: Coupling, at_ends: EndContacts, push: Array):
-            if isinstance(form, SlidingForm):
-                assert isinstance(here, SlidingLinearization)
-                coupling, here = sliding_along(here, coupling), here.at_arclengths
-            form, point = at_its_arclengths(form, point)
-            assert isinstance(form, NodalForm)
-            system, forces = here.system, point.nodal.contact_forces
-            assert isinstance(system, ChainSystem)
-            assert here.gaps is not None
-            moments, c = form.without_contacts(here, forces)
-            contacts = contact_model(form, point, here.gaps, here.reference_displacements)
-            system = first_closed(system, contacts)
-            first = coupling.first.at[:12].add(jnp.einsum("rni,rn->i", _of_gaps(system, coupling)[..., :12], forces))
-            first = first.at[:12].add(jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12))
-            return system, coupling, contacts, push + moments, c, first
-
-        system, coupling, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
-        return RodsInContact(system, coupling, contacts, f, c, at_ends, first, by_q, shares)
-
-    def touched(self, columns: Columns, pressures: Float[Array, "c"]) -> "RodsInContact":
-        """By other rods, whose pressures are among the loads so far."""
-        gaps = columns.gaps(len(pressures))
-        f, c, first = (
-            self.f - gaps.rotation @ pressures,
-            self.c - gaps.rows @ pressures,
-            self.first + gaps.ends @ pressures,
-        )
-        return dataclasses.replace(self, f=f, c=c, first=first, columns=columns)
-
-    @property
-    def size(self) -> int:
-        """How many contacts all rods have."""
-        return self.contacts.gaps.size + self.at_ends.gaps.size
-
-    @property
-    def contact_compliance(self) -> Float[Array, "size"]:
-        """Of all contacts, in a row."""
-        contact_compliance = self.system.contacts.contact_compliance
-        return self.row(*(jnp.broadcast_to(contact_compliance[:, None, None], x.shape) for x in self._shapes))
-
-    @property
-    def weights(self) -> Float[Array, "size"]:
-        return self.row(*(jnp.broadcast_to(self.shares[:, None, None], x.shape) for x in self._shapes))
-
-    @property
-    def _shapes(self) -> tuple[Array, Array]:
-        return self.contacts.gaps, self.at_ends.gaps
-
-    def row(self, of_rods: Array, at_ends: Array) -> Array:
-        return jnp.concatenate([of_rods.reshape(-1), at_ends.reshape(-1)])
-
-    def split(self, row: Array) -> tuple[Array, Array]:
-        of_rods, at_ends = self._shapes
-        return row[: of_rods.size].reshape(of_rods.shape), row[of_rods.size :].reshape(at_ends.shape)
-
-    def moved(self, q: Float[Array, "q"]) -> Float[Array, "k 12+a"]:
-        return self.by_q @ q
-
-    def opening(self, motion: tuple[Array, Array], q: Float[Array, "q"]) -> Float[Array, "size"]:
-        moved = self.moved(q)
-
-        def of_rod(system: ChainSystem, coupling: Coupling, x: Array, y: Array, q: Array) -> Array:
-            return system.contacts.rates(x, system.split(y)[2]) + _of_gaps(system, coupling) @ q
-
-        rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, moved)
-        return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, moved[:, :12].reshape(-1, 2, 6)))
-
-
-def moved_by(
-    groups: list[tuple[Int[Array, "k 2"], int]], motions: Float[Array, "6j q"]
-) -> list[Float[Array, "k 12+a q+s"]]:
-    """What moves the rods of each group, of which the bodies at the ends and the number of sliding clips are given, by
-    the unknowns of all: those of `motions` of the bodies, then the arclengths of the clips of rod after rod.
-    """
-    rows, bodies = motions.shape
-    motions = jnp.pad(motions, ((0, 6), (0, 0))).reshape(rows // 6 + 1, 6, bodies)
-    total = bodies + sum(len(body) * clips for body, clips in groups)
-    found, first = [], bodies
-    for body, clips in groups:
-        k = len(body)
-        by_q = jnp.zeros((k, 12 + clips, total), motions.dtype)
-        by_q = by_q.at[:, :12, :bodies].set(motions[body].reshape(k, 12, bodies))
-        rod, clip = np.indices((k, clips)).reshape(2, -1)
-        found.append(by_q.at[rod, 12 + clip, first + clips * rod + clip].set(1.0))
-        first += k * clips
-    return found
-
-
-class Eliminated(NamedTuple):
-    """Rods with some contacts closed, under a shift: whether they have a minimum, negative eigenvalues, solutions
-    without what moves them and by that, and what is left for it: stiffness, and forces. After the motions of the ends
-    stand the arclengths of sliding clips, then the unknowns of contacts with other rods.
-    """
-
-    is_minimum: Bool[Array, "k"]
-    negative: Int[Array, "k"]
-    motion: tuple[Array, Array]
-    by_motions: tuple[Array, Array]
-    stiffness: Float[Array, "k 12+a+z 12+a+z"]
-    force: Float[Array, "k 12+a+z"]
-
-
-def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12+a"]:
-    """None of a rod without obstacles."""
-    if coupling.of_gaps is not None:
-        return coupling.of_gaps
-    return jnp.zeros((*system.contacts.is_closed.shape, len(coupling.first)), coupling.first.dtype)
-
-
-def _eliminated(
-    rods: RodsInContact, is_closed: Array, trial: Array, contact_compliance: Array, shift: Float[Array, "k"]
-) -> Eliminated:
-    def of_rod(
-        rod: RodsInContact, is_closed: Array, closed_end: Array, trial: Array, contact_compliance: Array, shift: Array
-    ) -> Eliminated:
-        coupling, at_ends, m = rod.coupling, rod.at_ends, rod.f.shape[1]
-        system = closed_softly(rod.system, is_closed, contact_compliance)
-        f, c = with_pressures(system, rod.contacts, rod.f, rod.c)
-        system, c = with_slips(system, rod.contacts, c, trial)
-        factors = factor_chain(held_back(system, shift / m))
-        rates = jnp.where(is_closed[..., None], _of_gaps(system, coupling), 0.0)
-        size = len(system.compliance)
-        of_gradient, second = coupling.of_gradient, coupling.second
-        contacts = slice(size, size + is_closed.size)
-        moves = len(coupling.first)
-        of_constraints = coupling.of_constraints.at[contacts].add(-rates.reshape(-1, moves))
-        by_rotations, by_multipliers = coupling.by_rotations, coupling.by_multipliers
-        # What a clip applies along the rod knows of no contacts.
-        of_ends = rates[..., :12]
-        by_multipliers = by_multipliers.at[contacts, :12].add(-of_ends.reshape(-1, 12))
-        force = (-rod.first).at[:12].add(jnp.einsum("rni,rn->i", of_ends, rod.contacts.pressures))
-        slides = np.arange(12, moves)
-        second = second.at[slides, slides].add(shift)
-        if rod.columns is not None:
-            of_gradient = jnp.concatenate([of_gradient, rod.columns.rotation], axis=2)
-            of_constraints = jnp.concatenate([of_constraints, rod.columns.rows], axis=1)
-            by_rotations = jnp.concatenate([by_rotations, rod.columns.rotation], axis=2)
-            by_multipliers = jnp.concatenate([by_multipliers, rod.columns.rows], axis=1)
-            count = rod.columns.ends.shape[1]
-            force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
-            second = second.at[:12, moves:].set(rod.columns.ends).at[moves:, :12].set(rod.columns.ends.T)
-        (x, y), by_motions = solved_with_columns(factors.solve_softly, (f, c), (of_gradient, of_constraints))
-        stiffness = second - jnp.einsum("bmi,bmj->ij", by_rotations, by_motions[0])
-        stiffness -= by_multipliers.T @ by_motions[1]
-        force -= jnp.einsum("bmi,bm->i", by_rotations, x) + by_multipliers.T @ y
-        # Contacts of the bodies have no unknowns of the rod.
-        rates = jnp.where(closed_end[..., None], at_ends.rates, 0.0)
-        pressures = at_ends.pressures - at_ends.gaps / contact_compliance
-        stiff = jnp.einsum("oei,oej->eij", rates, rates) / contact_compliance
-        pushed = jnp.einsum("oei,oe->ei", rates, pressures)
-        stiffness = stiffness.at[:12, :12].add(jax.scipy.linalg.block_diag(*stiff))
-        force = force.at[:12].add(pushed.reshape(12))
-        return Eliminated(factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force)
-
-    closed_rods, closed_ends = rods.split(is_closed)
-    trials, _ = rods.split(trial)
-    of_rods, _ = rods.split(contact_compliance)
-    count = len(shift)
-    # Of a rod without obstacles there is none.
-    soft = of_rods[:, 0, 0] if of_rods.size else rods.system.contacts.contact_compliance
-    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, trials, jnp.broadcast_to(soft, (count,)), shift)
+from rodjax.solving.rod_contact import Between, BetweenStep
 
 
 class BodyContacts(eqx.Module):
@@ -355,15 +152,15 @@ class ContactModel(eqx.Module):
     ) -> tuple[Eliminated, Float[Array, "k"]]:
         """Stiffer until each rod by itself has a minimum; `at`: what contacts would exert at the last iterate."""
         if not self.may_reverse:
-            return _eliminated(rods, is_closed, at, contact_compliance, shift), shift
+            return eliminated(rods, is_closed, at, contact_compliance, shift), shift
 
         def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
             shift, tries, found = trial
             larger = jnp.maximum(SHIFT_GROWTH * shift, least)
             shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
-            return shift, tries + 1, _eliminated(rods, is_closed, at, contact_compliance, shift)
+            return shift, tries + 1, eliminated(rods, is_closed, at, contact_compliance, shift)
 
-        kinds = jax.eval_shape(_eliminated, rods, is_closed, at, contact_compliance, shift)
+        kinds = jax.eval_shape(eliminated, rods, is_closed, at, contact_compliance, shift)
         blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         shift, _, found = jax.lax.while_loop(
             lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
@@ -454,7 +251,7 @@ class ContactModel(eqx.Module):
 
         def of_all(shifts: tuple[Array, ...]) -> tuple[list[Eliminated], _Touching]:
             each = zip(groups, is_closed, trials, contact_compliance, shifts, strict=True)
-            found = [_eliminated(*given) for given in each]
+            found = [eliminated(*given) for given in each]
             return found, self._touching(found, *pairs)
 
         if not self.may_reverse:
@@ -521,7 +318,7 @@ class ContactModel(eqx.Module):
         slope = q @ stiffness @ dq - (self.force + memory.push) @ dq
         curvature = dq @ stiffness @ dq
         for rods, here, ahead, shift in zip(self.groups, of_rods, changes, memory.shifts, strict=True):
-            slopes, curvatures = jax.vmap(_along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
+            slopes, curvatures = jax.vmap(along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
             slope += jnp.sum(rods.shares * slopes)
             curvature += jnp.sum(rods.shares * curvatures)
         if self.between is not None:
@@ -543,35 +340,6 @@ class _Touching(NamedTuple):
     inverse: Float[Array, "z z"]
     by_bodies: Float[Array, "z q"]
     force: Float[Array, "z"]
-
-
-def _along_rod(
-    rod: RodsInContact, shift: Float[Array, ""], here: tuple[Array, Array, Array], ahead: tuple[Array, Array, Array]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    coupling = rod.coupling
-    system = rod.system.closed_where(jnp.zeros(rod.contacts.gaps.shape, bool))
-    system = held_back(system, shift / rod.f.shape[1])
-
-    def times(x: Array, y: Array, q: Array) -> tuple[Array, Array, Array]:
-        moments, rows = system.times(x, y)
-        by_bodies = (
-            coupling.second @ q + coupling.of_constraints.T @ y + jnp.einsum("bmi,bm->i", coupling.of_gradient, x)
-        )
-        by_bodies = by_bodies.at[12:].add(shift * q[12:])
-        return moments + coupling.of_gradient @ q, rows + coupling.of_constraints @ q, by_bodies
-
-    def works(motion: tuple[Array, Array, Array], by: tuple[Array, Array, Array]) -> Float[Array, ""]:
-        x, y, q = motion
-        moments, rows, by_bodies = by
-        return work(system, (x, y), (moments, rows)) + q @ by_bodies
-
-    x, y, q = ahead
-    by_ahead = times(*ahead)
-    _, _, u, _ = system.split(y)
-    _, _, of_nodes, _ = system.split(rod.c)
-    linear = jnp.sum(rod.f * x) + jnp.sum(of_nodes * u) - rod.first @ q
-    slope = (works(here, by_ahead) + works(ahead, times(*here))) / 2 - linear
-    return slope, works(ahead, by_ahead)
 
 
 class ContactStep(NamedTuple):

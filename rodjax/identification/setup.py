@@ -26,8 +26,8 @@ from rodjax.paths.path import stack_scenes
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import Discretization, checked_options, first_state
 from rodjax.solving.guess import Guess
-from rodjax.solving.harness import clamped_rods
 from rodjax.solving.harness_result import Solution, results_of
+from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
 from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
 from rodjax.solving.solve import solve

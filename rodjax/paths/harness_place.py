@@ -29,9 +29,9 @@ from rodjax.paths.place import Place, work
 from rodjax.paths.rod_place import MAX_ROTATION, SPRING, TOLERANCE, Direction, Regularized, regularized
 from rodjax.solving.assembly import Assembly, Poses, Rods
 from rodjax.solving.coupling import RodInBodies
-from rodjax.solving.harness import harness_equilibrium
 from rodjax.solving.harness_forces import ends_of
 from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_search import harness_equilibrium
 from rodjax.solving.newton import STAGNATION
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, form_and_point
 from rodjax.solving.status import Outcome

@@ -46,7 +46,8 @@ from rodjax.model.plane import plane
 from rodjax.model.scene import nondimensional
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.equilibrium import Options, first_state
-from rodjax.solving.result import Found, SolverState, build_result
+from rodjax.solving.result import build_result
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome
 
 LOOPS = 300

@@ -24,7 +24,7 @@ import rodjax
 from rodjax import Clamp, Equilibrium, Free, Pin, Rod, Scene, Status, Swivel
 from rodjax.discretization.form import NEUTRAL
 from rodjax.linalg.saddle_point import SaddlePointSystem
-from rodjax.solving.result import form_and_point, over_leading_axes
+from rodjax.solving.result_form import form_and_point, over_leading_axes
 
 KINDS: dict[str, Callable] = {
     "clamp": lambda position, frame: Clamp(position, frame),

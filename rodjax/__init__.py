@@ -26,20 +26,14 @@ from rodjax.model.triangle_mesh import Mesh
 from rodjax.programs.answers import numpy_first
 from rodjax.programs.compilation import enable_compilation_cache
 from rodjax.programs.kept import keep_programs
+from rodjax.solving.description import describe
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.line_search import LineSearch
 from rodjax.solving.newton import Newton
 from rodjax.solving.nonlinear_cg import NonlinearCG
-from rodjax.solving.result import (
-    Equilibrium,
-    MeshWarning,
-    NotConvergedWarning,
-    OverstretchedWarning,
-    PrecisionWarning,
-    describe,
-    pictures,
-)
+from rodjax.solving.result import Equilibrium, pictures
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning, PrecisionWarning
 from rodjax.solving.solve import solve
 from rodjax.solving.status import Status
 from rodjax.version import __version__ as __version__

@@ -14,7 +14,9 @@ from rodjax import problems
 from rodjax.io.files import save
 from rodjax.paths.path import solve_path
 from rodjax.plot import figure_of, plot_figure_1
-from rodjax.solving.result import Equilibrium, NotConvergedWarning, describe
+from rodjax.solving.description import describe
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_warnings import NotConvergedWarning
 
 REPORT_MILLISECONDS = 6.0  # a step, with 10 segments, on a 2.2 GHz AMD of 2008
 REPEATS = 9

@@ -14,7 +14,8 @@ from rodjax.notes import bar
 from rodjax.paths.path import solve_path
 from rodjax.problems import cable, figure_1, figure_1_start, hanging_cable
 from rodjax.programs.answers import numpy_first
-from rodjax.solving.result import Equilibrium, describe
+from rodjax.solving.description import describe
+from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
 
 # Of an experiment's or a route's file, tables that no scene has.

@@ -13,7 +13,7 @@ from scipy.optimize import brentq, fsolve, minimize_scalar
 import rodjax as rj
 from rodjax import BranchEnd, Clamp, Clip, Free, Pin, PointForce, Potential, Rod, Scene, frame, problems
 from rodjax.discretization.motion import Metric
-from rodjax.solving.result import free_form_and_point
+from rodjax.solving.result_form import free_form_and_point
 
 ORIGIN, X = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)
 # EA L^2/EI of 1e8 shifts loads of 10 EI/L^2 by 1e-7.

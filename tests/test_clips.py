@@ -11,7 +11,7 @@ import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame, problems, rotate
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.scene import between, nondimensional
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 from rodjax.solving.sliding import sliding_at
 
 # Thick rods bent within short spans: strains up to 0.2, on purpose.

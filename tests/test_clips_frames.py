@@ -427,7 +427,7 @@ def test_loads_without_a_potential_are_carried():
 
 def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
     """Of spans, and of elements under loads without a potential of every kind, at both ends too."""
-    from rodjax.solving.result import form_and_point
+    from rodjax.solving.result_form import form_and_point
 
     rod = Rod(1.0, (1.0, 1.5), 0.7, 1e4)
     loads = [

@@ -18,7 +18,7 @@ from rodjax.discretization.node_contacts import contacts_at
 from rodjax.model.supports import Support
 from rodjax.solving import equilibrium
 from rodjax.solving.equilibrium import checked_options
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
 DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)

@@ -16,7 +16,7 @@ from rodjax.discretization.potentials import PointForces
 from rodjax.geometry.rotations import columns
 from rodjax.paths.path import stack_scenes
 from rodjax.solving.refinement import SECTION_FACTOR
-from rodjax.solving.result import warn_if_coarse, warn_of_unknown_mesh
+from rodjax.solving.result_warnings import warn_if_coarse, warn_of_unknown_mesh
 
 # Rods as soft as EA L^2/EI = 1e3 in tight spans are strained by up to 0.4.
 pytestmark = pytest.mark.filterwarnings("ignore::rodjax.OverstretchedWarning")

@@ -49,7 +49,7 @@ from rodjax.discretization.hermite import Curve
 from rodjax.discretization.nodal_point import Friction
 from rodjax.io.files import FIELDS, FORMAT, KINDS, OLDEST_FORMAT, load, save
 from rodjax.mechanics.passage import Before
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 ORIGIN, FAR, GRAVITY = (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), (0.0, 0.3, -9.81)
 CLAMP = Clamp(ORIGIN, frame((1, 0, 0)))

@@ -12,7 +12,7 @@ from numpy_programs import by_numpy
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
 from rodjax.discretization.nodal_point import NodalChange
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 AXIS = jnp.array([1.0, 0.0, 0.0])
 CLIP = Clip(0.4, (0.3, 0.0, 0.0))

@@ -12,7 +12,7 @@ import rodjax as rj
 from rodjax import Clamp, Free, Pin, Rod, Scene, Swivel, frame
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.discretization.node_contacts import exerted_by_obstacles
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 EI, GJ, RADIUS = 0.01, 0.008, 0.005
 WEIGHT, MU = 1.0, 0.3  # N/m; with the length of 1 m N

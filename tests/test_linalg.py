@@ -19,7 +19,7 @@ from rodjax.linalg.far_rows import FarRows
 from rodjax.linalg.saddle_point import SaddlePointSystem, factor, factor_and_solve
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.linalg.substitution import substituted
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 
 def random_system(n: int, b: int, k: int, *, dominance: float = 8.0, seed: int = 0) -> SaddlePointSystem:

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import rodjax as rj
 from rodjax import Clamp, Free, Pin, Potential, Rod, Scene
 from rodjax.discretization.nodal_point import NodalChange
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 
 X = (1.0, 0.0, 0.0)
 START = Clamp((0, 0, 0), rj.frame(X))

@@ -9,7 +9,7 @@ from scenes import loaded_scenes
 
 import rodjax as rj
 from rodjax import Clamp, Free, Guess, Pin, Rod, Scene, frame
-from rodjax.solving.result import form_and_point, over_leading_axes
+from rodjax.solving.result_form import form_and_point, over_leading_axes
 
 EI = 2.0
 X, Z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)

@@ -12,7 +12,8 @@ from rodjax.checks import Numbers, instance, whole_number
 from rodjax.model.along import largest_beside
 from rodjax.model.obstacles import Obstacle, checked_obstacles
 from rodjax.model.rod import Rod
-from rodjax.solving.result import Equilibrium, over_leading_axes
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_form import over_leading_axes
 
 # Places between two nodes, where none are asked for, and at most.
 POINTS = 4

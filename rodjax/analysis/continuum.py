@@ -62,7 +62,8 @@ from rodjax.model.supports import Clamp, Directed, Pin
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import MAX_SEGMENTS
-from rodjax.solving.result import Equilibrium, NotConvergedWarning, warn_of_outcome
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_warnings import NotConvergedWarning, warn_of_outcome
 from rodjax.solving.solve import solve
 from rodjax.units import Units
 

@@ -54,7 +54,8 @@ from rodjax.model.rod import Law
 from rodjax.model.scene import Scene, nondimensional, slid, slides, sliding_arclengths
 from rodjax.model.supports import Clamp
 from rodjax.programs.compilation import compiled
-from rodjax.solving.result import Equilibrium, form_and_point
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_form import form_and_point
 from rodjax.units import Units
 
 # --- what varies along the rod ---------------------------------------------------------------------------------------

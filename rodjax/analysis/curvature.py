@@ -10,7 +10,9 @@ from rodjax.checks import instance, leaf
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.hermite import Curve
 from rodjax.geometry.vectors import root
-from rodjax.solving.result import Equilibrium, beside_nodes, estimated_errors, over_leading_axes
+from rodjax.solving.result import Equilibrium, beside_nodes
+from rodjax.solving.result_errors import estimated_errors
+from rodjax.solving.result_form import over_leading_axes
 
 
 def most_curved(equilibrium: Equilibrium) -> Float[Array, "... 2"]:

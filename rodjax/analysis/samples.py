@@ -13,7 +13,8 @@ from rodjax.checks import namespace
 from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.section_loads import is_known_along, loads_between, section_loads
 from rodjax.discretization.twist import angle_about, transport
-from rodjax.solving.result import Equilibrium, form_and_point, over_leading_axes
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_form import form_and_point, over_leading_axes
 
 # A polyline through the samples is this close to the curve, by the length of the rod; the samples of an element at
 # least, and of all elements at most.

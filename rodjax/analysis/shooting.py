@@ -38,7 +38,9 @@ from rodjax.model.scene import (
     slid,
 )
 from rodjax.model.supports import Clamp, Free, Held, Support, Swivel
-from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, SolverState, form_and_point
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
+from rodjax.solving.result_form import form_and_point
+from rodjax.solving.solver_state import SolverState
 from rodjax.solving.status import Status, is_converged, with_strain
 from rodjax.units import Units
 

@@ -11,7 +11,7 @@ import rodjax
 from rodjax.atomic_write import replace_file
 from rodjax.commands.errors import CommandError
 from rodjax.commands.outputs import check_folder, save_figure
-from rodjax.solving.result import NotConvergedWarning
+from rodjax.solving.result_warnings import NotConvergedWarning
 
 if TYPE_CHECKING:
     from rodjax.identification.refits import Profile

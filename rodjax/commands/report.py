@@ -16,7 +16,8 @@ from rodjax.io.files import load
 from rodjax.io.harness_file import HarnessFile
 from rodjax.io.scene_file import SceneFile
 from rodjax.solving.equilibrium import DEFAULT_RTOL
-from rodjax.solving.result import Equilibrium, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_warnings import NotConvergedWarning, OverstretchedWarning
 
 
 def run_report(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from rodjax.commands.outputs import check_folder
 from rodjax.commands.sweep import connection
 from rodjax.commands.view import show_session
 from rodjax.programs.tasks import TaskError
-from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 
 
 def run_route(arguments: argparse.Namespace) -> int:

@@ -23,7 +23,8 @@ from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
 from rodjax.model.scene import Scene, has_no_place
 from rodjax.notes import note
-from rodjax.solving.result import Equilibrium, MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 
 Result = TypeVar("Result", Equilibrium, rodjax.HarnessEquilibrium)
 

@@ -11,7 +11,7 @@ from rodjax.commands.errors import CommandError
 from rodjax.io.files import SUFFIX
 from rodjax.io.harness_file import HarnessFile, is_harness_file, read_harness_file
 from rodjax.io.scene_file import SceneFile, read_scene_file
-from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 
 
 def _file_to_view(path: Path) -> SceneFile | HarnessFile | rodjax.Equilibrium | rodjax.HarnessEquilibrium:

@@ -37,7 +37,7 @@ from rodjax.paths.continuation import critical_point
 from rodjax.programs.answers import one_answer
 from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.harness_result import Solution
-from rodjax.solving.result import NotConvergedWarning
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn
 
 # The scatter of robust fits, and points about which critical values are linear, settle in some 3 to 5 rounds.

@@ -29,7 +29,9 @@ from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import Solution, results_of
 from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
-from rodjax.solving.result import Equilibrium, NotConvergedWarning, estimated_errors
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_errors import estimated_errors
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.solving.solve import solve
 from rodjax.warn import warn
 

@@ -36,7 +36,8 @@ from rodjax.model.scene import Scene, has_node_positions, under_contact
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Pin, Slider, Spring, Swivel
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import Equilibrium, PrecisionWarning
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_warnings import PrecisionWarning
 from rodjax.solving.status import Status
 from rodjax.version import __version__
 from rodjax.warn import warn

@@ -37,7 +37,8 @@ from rodjax.paths.rod_place import BranchContacts, RodProblem, pressing
 from rodjax.programs.compilation import compiled
 from rodjax.solving.equilibrium import on_mesh_of
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import Equilibrium, free_form_and_point
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_form import free_form_and_point
 from rodjax.solving.status import Outcome, Status
 
 MAX_ITERATIONS = 12

@@ -27,7 +27,7 @@ from rodjax.solving.assembly import Assembly, Poses, Rods
 from rodjax.solving.coupling import Coupling, RodInBodies, end_contacts
 from rodjax.solving.harness_forces import ends_of, split_pressures
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import form_and_point
+from rodjax.solving.result_form import form_and_point
 from rodjax.solving.stability import INVERSE_ITERATIONS, below_lowest
 
 

@@ -17,7 +17,7 @@ from rodjax.solving.harness import solve_harness, warn_of_harness
 from rodjax.solving.harness_refinement import finer_meshes
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.refinement import Depth
-from rodjax.solving.result import NotConvergedWarning
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn
 
 # A step is halved at most so often, to a sixty-fourth of it.

@@ -33,7 +33,8 @@ from rodjax.solving.harness_forces import ends_of
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_search import harness_equilibrium
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, form_and_point
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
+from rodjax.solving.result_form import form_and_point
 from rodjax.solving.status import Outcome
 
 

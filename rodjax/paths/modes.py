@@ -22,7 +22,8 @@ from rodjax.paths.harness_modes import HarnessMode, harness_mode
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import Equilibrium, free_form_and_point, over_leading_axes, slopes
+from rodjax.solving.result import Equilibrium, slopes
+from rodjax.solving.result_form import free_form_and_point, over_leading_axes
 from rodjax.solving.stability import softest
 from rodjax.solving.status import Status
 

@@ -49,14 +49,9 @@ from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find
 from rodjax.solving.ranges import check_ranges, with_ranges
-from rodjax.solving.result import (
-    DEFAULT_STRAIN_LIMIT,
-    Equilibrium,
-    Found,
-    SolverState,
-    build_result,
-    warn_of_outcome,
-)
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, build_result
+from rodjax.solving.result_warnings import warn_of_outcome
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome, is_converged
 
 # What a path does where its branch of equilibria loses its stability.

@@ -25,14 +25,9 @@ from rodjax.mechanics.passage import Before
 from rodjax.model.scene import Scene, between, nondimensional
 from rodjax.paths.place import Place, work
 from rodjax.solving.newton import STAGNATION
-from rodjax.solving.result import (
-    Equilibrium,
-    Found,
-    SolverState,
-    build_result,
-    form_and_point,
-    free_form_and_point,
-)
+from rodjax.solving.result import Equilibrium, build_result
+from rodjax.solving.result_form import form_and_point, free_form_and_point
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.stability import carried_to
 from rodjax.solving.status import Outcome
 

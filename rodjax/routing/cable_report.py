@@ -16,7 +16,9 @@ from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Margins, margins
 from rodjax.routing.route import Route
-from rodjax.solving.result import Equilibrium, describe, estimated_errors
+from rodjax.solving.description import describe
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_errors import estimated_errors
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
 WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}

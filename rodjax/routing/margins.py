@@ -22,7 +22,8 @@ from rodjax.model.scene import Scene
 from rodjax.paths.modes import lowest_mode
 from rodjax.routing.limits import Limits
 from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
-from rodjax.solving.result import Equilibrium, beside_nodes, over_leading_axes
+from rodjax.solving.result import Equilibrium, beside_nodes
+from rodjax.solving.result_form import over_leading_axes
 
 # What the name of a clearance is told by, before that of the obstacle.
 CLEARANCE = "clearance to "

@@ -39,7 +39,7 @@ from rodjax.solving.equilibrium import Solver, checked_options
 from rodjax.solving.harness_result import Solution, results_of, solved_in
 from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.newton import Newton
-from rodjax.solving.result import NotConvergedWarning
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.solving.solve import solve
 from rodjax.warn import silenced
 

@@ -25,7 +25,7 @@ from rodjax.routing.limits import Limits
 from rodjax.routing.margins import measured
 from rodjax.solving.harness_derivatives import jacobian
 from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of, solved_in
-from rodjax.solving.result import NotConvergedWarning
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import silenced
 
 # Of the three-point rule of Gauss & Hermite, in standard deviations.

@@ -59,6 +59,7 @@ from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.loading import found_under_loads
 from rodjax.solving.newton import Find, Newton, NewtonEnd, find_equilibrium, is_stable
 from rodjax.solving.nonlinear_cg import NonlinearCG, minimize
+from rodjax.solving.penetration import sampled
 from rodjax.solving.ranges import check_ranges, with_ranges
 from rodjax.solving.refinement import (
     SAFETY,
@@ -71,20 +72,16 @@ from rodjax.solving.refinement import (
     next_size,
     normalized,
 )
-from rodjax.solving.result import (
-    DEFAULT_STRAIN_LIMIT,
-    Equilibrium,
-    Found,
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, build_result
+from rodjax.solving.result_errors import estimated_errors
+from rodjax.solving.result_warnings import (
     NotConvergedWarning,
-    SolverState,
-    build_result,
-    estimated_errors,
-    sampled,
     warn_if_coarse,
     warn_of_outcome,
     warn_of_single_precision,
     warn_of_unknown_mesh,
 )
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 from rodjax.warn import warn

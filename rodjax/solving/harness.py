@@ -23,13 +23,8 @@ from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.harness_start import solved_on_meshes
 from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.newton import Newton
-from rodjax.solving.result import (
-    DEFAULT_STRAIN_LIMIT,
-    Equilibrium,
-    NotConvergedWarning,
-    warn_if_coarse,
-    warn_of_outcome,
-)
+from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
+from rodjax.solving.result_warnings import NotConvergedWarning, warn_if_coarse, warn_of_outcome
 from rodjax.warn import warn
 
 

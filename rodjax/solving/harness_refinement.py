@@ -12,7 +12,8 @@ from rodjax.solving.equilibrium import Options, _finer
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_start import solved_on_meshes
 from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
-from rodjax.solving.result import NotConvergedWarning, estimated_errors
+from rodjax.solving.result import estimated_errors
+from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn
 
 

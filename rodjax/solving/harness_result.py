@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
-from rodjax.solving.result import Described, Equilibrium, describe
+from rodjax.solving.description import Described, describe
+from rodjax.solving.result import Equilibrium
 from rodjax.solving.rod_contact_results import RodContacts, rod_contacts
 from rodjax.solving.status import Status
 

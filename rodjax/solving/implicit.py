@@ -21,7 +21,9 @@ from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.model.scene import Scene, has_contacts, nondimensional
 from rodjax.programs.linear import linear
 from rodjax.programs.parts import zeros
-from rodjax.solving.result import Equilibrium, Found, SolverState, build_result, form_and_point
+from rodjax.solving.result import Equilibrium, build_result
+from rodjax.solving.result_form import form_and_point
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.stability import carried_to, examined
 from rodjax.solving.status import Outcome
 

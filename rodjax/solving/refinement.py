@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rodjax.discretization.error import Errors
-from rodjax.solving.result import MOST_PENETRATION
+from rodjax.solving.penetration import MOST_PENETRATION
 
 # The order of the shape error in 1/segments, and the numbers of segments: few, as each is a program to compile.
 ORDERS = {"finite_difference": 2, "hermite": 4}

@@ -15,14 +15,9 @@ from rodjax.model.scene import Scene
 from rodjax.paths.batch import solve_batch
 from rodjax.solving.harness_result import HarnessEquilibrium, Solution, results_of
 from rodjax.solving.refinement import ORDERS, SAFETY, SECTION_FACTOR, SIZES
-from rodjax.solving.result import (
-    Equilibrium,
-    MeshWarning,
-    NotConvergedWarning,
-    OverstretchedWarning,
-    estimated_errors,
-    positions_at,
-)
+from rodjax.solving.result import Equilibrium, positions_at
+from rodjax.solving.result_errors import estimated_errors
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.sweeps.cases import CaseScenes
 from rodjax.sweeps.manifest import OF_CABLE, Manifest
 from rodjax.sweeps.quantities import QUANTITIES

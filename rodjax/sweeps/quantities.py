@@ -10,7 +10,8 @@ from rodjax.analysis.curvature import curvature_along
 from rodjax.checks import sequence, shown
 from rodjax.model.harness import Harness, scenes_of
 from rodjax.model.scene import Scene
-from rodjax.solving.result import Equilibrium, over_leading_axes
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.result_form import over_leading_axes
 from rodjax.sweeps.cases import SweepError
 
 

@@ -25,7 +25,7 @@ from rodjax.notes import bar, told
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
 from rodjax.solving.equilibrium import DEFAULT_RTOL
 from rodjax.solving.harness_result import HarnessEquilibrium
-from rodjax.solving.result import MeshWarning, NotConvergedWarning, OverstretchedWarning
+from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.solve import solve
 from rodjax.sweeps.cases import MAX_CASES, CaseReader, SweepError
 from rodjax.sweeps.chunk import Arrays, Chunk, solved_chunk

@@ -24,7 +24,8 @@ from work_precision import Scipy, begun, reached
 import rodjax
 from rodjax import Clamp, Scene, frame, problems
 from rodjax.paths.path import stack_scenes
-from rodjax.solving.equilibrium import Discretization, Options, first_state
+from rodjax.solving.first_state import first_state
+from rodjax.solving.options import Discretization, Options
 
 HARD_SHARE = 50  # one scene in so many
 HARD_TURNS = 10.0  # times the median of the others

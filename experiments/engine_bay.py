@@ -29,7 +29,7 @@ from rodjax.paths.batch import solve_first, solve_stack
 from rodjax.routing.problem import Problem, arranged, scenes_at, spare_lengths, valued
 from rodjax.routing.route import RESERVE, SEGMENTS, TOLERANCE
 from rodjax.routing.variables import checked_variables
-from rodjax.solving.equilibrium import checked_options
+from rodjax.solving.options import checked_options
 from rodjax.solving.result import Equilibrium
 
 jax.config.update("jax_enable_x64", True)  # before the numbers below are made

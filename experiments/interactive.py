@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 import rodjax
 from rodjax import problems
-from rodjax.solving.equilibrium import Discretization
+from rodjax.solving.options import Discretization
 
 PICTURE_MS = 1e3 / 90
 LARGEST_MOVE = 5e-3  # [m], of the end in one scene

@@ -45,7 +45,8 @@ from rodjax.mechanics.strain import swept_angle
 from rodjax.model.plane import plane
 from rodjax.model.scene import nondimensional
 from rodjax.paths.path import stack_scenes
-from rodjax.solving.equilibrium import Options, first_state
+from rodjax.solving.first_state import first_state
+from rodjax.solving.options import Options
 from rodjax.solving.result import build_result
 from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome

@@ -18,7 +18,7 @@ import rodjax
 from rodjax import Clamp, Free, Scene, problems
 from rodjax.model.supports import Support
 from rodjax.paths.path import stack_scenes
-from rodjax.solving.equilibrium import Discretization
+from rodjax.solving.options import Discretization
 
 # The section of `problems.cable`, for programs that ask for moduli [m, Pa, Pa, kg/m^3].
 RADIUS, YOUNGS_MODULUS, SHEAR_MODULUS, DENSITY = 5e-3, 1e7, 1e7 / 3, 1200.0

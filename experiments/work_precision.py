@@ -30,7 +30,8 @@ from rodjax.discretization.finite_difference import FiniteDifference, Polyline
 from rodjax.discretization.first_twist import FirstTwist
 from rodjax.model.scene import nondimensional
 from rodjax.paths.path import stack_scenes
-from rodjax.solving.equilibrium import Discretization, Options, first_state
+from rodjax.solving.first_state import first_state
+from rodjax.solving.options import Discretization, Options
 
 TOLERANCE = 1e-8  # largest component of the gradient [EI/L^2], of every method
 # Above this mesh the C++ program, which keeps positions and not edges, cannot reach that, and gets a looser one.

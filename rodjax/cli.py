@@ -30,7 +30,7 @@ from rodjax.io.files import SUFFIX
 from rodjax.io.scene_file import SceneFileError
 from rodjax.notes import told
 from rodjax.programs import kept
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.options import MAX_SEGMENTS
 from rodjax.sweeps.cases import SweepError
 from rodjax.sweeps.quantities import QUANTITIES
 from rodjax.sweeps.sweep import SUFFIX as SWEEP_SUFFIX

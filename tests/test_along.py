@@ -13,7 +13,7 @@ from rodjax.discretization.cells import ElementCells
 from rodjax.model.along import Spline
 from rodjax.model.rod import torsion_constant
 from rodjax.model.scene import nondimensional
-from rodjax.solving.equilibrium import checked_options
+from rodjax.solving.options import checked_options
 
 LINE = np.stack([np.arange(5.0), np.zeros(5), np.zeros(5)], axis=1)
 FRAMES = np.stack([np.eye(3)] * 5)

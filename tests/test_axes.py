@@ -12,7 +12,9 @@ from rodjax import Clamp, Clip, Free, Pin, PointForce, Rod, Scene, Swivel
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.framed import FrameForm
 from rodjax.model.scene import nondimensional, scene_axes
-from rodjax.solving.equilibrium import Options, _first_point, first_state, in_units_of
+from rodjax.solving.first_state import first_state
+from rodjax.solving.options import Options
+from rodjax.solving.search import first_point, in_units_of
 
 IDENTITY = Rotation.identity()
 SEGMENTS = 16
@@ -54,7 +56,7 @@ def first_tangents(scene: Scene):
     state, first = first_state(scene, None, options)
     scaled, state = in_units_of(scene, state)
     form = form_of(scaled, state.shape)
-    _, point = _first_point(form, state, first)
+    _, point = first_point(form, state, first)
     twist = form.total_twist(point.quaternions) if isinstance(form, FrameForm) else point.total_twist
     return point.tangents, twist
 

@@ -150,7 +150,8 @@ def world(tmp_path, samples, capsys, monkeypatch) -> World:
         raise Accepted
 
     modules = {
-        "solving.equilibrium": ("_solve", "_first_state"),
+        "solving.equilibrium": ("_solve",),
+        "solving.first_state": ("_first_state",),
         "paths.path": ("_solve_path",),
         "paths.batch": ("_solve_many",),
     }

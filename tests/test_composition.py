@@ -23,7 +23,7 @@ from rodjax import (
     Steps,
     Swivel,
 )
-from rodjax.solving.equilibrium import checked_options
+from rodjax.solving.options import checked_options
 
 SEGMENTS = 8
 X = (1.0, 0.0, 0.0)

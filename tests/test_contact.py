@@ -16,8 +16,8 @@ from rodjax.discretization.inner_contacts import Elements, Places
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.discretization.node_contacts import contacts_at
 from rodjax.model.supports import Support
-from rodjax.solving import equilibrium
-from rodjax.solving.equilibrium import checked_options
+from rodjax.solving import options
+from rodjax.solving.options import checked_options
 from rodjax.solving.result_form import form_and_point
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
@@ -211,8 +211,8 @@ def test_a_rod_that_begins_across_a_box_and_stays_there_is_told(monkeypatch):
     """Between clips it is not led out: where a search ends so, it is not converged, and not sought up to the finest
     mesh.
     """
-    monkeypatch.setattr(equilibrium, "CONTACT_SEGMENTS", 8)
-    monkeypatch.setattr(equilibrium, "SPAN_SEGMENTS", 4)
+    monkeypatch.setattr(options, "CONTACT_SEGMENTS", 8)
+    monkeypatch.setattr(options, "SPAN_SEGMENTS", 4)
     with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = "):
         result = rj.solve(across_a_box(clips=[rj.Clip(1.15, (0.76, 0, 0.095))]))
     assert not result.converged

@@ -15,7 +15,9 @@ from rodjax.discretization.nodal_point import NodalChange
 from rodjax.linalg.chain import ChainSystem
 from rodjax.solving.assembly_step import RodStep
 from rodjax.solving.coupling import RodInBodies, linearized_with_ends
-from rodjax.solving.equilibrium import Search, checked_options, first_state, in_units_of, sliding_search
+from rodjax.solving.first_state import first_state
+from rodjax.solving.options import checked_options
+from rodjax.solving.search import Search, in_units_of, sliding_search
 
 START = Clamp((0.1, 0, 0.2), frame((1, 0, -1)))
 END = Clamp((0.7, 0.2, 0.1), frame((1, 1, 1)))

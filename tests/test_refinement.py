@@ -11,7 +11,7 @@ import rodjax as rj
 from rodjax import Clamp, Scene, frame, problems
 from rodjax.programs.compilation import program_count
 from rodjax.solving import equilibrium
-from rodjax.solving.equilibrium import TRACED_SEGMENTS, Discretization
+from rodjax.solving.options import TRACED_SEGMENTS, Discretization
 from rodjax.solving.refinement import GRADING, LONGEST, SIZES, first_size, graded, next_size
 
 TWISTED = Scene(

@@ -61,7 +61,7 @@ from rodjax.model.scene import Scene, needs_frames, nondimensional, slid, slides
 from rodjax.model.supports import Clamp, Directed, Pin
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.options import MAX_SEGMENTS
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.result_warnings import NotConvergedWarning, warn_of_outcome
 from rodjax.solving.solve import solve

@@ -15,7 +15,7 @@ from rodjax.commands.outputs import check_folder
 from rodjax.io.files import load
 from rodjax.io.harness_file import HarnessFile
 from rodjax.io.scene_file import SceneFile
-from rodjax.solving.equilibrium import DEFAULT_RTOL
+from rodjax.solving.options import DEFAULT_RTOL
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.result_warnings import NotConvergedWarning, OverstretchedWarning
 

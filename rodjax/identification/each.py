@@ -36,8 +36,8 @@ from rodjax.identification.unknowns import Unknown
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import checked_executor, checked_threads, in_order, rows_of
-from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.harness_result import Solution
+from rodjax.solving.options import Discretization
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,7 +82,7 @@ from rodjax.io.quantities import SceneFileError, check_keys, choice, flag, in_fi
 from rodjax.io.scene_file import SceneFile, read_text, toml_tables
 from rodjax.io.scene_keys import SceneVariations
 from rodjax.io.scene_keys import check_keys as check_scene_keys
-from rodjax.solving.equilibrium import MAX_SEGMENTS, Discretization, checked_rtol
+from rodjax.solving.options import MAX_SEGMENTS, Discretization, checked_rtol
 
 UNKNOWN_KEYS = ("name", "names", "scale", "per", "start", "bounds", "prior", "label")
 SETTINGS = ("loss", "threshold", "rtol", "segments", "discretization", "planar")

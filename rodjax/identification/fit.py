@@ -35,8 +35,8 @@ from rodjax.identification.unknowns import Unknown, with_values
 from rodjax.notes import note
 from rodjax.paths.continuation import critical_point
 from rodjax.programs.answers import one_answer
-from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.harness_result import Solution
+from rodjax.solving.options import Discretization
 from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn
 

@@ -20,9 +20,9 @@ from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.programs.compilation import compiled
 from rodjax.programs.parts import traced_once
-from rodjax.solving.equilibrium import Discretization
 from rodjax.solving.harness_result import Solution
 from rodjax.solving.newton import Newton
+from rodjax.solving.options import Discretization
 from rodjax.solving.solve import solve
 
 # Of harnesses. Their steps end less far below the tolerance than those of one rod: with 1e-8 EI/L^2 what is left undone

@@ -24,10 +24,11 @@ from rodjax.model.scene import Scene, held_position
 from rodjax.paths.harness_path import are_harnesses, harness_batch, stack_harnesses, unstacked
 from rodjax.paths.path import stack_scenes
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import Discretization, checked_options, first_state
+from rodjax.solving.first_state import first_state
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import Solution, results_of
 from rodjax.solving.harness_rods import clamped_rods
+from rodjax.solving.options import Discretization, checked_options
 from rodjax.solving.refinement import SAFETY, SIZES, next_size
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.result_errors import estimated_errors

@@ -60,7 +60,7 @@ from rodjax.io.quantities import SceneFileError, check_keys, in_file, named, si_
 from rodjax.io.scene_file import SceneReader, body_support, read_text, toml_tables
 from rodjax.model.harness import Body, Harness
 from rodjax.model.scene import Scene
-from rodjax.solving.equilibrium import MAX_SEGMENTS, checked_rtol, checked_strain_limit
+from rodjax.solving.options import MAX_SEGMENTS, checked_rtol, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
 HARNESS_TABLES = ("cables", "contact", "joints", "loads", "obstacles", "solve")

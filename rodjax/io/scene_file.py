@@ -155,13 +155,7 @@ from rodjax.model.supports import (
     Swivel,
     frame,
 )
-from rodjax.solving.equilibrium import (
-    MAX_SEGMENTS,
-    Discretization,
-    checked_options,
-    checked_rtol,
-    checked_strain_limit,
-)
+from rodjax.solving.options import MAX_SEGMENTS, Discretization, checked_options, checked_rtol, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 
 # More steps than this in one table are taken for a mistake: a full turn would go in steps of 0.04 degrees.

@@ -19,7 +19,7 @@ from rodjax.model.harness import Harness
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene
 from rodjax.model.supports import Joint, Spring, Support
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.options import MAX_SEGMENTS
 
 
 def write_scene(scene: Scene | Harness, path: str | os.PathLike[str], segments: int | None = None) -> None:

@@ -29,26 +29,17 @@ from rodjax.paths.path import check_still, path_from, stack_scenes
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import as_completed, checked_threads
-from rodjax.solving.equilibrium import (
-    Discretization,
-    Options,
-    Search,
-    Solver,
-    checked_options,
-    checked_strain_limit,
-    first_state,
-    in_units_of,
-    is_here,
-    refined_together,
-    solve_from,
-)
+from rodjax.solving.equilibrium import is_here, refined_together
+from rodjax.solving.first_state import first_state
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find, Newton, NewtonEnd, NewtonState, begin, ended, is_running, turn
+from rodjax.solving.options import Discretization, Options, Solver, checked_options, checked_strain_limit
 from rodjax.solving.ranges import check_ranges, with_ranges
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, build_result
 from rodjax.solving.result_warnings import warn_of_outcome
+from rodjax.solving.search import Search, in_units_of, solve_from
 from rodjax.solving.solver_state import Found, SolverState
 
 # Rods computed side by side: more amortise what a loop costs beside its numbers, and wait for the last rods of all. On

@@ -35,10 +35,10 @@ from rodjax.paths.modes import Mode, mode_of
 from rodjax.paths.place import added, left_of, less, nearest_to_zero, scaled
 from rodjax.paths.rod_place import BranchContacts, RodProblem, pressing
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import on_mesh_of
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.result_form import free_form_and_point
+from rodjax.solving.search import on_mesh_of
 from rodjax.solving.status import Outcome, Status
 
 MAX_ITERATIONS = 12

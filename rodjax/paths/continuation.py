@@ -28,10 +28,10 @@ from rodjax.paths.rod_place import scene_at
 from rodjax.paths.tracing import DEFAULT_STEPS, BranchEnd, Crossing, StepControl, begun, towards, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import Discretization, Solver
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import not_differentiated
+from rodjax.solving.options import Discretization, Solver
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.solve import solve
 

@@ -12,10 +12,10 @@ from rodjax.model.harness import Harness, harness_between
 from rodjax.model.scene import has_friction
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import checked_threads, in_order
-from rodjax.solving.equilibrium import DEFAULT_RTOL, checked_rtol
 from rodjax.solving.harness import solve_harness, warn_of_harness
 from rodjax.solving.harness_refinement import finer_meshes
 from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.options import DEFAULT_RTOL, checked_rtol
 from rodjax.solving.refinement import Depth
 from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn

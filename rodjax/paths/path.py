@@ -33,24 +33,17 @@ from rodjax.paths.harness_path import are_harnesses, harness_path, stack_harness
 from rodjax.paths.tracing import DEFAULT_STEPS, trace
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
-from rodjax.solving.equilibrium import (
-    Discretization,
-    Options,
-    Solver,
-    check_single,
-    checked_options,
-    checked_strain_limit,
-    first_state,
-    refined_together,
-    solve_from,
-)
+from rodjax.solving.equilibrium import refined_together
+from rodjax.solving.first_state import first_state
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.implicit import differentiable, not_differentiated
 from rodjax.solving.newton import Find
+from rodjax.solving.options import Discretization, Options, Solver, check_single, checked_options, checked_strain_limit
 from rodjax.solving.ranges import check_ranges, with_ranges
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium, build_result
 from rodjax.solving.result_warnings import warn_of_outcome
+from rodjax.solving.search import solve_from
 from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome, is_converged
 

@@ -22,8 +22,8 @@ from rodjax.routing.problem import (
 )
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.search import KEPT, Asked, Numbers, Outcome, Search, Settings
-from rodjax.solving.equilibrium import Options
 from rodjax.solving.harness_result import Solution
+from rodjax.solving.options import Options
 
 # Starts of a group: as many as are computed side by side. Searches of several groups do not wait for one another.
 GROUP = 8

@@ -19,9 +19,9 @@ from rodjax.routing.limits import Limits
 from rodjax.routing.margins import Measured, measured
 from rodjax.routing.objective import Objective
 from rodjax.routing.variables import Variable, leaf_names, with_numbers
-from rodjax.solving.equilibrium import Solver
 from rodjax.solving.harness_derivatives import jacobian
 from rodjax.solving.harness_result import Solution, solved_in
+from rodjax.solving.options import Solver
 
 T = TypeVar("T")
 

@@ -35,10 +35,10 @@ from rodjax.routing.problem import (
 )
 from rodjax.routing.search import KEPT, REGION, Outcome
 from rodjax.routing.variables import checked_variables, first_numbers, leaf_names, number_of
-from rodjax.solving.equilibrium import Solver, checked_options
 from rodjax.solving.harness_result import Solution, results_of, solved_in
 from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.newton import Newton
+from rodjax.solving.options import Solver, checked_options
 from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.solving.solve import solve
 from rodjax.warn import silenced

@@ -12,7 +12,7 @@ from rodjax.model.harness import Bodies, Harness, of_one_rod
 from rodjax.model.scene import Scene, has_friction
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Poses
-from rodjax.solving.equilibrium import DEFAULT_RTOL, check_single, checked_options, checked_strain_limit, is_here
+from rodjax.solving.equilibrium import is_here
 from rodjax.solving.first_poses import Shapes, first_poses
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_derivatives import differentiable_harness
@@ -23,6 +23,7 @@ from rodjax.solving.harness_rods import clamped_rods
 from rodjax.solving.harness_start import solved_on_meshes
 from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.newton import Newton
+from rodjax.solving.options import DEFAULT_RTOL, check_single, checked_options, checked_strain_limit
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.solving.result_warnings import NotConvergedWarning, warn_if_coarse, warn_of_outcome
 from rodjax.warn import warn

@@ -11,7 +11,7 @@ from rodjax.checks import leaf
 from rodjax.model.harness import Bodies, Harness, end_radii, floating, joint_ends, rotated
 from rodjax.model.scene import has_contacts
 from rodjax.solving.assembly import Poses
-from rodjax.solving.equilibrium import Options
+from rodjax.solving.options import Options
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.rod_contact import Members, in_contact, pairs_of
 

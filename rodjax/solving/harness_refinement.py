@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rodjax.solving.assembly import Poses
-from rodjax.solving.equilibrium import Options, _finer
+from rodjax.solving.first_state import finer_state
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_start import solved_on_meshes
+from rodjax.solving.options import Options
 from rodjax.solving.refinement import SAFETY, SIZES, Depth, error_by_rtol, next_size, normalized
-from rodjax.solving.result import estimated_errors
+from rodjax.solving.result_errors import estimated_errors
 from rodjax.solving.result_warnings import NotConvergedWarning
 from rodjax.warn import warn
 
@@ -29,7 +30,7 @@ def refined(
         counts, worst, all_defects = finer_meshes(result, rtol, depths)
         options = [dataclasses.replace(old, segments=count) for old, count in zip(all_options, counts, strict=True)]
         finer = {
-            number: _finer(result.rod(number), all_defects[number], new)
+            number: finer_state(result.rod(number), all_defects[number], new)
             for number, (new, old) in enumerate(zip(options, all_options, strict=True))
             if new.segments != old.segments
         }

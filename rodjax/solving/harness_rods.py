@@ -13,7 +13,7 @@ from rodjax.model.harness import Harness
 from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, under_contact
 from rodjax.model.supports import Clamp, Joint
-from rodjax.solving.equilibrium import Options
+from rodjax.solving.options import Options
 from rodjax.solving.rod_contact import Members
 
 

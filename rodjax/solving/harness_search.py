@@ -18,21 +18,15 @@ from rodjax.model.scene import Scene, has_contacts, nondimensional, slid, slides
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Assembly, Poses, Rods, State
 from rodjax.solving.assembly_newton import find_assembly
-from rodjax.solving.equilibrium import (
-    MOST_MESHES,
-    Options,
-    Search,
-    in_units_of,
-    on_mesh_of,
-    on_one_side,
-    sliding_search,
-)
 from rodjax.solving.harness_forces import contact_forces, ends_of, energy_of, split_pressures, stacked
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_rods import touchable
 from rodjax.solving.newton import Newton
-from rodjax.solving.result import Equilibrium, Found, SolverState, build_result
+from rodjax.solving.options import Options
+from rodjax.solving.result import Equilibrium, build_result
 from rodjax.solving.rod_contact import Members, in_contact, pairs_of, split_by_pairs
+from rodjax.solving.search import MOST_MESHES, Search, in_units_of, on_mesh_of, on_one_side, sliding_search
+from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome, Status, is_converged
 from rodjax.units import Units
 

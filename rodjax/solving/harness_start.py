@@ -13,13 +13,15 @@ from rodjax.model.scene import Scene
 from rodjax.model.supports import Joint
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Poses
-from rodjax.solving.equilibrium import Options, _fits, first_state, last_twist
 from rodjax.solving.first_poses import Shapes
+from rodjax.solving.first_state import first_state, fits, last_twist
 from rodjax.solving.harness_forces import no_pressures, no_rod_pressures, stacked
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_rods import clamped_rods, members_of, touchable
 from rodjax.solving.harness_search import find_harness
-from rodjax.solving.result import Equilibrium, SolverState
+from rodjax.solving.options import Options
+from rodjax.solving.result import Equilibrium
+from rodjax.solving.solver_state import SolverState
 
 
 def solved_on_meshes(
@@ -89,7 +91,7 @@ def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[Solv
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), group)
     if not eqx.tree_equal(*(jax.tree.map(jnp.shape, each.obstacles) for each in (one.scene, scene))):
         return None
-    return (group.state, last_twist(group)) if _fits(scene, one, options) else None
+    return (group.state, last_twist(group)) if fits(scene, one, options) else None
 
 
 def _bodies_of(harness: Harness, number: int) -> tuple[int, int]:

@@ -7,11 +7,12 @@ from rodjax.checks import instance
 from rodjax.model.harness import Harness, has_movable_ends
 from rodjax.model.scene import Scene
 from rodjax.programs.answers import one_answer
-from rodjax.solving.equilibrium import Discretization, Solver, solve_scene
+from rodjax.solving.equilibrium import solve_scene
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness import solve_harness, solve_movable
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.newton import Find
+from rodjax.solving.options import Discretization, Solver
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from rodjax.atomic_write import has_seal
-from rodjax.solving.equilibrium import MAX_SEGMENTS
+from rodjax.solving.options import MAX_SEGMENTS
 from rodjax.sweeps.cases import MAX_CASES, SweepError
 
 # Of the file and the folder. Raise it where an older rodjax could not go on with what this one writes.

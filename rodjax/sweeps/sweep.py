@@ -23,8 +23,8 @@ from rodjax.io.scene_file import SceneFile
 from rodjax.model.harness import Harness, check_without_friction
 from rodjax.notes import bar, told
 from rodjax.programs.tasks import TaskError, as_completed, checked_executor, checked_threads
-from rodjax.solving.equilibrium import DEFAULT_RTOL
 from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.options import DEFAULT_RTOL
 from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.solve import solve
 from rodjax.sweeps.cases import MAX_CASES, CaseReader, SweepError

@@ -20,8 +20,8 @@ from rodjax.paths.harness_path import unstacked
 from rodjax.paths.modes import lowest_mode
 from rodjax.programs.answers import compiled_only
 from rodjax.solving.description import describe
-from rodjax.solving.equilibrium import MAX_SEGMENTS
 from rodjax.solving.harness_result import solved_in
+from rodjax.solving.options import MAX_SEGMENTS
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
 from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning
 from rodjax.solving.solve import solve

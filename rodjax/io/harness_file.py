@@ -57,7 +57,8 @@ from typing import Any, NamedTuple
 from rodjax.checks import file_path, shown, whole_number
 from rodjax.io import scene_file
 from rodjax.io.quantities import SceneFileError, check_keys, in_file, named, si_values
-from rodjax.io.scene_file import SceneReader, body_support, read_text, toml_tables
+from rodjax.io.scene_file import SceneReader, read_text, toml_tables
+from rodjax.io.support_tables import body_support
 from rodjax.model.harness import Body, Harness
 from rodjax.model.scene import Scene
 from rodjax.solving.options import MAX_SEGMENTS, checked_rtol, checked_strain_limit

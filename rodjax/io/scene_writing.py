@@ -11,9 +11,10 @@ from jaxtyping import Array
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, whole_number
+from rodjax.io.load_tables import DISTRIBUTED
 from rodjax.io.obstacle_tables import written_obstacle
 from rodjax.io.quantities import assignment, quantity
-from rodjax.io.scene_file import DISTRIBUTED, PAIRS
+from rodjax.io.rod_table import PAIRS
 from rodjax.model.along import Along, Steps
 from rodjax.model.harness import Harness
 from rodjax.model.rod import Rod

@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.geometry.vectors import cross, dot
+from rodjax.linalg.blocks import short_sum
 from rodjax.programs.parts import traced_once
 
 # NARROW: by how much the gap of a narrow well grows half of an element from its middle [radii]. WIDE: stiffness k of a
@@ -22,6 +24,15 @@ DEEPEST_WELL = 0.1
 MIDDLE = 0.75
 # Where two parts of the rod cross within this distance [L], they part at right angles to both.
 CROSSING = 1e-9
+# The cubic of an element from its first node, and its first two derivatives, by the powers 0 to 3 of the part of the
+# element: the weights of the way to the second node, and of both tangents times the length.
+CUBIC = np.array(
+    [
+        [[0, 0, 3, -2], [0, 1, -2, 1], [0, 0, -1, 1]],
+        [[0, 6, -6, 0], [1, -4, 3, 0], [0, -2, 3, 0]],
+        [[6, -12, 0, 0], [-4, 6, 0, 0], [-2, 6, 0, 0]],
+    ]
+)
 
 
 class Curve(NamedTuple):
@@ -43,57 +54,53 @@ class Curve(NamedTuple):
 
 
 class Side(NamedTuple):
-    """A place of the curve: position, its first two derivatives by arclength, and the weights in the position and the
+    """Places of the curve: position, its first two derivatives by arclength, and the weights in the position and the
     first derivative of both nodes' positions and tangents.
     """
 
-    x: Float[Array, "3 k"]
-    slope: Float[Array, "3 k"]
-    curvature: Float[Array, "3 k"]
-    of_positions: Float[Array, "2 2 k"]  # [derivative, node]
-    of_tangents: Float[Array, "2 2 k"]
+    x: Float[Array, "3 *k"]
+    slope: Float[Array, "3 *k"]
+    curvature: Float[Array, "3 *k"]
+    of_positions: Float[Array, "2 2 *k"]  # [derivative, node]
+    of_tangents: Float[Array, "2 2 *k"]
 
 
 @traced_once
-def side_at(curve: Curve, element: Int[Array, "k"], s: Float[Array, "k"]) -> Side:
-    begin, end = curve.s[element], curve.s[element + 1]
-    h = end - begin
+def side_at(curve: Curve, element: Int[Array, "*k"], s: Float[Array, "*k"]) -> Side:
+    begin, first = curve.s[element], curve.positions.T[:, element]
+    h = curve.s[element + 1] - begin
     t = (s - begin) / h
-    u = 1 - t
-    zero = jnp.zeros_like(t)
-    of_positions = jnp.stack(
-        [jnp.stack([(1 + 2 * t) * u**2, t**2 * (3 - 2 * t)]), jnp.stack([-6 * t * u / h, 6 * t * u / h])]
-    )
-    of_tangents = jnp.stack(
-        [jnp.stack([h * t * u**2, -h * t**2 * u]), jnp.stack([u * (1 - 3 * t), t * (3 * t - 2)]) + zero[None]]
-    )
-    second_of_positions = jnp.stack([(12 * t - 6) / h**2, (6 - 12 * t) / h**2])
-    second_of_tangents = jnp.stack([(6 * t - 4) / h, (6 * t - 2) / h])
-    nodes = jnp.stack([element, element + 1])
-    positions, tangents = curve.positions.T[:, nodes], curve.tangents[:, nodes]
+    weights = jnp.tensordot(CUBIC.astype(t.dtype), jnp.stack([jnp.ones_like(t), t, t**2, t**3]), 1, precision="highest")
+    # By arclength; the tangents are derivatives by it.
+    inverse = 1 / h[None]
+    weights = jnp.stack([weights[0], weights[1] * inverse, weights[2] * inverse**2])
+    of_second, of_tangents = weights[:, 0], weights[:, 1:] * h[None, None]
+    way = curve.positions.T[:, element + 1] - first
+    tangents = curve.tangents[:, jnp.stack([element, element + 1])]
+    points = way[:, None] * of_second[None] + short_sum(tangents[:, None] * of_tangents[None], axis=2)
+    x, slope, curvature = jnp.unstack(points, axis=1)
+    from_first = jnp.stack([1 - of_second[0], -of_second[1]])
+    return Side(x + first, slope, curvature, jnp.stack([from_first, of_second[:2]], axis=1), of_tangents[:2])
 
-    def weighted(of_positions: Float[Array, "2 k"], of_tangents: Float[Array, "2 k"]) -> Float[Array, "3 k"]:
-        return jnp.sum(positions * of_positions[None] + tangents * of_tangents[None], axis=1)
 
-    return Side(
-        weighted(of_positions[0], of_tangents[0]),
-        weighted(of_positions[1], of_tangents[1]),
-        weighted(second_of_positions, second_of_tangents),
-        of_positions,
-        of_tangents,
-    )
+def sides_at(
+    curve: Curve, element: Int[Array, "k"], other: Int[Array, "k"], a: Float[Array, "k"], b: Float[Array, "k"]
+) -> Side:
+    """Of places in an element and in another one, along a last axis but one of two."""
+    return side_at(curve, jnp.stack([element, other]), jnp.stack([a, b]))
 
 
 @traced_once
-def direction(here: Side, there: Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
+def direction(sides: Side) -> tuple[Float[Array, "k"], Float[Array, "3 k"]]:
     """The distance of two places, and the direction in which it grows."""
-    way = here.x - there.x
-    across = cross(here.slope, there.slope)
+    here, there = jnp.unstack(sides.x, axis=1)
+    way = here - there
+    slope, other_slope = jnp.unstack(jax.lax.stop_gradient(sides.slope), axis=1)
+    across = cross(slope, other_slope)
     size = dot(across, across)
-    across = jnp.where(size > CROSSING**2, across, perpendicular(here.slope))
+    across = jnp.where(size > CROSSING**2, across, perpendicular(slope))
     across /= jnp.sqrt(dot(across, across))[None]
-    is_crossing = dot(way, way) <= CROSSING**2
-    way = jnp.where(is_crossing, CROSSING * jax.lax.stop_gradient(across), way)
+    way = jnp.where(dot(way, way) <= CROSSING**2, CROSSING * across, way)
     distance = jnp.sqrt(dot(way, way))
     return distance, way / distance[None]
 
@@ -111,16 +118,19 @@ def seen_distance(
     """The distance and the well of the cell, and its derivatives by both places; `is_far`: the second ones as of half
     of the squared distance, by the distance.
     """
-    here, there = side_at(curve, element, a), side_at(curve, other, b)
-    d, normal = direction(here, there)
+    sides = sides_at(curve, element, other, a, b)
+    d, normal = direction(sides)
     h = curve.s[cell + 1] - curve.s[cell]
     aside = a - curve.s[cell] - MIDDLE * h
     well = (narrow_wells(curve) if curve.wells is None else curve.wells)[cell]
-    on_here, on_there = dot(normal, here.slope), dot(normal, there.slope)
+    along = dot(jnp.broadcast_to(normal[:, None], sides.slope.shape), sides.slope)
+    bent = dot(jnp.broadcast_to(normal[:, None], sides.slope.shape), sides.curvature)
     across = 1.0 if is_far is None else 1.0 - is_far.astype(d.dtype)
-    aa = (dot(here.slope, here.slope) - across * on_here**2) / d + dot(normal, here.curvature) + well
-    bb = (dot(there.slope, there.slope) - across * on_there**2) / d - dot(normal, there.curvature)
-    ab = -(dot(here.slope, there.slope) - across * on_here * on_there) / d
+    squares = (dot(sides.slope, sides.slope) - across * along**2) / d[None]
+    on_here, on_there = jnp.unstack(along)
+    slope, other_slope = jnp.unstack(sides.slope, axis=1)
+    aa, bb = squares[0] + bent[0] + well, squares[1] - bent[1]
+    ab = -(dot(slope, other_slope) - across * on_here * on_there) / d
     return d + well * aside**2 / 2, (on_here + well * aside, -on_there), (aa, ab, bb)
 
 

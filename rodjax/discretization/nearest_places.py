@@ -8,7 +8,6 @@ that it should have (`wide_cells`); at its end each becomes what it should be, a
 Neighbours along the rod are no contact: less than half a turn around the rod's own radius away, or of the next element.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import Numbers
-from rodjax.discretization.curve_distance import Curve, direction, seen_distance, side_at, with_wells
+from rodjax.discretization.curve_distance import Curve, direction, seen_distance, side_at, sides_at, with_wells
 from rodjax.geometry.vectors import dot
 from rodjax.programs.parts import traced_once
 
@@ -64,13 +63,13 @@ def _nearest(curve: Curve) -> Nearest:
     cell = jnp.arange(n)
     begin, end, least, most = _range(curve)
     samples, of_element = _samples(s)
-    x = jnp.stack(side_at(curve, of_element, samples).x)  # [3, k]
+    x = side_at(curve, of_element, samples).x
     allowed = (samples[None] >= least[:, None]) & (samples[None] <= most[:, None])
 
     def squares(rows: Int[Numbers, "n r"]) -> Float[Array, "n r k"]:
         """Of the distances of these samples from all that their cells may touch."""
-        parts = (x[c][rows][..., None] - x[c][None, None] for c in range(3))
-        return jnp.where(allowed[:, None], functools.reduce(jnp.add, map(jnp.square, parts)), jnp.inf)
+        way = x[:, rows][..., None] - x[:, None, None]
+        return jnp.where(allowed[:, None], dot(way, way), jnp.inf)
 
     # Of a cell those of its element, and those of the next one within it.
     own = np.arange(len(samples)).reshape(n, -1)
@@ -86,55 +85,53 @@ def _nearest(curve: Curve) -> Nearest:
     first = samples[row], samples[column]
     h = jnp.diff(s)
 
-    def nearer(k: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
-        a, b = pair
+    def stepped(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        k, a, b = state[:3]
         element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
         _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b, k < FAR_STEPS)
-        bb = jnp.where(bb > 0, bb, 1.0)
+        is_flat, is_flat_beyond = aa * bb <= ab**2, bb <= 0
+        bb = jnp.where(is_flat_beyond, 1.0, bb)
         slope, growth = of_a - ab * of_b / bb, aa - ab**2 / bb
         step = jnp.where(growth > 0, -slope / jnp.where(growth > 0, growth, 1.0), -jnp.sign(slope) * h)
         step = jnp.clip(a + jnp.clip(step, -h / 4, h / 4), begin, end) - a
         along = jnp.clip(-(of_b + ab * step) / bb, -h[other] / 2, h[other] / 2)
-        return a + step, jnp.clip(b + along, least, most)
+        nearer = jnp.clip(b + along, least, most)
+        way = jnp.where(exists, jnp.abs(step) + jnp.abs(nearer - b), 0.0)
+        return k + 1, a + step, nearer, jnp.max(way), is_flat, is_flat_beyond
 
-    def stepped(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        k, a, b, _ = state
-        nearer_a, nearer_b = nearer(k, (a, b))
-        way = jnp.where(exists, jnp.abs(nearer_a - a) + jnp.abs(nearer_b - b), 0.0)
-        return k + 1, nearer_a, nearer_b, jnp.max(way)
-
-    def goes_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        k, _, _, way = state
+    def goes_on(state: tuple[Array, ...]) -> Bool[Array, ""]:
+        k, way = state[0], state[3]
         return (k < FAR_STEPS + STEPS) & ((k <= FAR_STEPS) | (way > STANDS))
 
-    _, a, b, _ = jax.lax.while_loop(goes_on, stepped, (jnp.zeros((), int), *first, jnp.zeros((), s.dtype)))
+    nowhere = jnp.zeros(n, bool)
+    start = jnp.zeros((), int), *first, jnp.zeros((), s.dtype), nowhere, nowhere
+    _, a, b, _, is_flat, is_flat_beyond = jax.lax.while_loop(goes_on, stepped, start)
     element, other = jnp.where(a > s[1:], cell + 1, cell), _element_at(s, b)
-    _, _, (aa, ab, bb) = seen_distance(curve, cell, element, other, a, b)
-    is_flat = aa * bb <= ab**2
-    stays = jnp.stack([(a <= begin) | (a >= end) | is_flat, (b <= least) | (b >= most) | (bb <= 0)])
+    stays = jnp.stack([(a <= begin) | (a >= end) | is_flat, (b <= least) | (b >= most) | is_flat_beyond])
     return Nearest(cell, a, element, b, other, stays, exists)
 
 
-def comes_through(before: Curve, after: Curve) -> Bool[Array, ""]:
+def comes_through(before: Curve, found: Nearest, after: Curve) -> Bool[Array, ""]:
     """Whether a step may lead one part of the rod through another: all places go straight from one curve to the other.
+    `found`: the nearest ones before.
 
     The places of two elements that are nearest to one another keep half of the distance at which they touch, along the
     line between them. All other parts are seen as places that represent the rod as far as halfway to the next ones:
     along the line between two of these the distance stays larger than what they represent.
     """
-    found = nearest(before)
-    here, there = side_at(before, found.element, found.s), side_at(before, found.other, found.beyond)
-    distance, normal = direction(here, there)
-    way = side_at(after, found.element, found.s).x - side_at(after, found.other, found.beyond).x
-    along = dot(normal, way)
+    places = found.element, found.other, found.s, found.beyond
+    distance, normal = direction(sides_at(before, *places))
+    here, there = jnp.unstack(sides_at(after, *places).x, axis=1)
+    along = dot(normal, here - there)
     contact_distance = before.radius[found.cell] + before.radius[found.other]
     is_pierced = jnp.any(found.exists & (along < DEEPEST * jnp.minimum(distance, contact_distance)))
     begin, of_element = _samples(before.s)
     _, _, least, most = _range(before)
     allowed = (begin[None] >= least[of_element][:, None]) & (begin[None] <= most[of_element][:, None])
     reach = jnp.max(jnp.diff(before.s)) / len(SAMPLES)
-    old, new = ([c[:, None] - c[None] for c in side_at(curve, of_element, begin).x] for curve in (before, after))
-    squares, products = (functools.reduce(jnp.add, map(jnp.multiply, old, way)) for way in (old, new))
+    each = (side_at(curve, of_element, begin).x for curve in (before, after))
+    old, new = (x[:, :, None] - x[:, None] for x in each)
+    squares, products = dot(old, old), dot(old, new)
     is_far = allowed & (squares > 4 * reach**2)
     return is_pierced | jnp.any(is_far & ((products < 0) | (products**2 < reach**2 * squares)))
 

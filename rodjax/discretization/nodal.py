@@ -32,7 +32,7 @@ from rodjax.discretization.contact_gaps import (
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Linearization
 from rodjax.discretization.friction import tangential
-from rodjax.discretization.nearest_places import comes_through, wide_cells
+from rodjax.discretization.nearest_places import comes_through, nearest, wide_cells
 from rodjax.discretization.nodal_point import Friction, Nodal, NodalChange
 from rodjax.discretization.node_contacts import (
     GAP_WEIGHT,
@@ -299,7 +299,8 @@ class NodalForm(PositionForm):
     def accepts(self, point: Any, trial: Any, is_better: Bool[Array, ""]) -> Bool[Array, ""]:
         """Only where no part of the rod goes through an obstacle, or through another part."""
         if self.scene.self_contact:
-            is_better &= ~comes_through(curve(self, point), curve(self, trial))
+            before = curve(self, point)
+            is_better &= ~comes_through(before, nearest(before), curve(self, trial))
         return stays_outside(self, point, trial, is_better)
 
     def coupled(self, point: Any, system: AnySystem) -> AnySystem:

@@ -19,9 +19,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rodjax.discretization.curve_distance import Curve, direction, perpendicular, seen_distance, side_at
+from rodjax.discretization.curve_distance import Curve, direction, perpendicular, seen_distance, sides_at
 from rodjax.discretization.nearest_places import Nearest, nearest
 from rodjax.geometry.vectors import cross, dot
 from rodjax.linalg.far_rows import FarRows
@@ -80,7 +81,7 @@ def exerted(curve: Curve, pressures: Float[Array, "n+1"]) -> Exerted:
 
 def exerted_at(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest) -> Exerted:
     gaps, a, b = moving_gaps(curve, found)
-    _, normal = direction(side_at(curve, found.element, a), side_at(curve, found.other, b))
+    _, normal = direction(sides_at(curve, found.element, found.other, a, b))
     forces = jnp.where(found.exists, pressures[:-1], 0.0)[None] * normal
     return Exerted(a, b, jnp.where(found.exists, gaps, jnp.inf), forces)
 
@@ -91,11 +92,12 @@ def on_elements(curve: Curve, pressures: Float[Array, "n+1"], found: Nearest | N
     """
     found = nearest(curve) if found is None else found
     a, b, _, forces = exerted_at(curve, pressures, found)
-    on_positions = on_tangents = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
-    for s, element, sign in ((a, found.element, 1), (b, found.other, -1)):
-        side = side_at(curve, element, s)
-        on_positions = on_positions.at[..., element].add(sign * forces[:, None] * side.of_positions[0][None])
-        on_tangents = on_tangents.at[..., element].add(sign * forces[:, None] * side.of_tangents[0][None])
+    sides, elements = sides_at(curve, found.element, found.other, a, b), jnp.stack([found.element, found.other])
+    forces = (forces[:, None] * np.array([1.0, -1.0], forces.dtype)[None, :, None])[:, None]  # [3, 1, side, k]
+    nothing = jnp.zeros((3, 2, len(curve.s) - 1), forces.dtype)
+    on_positions, on_tangents = (
+        nothing.at[..., elements].add(forces * weights[0][None]) for weights in (sides.of_positions, sides.of_tangents)
+    )
     return on_positions, on_tangents
 
 
@@ -104,16 +106,21 @@ def moving_gaps(curve: Curve, found: Nearest) -> tuple[Float[Array, "k"], Float[
     """And the places, as they move with the curve: by two steps of Newton's method, which have the first three
     derivatives.
     """
-    a, b = found.s, found.beyond
     a_stays, b_stays = found.stays
-    for _ in range(2):
-        _, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, a, b)
+
+    def stepped(places: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
+        a, b = places
+        distance, (of_a, of_b), (aa, ab, bb) = seen_distance(curve, found.cell, found.element, found.other, a, b)
         of_a, of_b = jnp.where(a_stays, 0.0, of_a), jnp.where(b_stays, 0.0, of_b)
         aa, bb = jnp.where(a_stays, 1.0, aa), jnp.where(b_stays, 1.0, bb)
         ab = jnp.where(a_stays | b_stays, 0.0, ab)
         determinant = aa * bb - ab**2
-        a, b = a - (bb * of_a - ab * of_b) / determinant, b - (aa * of_b - ab * of_a) / determinant
-    distance, _, _ = seen_distance(curve, found.cell, found.element, found.other, a, b)
+        there = a - (bb * of_a - ab * of_b) / determinant, b - (aa * of_b - ab * of_a) / determinant
+        return there, (distance, a, b)
+
+    # A loop, which is a third of what is written out: the last turn is for the distance.
+    _, each = jax.lax.scan(stepped, (found.s, found.beyond), length=3)
+    distance, a, b = (leaf[-1] for leaf in each)
     return distance - curve.radius[found.cell] - curve.radius[found.other], a, b
 
 
@@ -125,17 +132,19 @@ def gap_vectors(
     and what of the curvature is by the rotations of one node.
     """
     _, a, b = moving_gaps(curve, found)
-    here, there = side_at(curve, found.element, a), side_at(curve, found.other, b)
+    sides = sides_at(curve, found.element, found.other, a, b)
+    slope, other_slope = jnp.unstack(sides.slope, axis=1)
     nodes = jnp.stack([found.element, found.element + 1, found.other, found.other + 1])
-    d, normal = direction(here, there)
+    d, normal = direction(sides)
     tangents, axes = curve.tangents[:, nodes], curve.axes[:, :, nodes]  # [3, 4, p], [3, b, 4, p]
     turned = cross(axes, jnp.broadcast_to(tangents[:, None], axes.shape))
     signs = jnp.array([1.0, 1.0, -1.0, -1.0], d.dtype)[:, None]
     is_free = signs * curve.free[nodes]
-    on_positions = (
-        jnp.concatenate([here.of_positions, there.of_positions], axis=1) * is_free[None]
-    )  # [derivative, node, p]
-    on_tangents = jnp.concatenate([here.of_tangents, there.of_tangents], axis=1) * signs[None]
+    # [derivative, node, p], the nodes of one side after those of the other.
+    on_positions, on_tangents = (
+        jnp.swapaxes(of_sides, 1, 2).reshape(2, 4, -1) for of_sides in (sides.of_positions, sides.of_tangents)
+    )
+    on_positions, on_tangents = on_positions * is_free[None], on_tangents * signs[None]
 
     def along(v: Float[Array, "3 p"], derivative: int = 0) -> Array:
         """The rate of v . way, or of v . the slopes on both sides, by rotations and positions of the nodes."""
@@ -151,8 +160,8 @@ def gap_vectors(
         return (v - dot(v, normal)[None] * normal) / d[None]
 
     gap, slopes = along(normal), along(normal, 1)
-    by_a = along(across(here.slope)) + slopes * is_own
-    by_b = -along(across(there.slope)) + slopes * (1 - is_own)
+    by_a = along(across(slope)) + slopes * is_own
+    by_b = -along(across(other_slope)) + slopes * (1 - is_own)
     # The curvature: of the distance at fixed places, across the normal, less what the places do as they move.
     pushing = jnp.sqrt(jnp.maximum(pressures, 0.0))
     side = perpendicular(normal)

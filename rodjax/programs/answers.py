@@ -24,8 +24,9 @@ from rodjax.programs.numpy_operations import TookTooLongError
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 # So many answers get a program as NumPy code: a script that solves twice ends sooner without a compiler.
 ANSWERS_BY_NUMPY = 2
-# Compiling takes about so many seconds for a byte of the program's NumPy code; and NumPy may take this part of them.
-COMPILE_SECONDS = 2.5e-5
+# Compiling takes about so many seconds for an operation of a small program, and for one of a program of LARGE and more
+# operations; and NumPy may take this part of them.
+COMPILE_SECONDS, COMPILE_SECONDS_OF_LARGE, LARGE = 8e-4, 2e-3, 10_000
 LEAST_SECONDS = 1.0  # for the smallest program, on a busy machine
 PATIENCE = 0.5
 # The environment variable: "off" for no NumPy code.
@@ -105,7 +106,7 @@ class Program:
             if self.name is not None:
                 kept.store_code(self.name, self.code)
         if self.code is not None:
-            self.seconds_left = PATIENCE * max(COMPILE_SECONDS * len(self.code.code), LEAST_SECONDS)
+            self.seconds_left = PATIENCE * max(compile_seconds(self.code.operations), LEAST_SECONDS)
 
     def compile(self, trace: Callable[[], Any]) -> Any:
         """The executable, made in any thread."""
@@ -122,6 +123,12 @@ class Program:
             self.code = self.traced = None
             ANSWERS.forget(self)
             return self.executable
+
+
+def compile_seconds(operations: int) -> float:
+    """About as long as compiling a program takes, at the lowest level of optimisation."""
+    part = min(operations / LARGE, 1.0)
+    return operations * (COMPILE_SECONDS + part * (COMPILE_SECONDS_OF_LARGE - COMPILE_SECONDS))
 
 
 class _Answers:

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
 from rodjax.programs import numpy_operations
 from rodjax.programs.numpy_rules import ELEMENTWISE, INNER, OTHERS, of_another_package
@@ -32,11 +32,15 @@ class NotInNumpyError(Exception):
 class AnswerCode:
     """A program as NumPy code: called with the leaves of its arguments it gives what the program gives.
 
-    `kinds`: types of the leaves; `out_tree`: structure of the result; `code` and `constants` are all that it runs.
+    `kinds`: types of the leaves; `out_tree`: structure of the result; `code` and `constants` are all that it runs;
+    `operations`: how many the program has for a compiler, which puts inner ones in line.
     """
 
-    def __init__(self, code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out_tree: Any):
+    def __init__(
+        self, code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out_tree: Any, operations: int
+    ):
         self.code, self.constants, self.kinds, self.out_tree = code, constants, kinds, out_tree
+        self.operations = operations
         space = {"np": np, "op": numpy_operations, **{f"k{index}": value for index, value in enumerate(constants)}}
         exec(marshal.loads(code), space)
         self._run: Callable[..., Values] = space["main"]
@@ -54,7 +58,8 @@ class AnswerCode:
             raise NotInNumpyError(f"an operation as this version of JAX has it ({error!r})") from error
         code = compile("\n".join(writer.lines), "<rodjax program>", "exec")
         kinds = [np.dtype(kind.dtype) for kind in program.in_avals]
-        return AnswerCode(marshal.dumps(code), writer.constants, kinds, jax.tree.structure(traced.out_info))
+        tree = jax.tree.structure(traced.out_info)
+        return AnswerCode(marshal.dumps(code), writer.constants, kinds, tree, _operations(program, {}))
 
     def __call__(self, leaves: Sequence[Any], seconds: float) -> Any:
         """Raises `TookTooLong` where loops take more than so many seconds."""
@@ -65,16 +70,29 @@ class AnswerCode:
 
     def packed(self) -> tuple[Any, ...]:
         """To be written to a file."""
-        return self.code, self.constants, self.kinds, skeleton(self.out_tree)
+        return self.code, self.constants, self.kinds, skeleton(self.out_tree), self.operations
 
     @staticmethod
-    def unpacked(code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out: Any) -> "AnswerCode":
-        return AnswerCode(code, constants, kinds, jax.tree.structure(out))
+    def unpacked(
+        code: bytes, constants: Sequence[Any], kinds: Sequence[np.dtype], out: Any, operations: int
+    ) -> "AnswerCode":
+        return AnswerCode(code, constants, kinds, jax.tree.structure(out), operations)
 
 
 def skeleton(tree: Any) -> Any:
     """What has a structure, which itself cannot be written to a file."""
     return jax.tree.unflatten(tree, range(tree.num_leaves))
+
+
+def _operations(program: ClosedJaxpr | Jaxpr, known: dict[int, int]) -> int:
+    """Of a program, those of inner ones as often as they are called; `known`: of programs, by their addresses."""
+    if id(program) not in known:
+        jaxpr = program.jaxpr if isinstance(program, ClosedJaxpr) else program
+        known[id(program)] = sum(
+            sum(_operations(inner, known) for inner in jaxprs_in_params(equation.params)) or 1
+            for equation in jaxpr.eqns
+        )
+    return known[id(program)]
 
 
 class _Writer:

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.curve_distance import Curve
 from rodjax.discretization.form import Form
 from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.shape import Shape
@@ -25,12 +24,14 @@ from rodjax.solving.coupling import RodInBodies
 from rodjax.solving.loading import bearing
 from rodjax.solving.rod_contact import (
     Contacts,
+    Curves,
     Pairs,
     contacts_between,
     curves_of,
     growth_between,
     in_contact,
     loads_of,
+    stacked_curves,
 )
 from rodjax.solving.status import Status
 from rodjax.units import Units
@@ -137,14 +138,14 @@ class Assembly(eqx.Module):
         """The unit of pressures between rods."""
         return self.energy / self.length
 
-    def curves(self, forms: tuple[Form, ...], points: tuple[Any, ...]) -> dict[int, Curve]:
-        """Of the groups of which a rod may touch another one; forms with their ends where the bodies are."""
+    def curves(self, forms: tuple[Form, ...], points: tuple[Any, ...]) -> Curves:
+        """Of rods that may touch another one; forms with their ends where the bodies are."""
         origin, found = self.groups[0].units.origin[0], {}
         for number in in_contact(self.pairs):
             units, form = self.groups[number].units, forms[number]
             assert isinstance(form, NodalForm)
             found[number] = curves_of(form, points[number], units, self.length, origin)
-        return found
+        return stacked_curves(self.pairs, found)
 
     def forms(self, poses: Poses, motions: tuple[Float[Array, "k 2 6"], ...] | None = None) -> tuple[Form, ...]:
         """Of the groups, with their ends where the bodies are after these motions of their ends."""
@@ -173,8 +174,7 @@ class Assembly(eqx.Module):
     def touched(self, contacts: tuple[Contacts, ...]) -> "Assembly":
         """With the loads of contacts between rods."""
         groups = list(self.groups)
-        for number in in_contact(self.pairs):
-            loads = self.contact_loads(contacts, number)
+        for number, loads in self.contact_loads(contacts).items():
             per_force = self.force / groups[number].units.force
             per_length = self.length / groups[number].units.length
             groups[number] = groups[number].touched(
@@ -185,11 +185,14 @@ class Assembly(eqx.Module):
             )
         return dataclasses.replace(self, groups=tuple(groups))
 
-    def contact_loads(self, contacts: tuple[Contacts, ...], number: int) -> ContactLoads:
-        """Of a group, in the units of the assembly."""
-        like = self.groups[number].form.scene.contact_loads
-        assert like is not None
-        return loads_of(self.pairs, contacts, number, like)
+    def contact_loads(self, contacts: tuple[Contacts, ...]) -> dict[int, ContactLoads]:
+        """Of the groups of which a rod may touch another one, in the units of the assembly."""
+        like = {}
+        for number in in_contact(self.pairs):
+            loads = self.groups[number].form.scene.contact_loads
+            assert loads is not None
+            like[number] = loads
+        return loads_of(self.pairs, contacts, like)
 
     @property
     def count(self) -> int:

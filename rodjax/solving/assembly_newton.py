@@ -109,8 +109,8 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
     is_given_up = (status == Status.MAX_ITERATIONS) | (status == Status.LINE_SEARCH_FAILED)
-    for contacts_of_pairs in touching:
-        status = jnp.where(is_given_up & are_crowded(contacts_of_pairs), Status.CROWDED, status)
+    for pairs, contacts_of_pairs in zip(assembly.pairs, touching, strict=True):
+        status = jnp.where(is_given_up & are_crowded(pairs, contacts_of_pairs), Status.CROWDED, status)
     points_here, changes = _refined(assembly, all_here, state, balance, status)
     is_wide, has_ended, differ = _wells(assembly, state, balance, status)
     changes |= differ

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.curve_distance import Curve
 from rodjax.discretization.dead_loads import total_force
 from rodjax.discretization.form import Form, Linearization
 from rodjax.discretization.nodal import NodalForm
@@ -23,7 +22,7 @@ from rodjax.solving.condensation import BodyMotions, EliminatedRods
 from rodjax.solving.coupling import Coupling, EndContacts, RodInBodies, end_contact_energy, end_contact_rate
 from rodjax.solving.harness_contact import ContactStep
 from rodjax.solving.newton import CLOSURE_WEIGHT, ENERGY_ROUNDING, MAX_HALVINGS, SUFFICIENT_DECREASE, Newton
-from rodjax.solving.rod_contact import BetweenStep, Contacts, contact_energy, passes
+from rodjax.solving.rod_contact import BetweenStep, Contacts, Curves, contact_energy, passes
 
 
 class RodStep(NamedTuple):
@@ -161,7 +160,7 @@ def searched(
 ) -> Trial:
     """The part of a step that is taken: the first of ever shorter ones that lowers the merit, or that is not judged."""
 
-    def curves_at(part: Float[Array, ""], points: tuple[Any, ...]) -> dict[int, Curve]:
+    def curves_at(part: Float[Array, ""], points: tuple[Any, ...]) -> Curves:
         return assembly.curves(assembly.forms(state.poses, tuple(part * ends for ends in steps.ends)), points)
 
     def merit_at(part: Float[Array, ""]) -> tuple[Float[Array, ""], tuple[Any, ...]]:

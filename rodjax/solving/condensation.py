@@ -251,7 +251,7 @@ def with_contacts(
     least, dtype = jnp.asarray(NEUTRAL, force.dtype), force.dtype
     may_push = jnp.array(find == "minimum") & (state.pushes < MAX_PUSHES)
     groups, shifts, least_shifts, is_pushed = [], [], [], rods.is_pushed
-    together, chosen = between(touching) if touching else (None, ())
+    together, chosen = between(assembly.pairs, touching) if touching else (None, ())
     of_pairs = in_contact(assembly.pairs)
     for number, (group, here, last) in enumerate(zip(assembly.groups, all_here, state.shifts, strict=True)):
         if here.at_ends is None:

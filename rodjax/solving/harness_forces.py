@@ -13,7 +13,7 @@ from rodjax.model.scene import has_contacts
 from rodjax.solving.assembly import Poses
 from rodjax.solving.options import Options
 from rodjax.solving.result import Equilibrium
-from rodjax.solving.rod_contact import Members, in_contact, pairs_of
+from rodjax.solving.rod_contact import Members, groups_in_contact
 
 
 def stacked(parts: list[Any]) -> Any:
@@ -76,7 +76,7 @@ def no_pressures(harness: Harness, members: Members) -> Float[Array, "c"]:
 
 def split_pressures(harness: Harness, members: Members, pressures: Float[Array, "c"]) -> list[Array | None]:
     """Of each group (rods, obstacles, ends); `None` of rods that touch nothing."""
-    found, first, touched = [], 0, in_contact(pairs_of(harness.contact, members))
+    found, first, touched = [], 0, groups_in_contact(harness.contact, members)
     for group, (count, numbers) in enumerate(zip(_of_obstacles(harness, members), members, strict=True)):
         size = 2 * count * len(numbers)
         of_group = pressures[first : first + size].reshape(len(numbers), count, 2)
@@ -90,8 +90,8 @@ def no_rod_pressures(
     harness: Harness, members: Members, options: tuple[Options, ...]
 ) -> tuple[Float[Array, "c"], Bool[Array, "c"]]:
     """Of contacts between rods, of each kind of pairs by pair and element of its first rod; wells, all wide."""
-    pairs = pairs_of(harness.contact, members)
-    count = sum(len(each.places) * options[each.groups[0]].segments for each in pairs)
+    counts = {number: option.segments for numbers, option in zip(members, options, strict=True) for number in numbers}
+    count = sum(counts[first] for first, _ in harness.contact)
     return leaf(np.zeros(count, harness.scenes[0].rod.length.dtype)), leaf(np.ones(count, bool))
 
 

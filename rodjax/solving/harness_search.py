@@ -24,7 +24,7 @@ from rodjax.solving.harness_rods import touchable
 from rodjax.solving.newton import Newton
 from rodjax.solving.options import Options
 from rodjax.solving.result import Equilibrium, build_result
-from rodjax.solving.rod_contact import Members, in_contact, pairs_of, split_by_pairs
+from rodjax.solving.rod_contact import Members, pairs_of, split_by_pairs
 from rodjax.solving.search import MOST_MESHES, Search, in_units_of, on_mesh_of, on_one_side, sliding_search
 from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.status import Outcome, Status, is_converged
@@ -62,9 +62,9 @@ def find_harness(
         points.append(searches.point)
         all_searches.append((searches, states))
         at_ends.append(None if pressures is None else pressures / searches.units.force[:, None, None])
-    bodies, pairs = Bodies.of(harness), pairs_of(harness.contact, members)
-    assembly = Assembly.of(tuple(groups), bodies, pairs)
     counts = [option.segments for option in options]
+    bodies, pairs = Bodies.of(harness), pairs_of(harness.contact, members, counts)
+    assembly = Assembly.of(tuple(groups), bodies, pairs)
     between = split_by_pairs(pairs, counts, rod_pressures / assembly.force)
     is_wide = split_by_pairs(pairs, counts, wide_wells)
     solver = options[0].solver
@@ -145,14 +145,14 @@ def harness_equilibrium(
     all_begun: tuple[tuple[Search | None, SolverState | None], ...],
 ) -> HarnessEquilibrium:
     """What a search found, whose rods are those of `assembly`; `all_begun`: where it began, of rods with obstacles."""
-    groups, bodies, pairs = assembly.groups, assembly.bodies, assembly.pairs
-    loads = assembly.contacts(end)
+    groups, bodies = assembly.groups, assembly.bodies
+    loads = assembly.contact_loads(assembly.contacts(end))
     is_stable = is_converged(end.status) & (end.negative == 0) & harness.has_potential
     rods = []
     for number, (rod, numbers, begun) in enumerate(zip(groups, members, all_begun, strict=True)):
         now = stacked([clamped(harness.scenes[k], harness, *end.poses) for k in numbers])
-        if number in in_contact(pairs):
-            now = under_contact(now, assembly.contact_loads(loads, number).times(assembly.force, assembly.energy))
+        if number in loads:
+            now = under_contact(now, loads[number].times(assembly.force, assembly.energy))
         rods.append(_equilibria(now, rod, begun, end, number, is_stable, strain_limit))
     pressures = [
         (pressures * rod.units.force[:, None, None]).reshape(-1)

@@ -1,4 +1,4 @@
-"""Contact between the rods of a harness: pairs of rods, stacked by the groups to which both belong.
+"""Contact between the rods of a harness: pairs of rods, stacked by the meshes of both.
 
 Lengths are those of the assembly and forces its energy by its length. The pressure of each contact is a number that all
 have in common; what the pressures apply to a rod are loads of its scene (`model.loads.ContactLoads`), so that a rod by
@@ -37,7 +37,8 @@ from rodjax.solving.coupling import Coupling
 
 # The numbers of the rods of each group.
 Members = tuple[tuple[int, ...], ...]
-# Of all contacts between rods of two groups, at most so many are sought in the model of a step.
+# Of all contacts between rods of two groups, at most so many are sought in the model of a step; of those of several
+# groups on the same meshes as many times that.
 MOST_BETWEEN = 64
 # Compliance of contacts in the model of a step [L^3/EI]. Where the cells of two elements overlap, both may have a
 # contact at one place; what one of them lacks to touch is below 1e-8 L.
@@ -45,10 +46,15 @@ CONTACT_COMPLIANCE = 1e-9
 
 
 class Pairs(NamedTuple):
-    """Rods that may touch, of two groups: the numbers of these, and the place of both rods of each pair in them."""
+    """Rods that may touch. Of both sides the numbers of the groups with as many elements, whose rods are stacked one
+    after another, where those of each group begin in the stack, and of each pair the places of both rods there; `most`:
+    how many contacts of all pairs are sought in the model of a step.
+    """
 
-    groups: tuple[int, int]
+    groups: tuple[tuple[int, ...], tuple[int, ...]]
+    begins: tuple[tuple[int, ...], tuple[int, ...]]
     places: tuple[tuple[int, int], ...]
+    most: int
 
     @property
     def first(self) -> np.ndarray:
@@ -58,20 +64,50 @@ class Pairs(NamedTuple):
     def second(self) -> np.ndarray:
         return np.array([place for _, place in self.places])
 
+    @property
+    def sides(self) -> tuple[tuple[tuple[int, ...], tuple[int, ...], np.ndarray], ...]:
+        """Groups, where these begin, and places."""
+        return tuple(zip(self.groups, self.begins, (self.first, self.second), strict=True))
 
-def pairs_of(contact: tuple[tuple[int, int], ...], members: Members) -> tuple[Pairs, ...]:
-    """Of pairs of numbers of rods."""
+
+# Of rods that may touch, by the groups of `Pairs` in which they are stacked.
+Curves = dict[tuple[int, ...], Curve]
+
+
+def pairs_of(contact: tuple[tuple[int, int], ...], members: Members, counts: Sequence[int]) -> tuple[Pairs, ...]:
+    """Of pairs of numbers of rods, by the groups of both; `counts`: of elements of the rods of each group. Pairs that
+    follow one another on the same meshes are of one kind, so that a harness of many structures has one program for all.
+    """
     where = {number: (group, place) for group, numbers in enumerate(members) for place, number in enumerate(numbers)}
-    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    by_groups: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for pair in contact:
         (first, place), (second, other) = (where[number] for number in pair)
-        found.setdefault((first, second), []).append((place, other))
-    return tuple(Pairs(groups, tuple(places)) for groups, places in found.items())
+        by_groups.setdefault((first, second), []).append((place, other))
+    touching = groups_in_contact(contact, members)
+    stacks = {group: tuple(one for one in touching if counts[one] == counts[group]) for group in touching}
+    begins = {group: sum(len(members[one]) for one in stacks[group] if one < group) for group in touching}
+    found: list[Pairs] = []
+    for (first, second), places in by_groups.items():
+        groups = stacks[first], stacks[second]
+        stacked = tuple((begins[first] + place, begins[second] + other) for place, other in places)
+        if found and found[-1].groups == groups:
+            last = found.pop()
+            found.append(last._replace(places=last.places + stacked, most=last.most + MOST_BETWEEN))
+        else:
+            of_groups = tuple(begins[group] for group in groups[0]), tuple(begins[group] for group in groups[1])
+            found.append(Pairs(groups, of_groups, stacked, MOST_BETWEEN))
+    return tuple(found)
+
+
+def groups_in_contact(contact: tuple[tuple[int, int], ...], members: Members) -> list[int]:
+    """The numbers of the groups of which a rod may touch another one."""
+    touching = {number for pair in contact for number in pair}
+    return [group for group, numbers in enumerate(members) if touching.intersection(numbers)]
 
 
 def in_contact(pairs: tuple[Pairs, ...]) -> list[int]:
-    """The numbers of the groups of which a rod may touch another one."""
-    return sorted({group for between in pairs for group in between.groups})
+    """The same, of pairs."""
+    return sorted({group for between in pairs for groups in between.groups for group in groups})
 
 
 def split_by_pairs(
@@ -82,7 +118,7 @@ def split_by_pairs(
     """
     found, first = [], 0
     for each in pairs:
-        shape = len(each.places), counts[each.groups[0]]
+        shape = len(each.places), counts[each.groups[0][0]]
         found.append(of_contacts[first : first + shape[0] * shape[1]].reshape(shape))
         first += shape[0] * shape[1]
     return tuple(found)
@@ -203,22 +239,30 @@ def curves_of(forms: NodalForm, points: Any, units: Any, length: Float[Array, ""
     return jax.vmap(of_rod)(forms, points, units)
 
 
-def joined_curves(pairs: Pairs, curves: dict[int, Curve]) -> Curve:
+def stacked_curves(pairs: tuple[Pairs, ...], curves: dict[int, Curve]) -> Curves:
+    """Of the curves of each group."""
+    stacks = {groups for each in pairs for groups in each.groups}
+    return {
+        groups: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(curves[group] for group in groups))
+        for groups in sorted(stacks)
+    }
+
+
+def joined_curves(pairs: Pairs, curves: Curves) -> Curve:
     first, second = (
-        jax.tree.map(lambda leaf, places=places: leaf[places], curves[group])
-        for group, places in zip(pairs.groups, (pairs.first, pairs.second), strict=True)
+        jax.tree.map(lambda leaf, places=places: leaf[places], curves[groups]) for groups, _, places in pairs.sides
     )
     return jax.vmap(joined)(first, second)
 
 
-def growth_between(pairs: Pairs, curves: dict[int, Curve]) -> Float[Array, "p n"]:
+def growth_between(pairs: Pairs, curves: Curves) -> Float[Array, "p n"]:
     """By which it is told which elements are to have wide wells."""
     elements = curves[pairs.groups[0]].radius.shape[1]
     return jax.vmap(lambda curve: growth_of_pair(curve, elements))(joined_curves(pairs, curves))
 
 
 def contacts_between(
-    pairs: Pairs, curves: dict[int, Curve], pressures: Float[Array, "p n"], is_wide: Bool[Array, "p n"]
+    pairs: Pairs, curves: Curves, pressures: Float[Array, "p n"], is_wide: Bool[Array, "p n"]
 ) -> Contacts:
     elements = pressures.shape[1]
 
@@ -231,42 +275,49 @@ def contacts_between(
     return Contacts(both, found, gaps, pressures, is_wide, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
 
 
-def contact_energy(
-    pairs: Pairs, curves: dict[int, Curve], here: Contacts, change: Float[Array, "p n"]
-) -> Float[Array, ""]:
+def contact_energy(pairs: Pairs, curves: Curves, here: Contacts, change: Float[Array, "p n"]) -> Float[Array, ""]:
     """As of `NodalForm.contact_energy`, where a step leads that begins here and changes the pressures."""
     there = contacts_between(pairs, curves, here.pressures, here.is_wide)
     pushing = here.pressures + change - (there.gaps + here.relaxed) / MERIT_COMPLIANCE
     return MERIT_COMPLIANCE / 2 * jnp.sum(jnp.where(pushing > 0, pushing, 0.0) ** 2)
 
 
-def are_crowded(contacts: Contacts) -> Bool[Array, ""]:
+def are_crowded(pairs: Pairs, contacts: Contacts) -> Bool[Array, ""]:
     """Whether more elements touch than are sought in the model of a step."""
     count = jnp.sum((contacts.pressures > 0) | (contacts.gaps < 0), axis=1)
-    return jnp.any(count > MOST_OF_PAIR) | (jnp.sum(count) > MOST_BETWEEN)
+    return jnp.any(count > MOST_OF_PAIR) | (jnp.sum(count) > pairs.most)
 
 
-def passes(pairs: Pairs, before: Contacts, curves: dict[int, Curve]) -> Bool[Array, ""]:
+def passes(pairs: Pairs, before: Contacts, curves: Curves) -> Bool[Array, ""]:
     """Whether a step leads no rod through another one."""
-    return ~jnp.any(jax.vmap(comes_through)(before.curves, joined_curves(pairs, curves)))
+    return ~jnp.any(jax.vmap(comes_through)(before.curves, before.found, joined_curves(pairs, curves)))
 
 
 def loads_of(
-    all_pairs: tuple[Pairs, ...], all_contacts: tuple[Contacts, ...], group: int, like: ContactLoads
-) -> ContactLoads:
-    """What contacts apply to the rods of a group."""
-    on_positions, on_tangents = jnp.zeros_like(like.on_positions), jnp.zeros_like(like.on_tangents)
+    all_pairs: tuple[Pairs, ...], all_contacts: tuple[Contacts, ...], like: dict[int, ContactLoads]
+) -> dict[int, ContactLoads]:
+    """What contacts apply to the rods of each group."""
+    stacks = {groups for pairs in all_pairs for groups in pairs.groups}
+    totals = {
+        groups: tuple(
+            jnp.concatenate([jnp.zeros_like(leaf) for leaf in leaves])
+            for leaves in zip(*((like[group].on_positions, like[group].on_tangents) for group in groups), strict=True)
+        )
+        for groups in sorted(stacks)
+    }
+    begins = {}
     for pairs, contacts in zip(all_pairs, all_contacts, strict=True):
-        if group not in pairs.groups:
-            continue
         both = jax.vmap(loads_between)(contacts.curves, contacts.found, contacts.pressures)
-        for of_rods, places, side in zip(both, (pairs.first, pairs.second), pairs.groups, strict=True):
-            if side == group:
-                on_positions, on_tangents = (
-                    on_positions.at[places].add(of_rods[0]),
-                    on_tangents.at[places].add(of_rods[1]),
-                )
-    return ContactLoads(on_positions, on_tangents)
+        for (groups, of_groups, places), of_rods in zip(pairs.sides, both, strict=True):
+            totals[groups] = tuple(
+                total.at[places].add(part) for total, part in zip(totals[groups], of_rods, strict=True)
+            )
+            begins |= {group: (groups, begin) for group, begin in zip(groups, of_groups, strict=True)}
+    found = {}
+    for group, (groups, begin) in begins.items():
+        here = slice(begin, begin + len(like[group].on_positions))
+        found[group] = ContactLoads(*(total[here] for total in totals[groups]))
+    return found
 
 
 class _Chosen(NamedTuple):
@@ -277,15 +328,15 @@ class _Chosen(NamedTuple):
     nodes: Int[Array, "4 c"]
 
 
-def between(all_contacts: tuple[Contacts, ...]) -> tuple[Between, tuple[_Chosen, ...]]:
+def between(all_pairs: tuple[Pairs, ...], all_contacts: tuple[Contacts, ...]) -> tuple[Between, tuple[_Chosen, ...]]:
     """Of all pairs those contacts that are nearest to touching."""
     parts, all_chosen = [], []
-    for contacts in all_contacts:
+    for pairs, contacts in zip(all_pairs, all_contacts, strict=True):
         found = jax.vmap(pair_contacts)(contacts.curves, contacts.found, contacts.pressures)
         count, (_, elements) = found.chosen.shape[1], contacts.gaps.shape
         at = (jnp.arange(len(found.chosen))[:, None] * elements + found.chosen).reshape(-1)
         gaps, pressures = (contacts.gaps + contacts.relaxed).reshape(-1)[at], contacts.pressures.reshape(-1)[at]
-        pick = jnp.argsort(jnp.where(pressures > 0, -1.0, gaps))[: min(len(at), MOST_BETWEEN)]
+        pick = jnp.argsort(jnp.where(pressures > 0, -1.0, gaps))[: min(len(at), pairs.most)]
         vectors = jnp.moveaxis(found.vectors, 0, 3).reshape(5, 6, 4, -1)[..., pick]
         nodes = jnp.moveaxis(found.nodes, 0, 1).reshape(4, -1)[:, pick]
         all_chosen.append(_Chosen(pick // count, vectors, nodes))
@@ -314,13 +365,14 @@ def columns_of(
     for pairs, chosen in zip(all_pairs, all_chosen, strict=True):
         numbers = first + np.arange(chosen.nodes.shape[1])
         first += len(numbers)
-        for side, places, of_side in zip(
-            pairs.groups, (pairs.first, pairs.second), (slice(0, 2), slice(2, 4)), strict=True
-        ):
-            if side == group:
-                rods, at = jnp.asarray(places)[chosen.pair], chosen.nodes[of_side]
-                vectors = chosen.vectors[:, :, of_side].transpose(2, 3, 0, 1)
-                by_node = by_node.at[rods[None], :, numbers[None], :, at].add(vectors)
+        for (groups, begins, places), of_side in zip(pairs.sides, (slice(0, 2), slice(2, 4)), strict=True):
+            if group not in groups:
+                continue
+            # Rods of other groups are dropped: they have no place here.
+            rods = jnp.asarray(places - begins[groups.index(group)])[chosen.pair]
+            rods, at = jnp.where((rods >= 0) & (rods < k), rods, k), chosen.nodes[of_side]
+            vectors = chosen.vectors[:, :, of_side].transpose(2, 3, 0, 1)
+            by_node = by_node.at[rods[None], :, numbers[None], :, at].add(vectors)
     by_node = by_node.reshape(k, 5 * count, 6, nodes) / shares[:, None, None, None]
     by_rotation = by_node[:, :, :b]
     by_position = lengths[:, None, None, None] * by_node[:, :, 3:]

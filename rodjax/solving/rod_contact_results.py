@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.discretization.curve_distance import Curve, direction, seen_distance, side_at, with_wells
+from rodjax.discretization.curve_distance import Curve, direction, seen_distance, side_at, sides_at, with_wells
 from rodjax.discretization.nearest_places import Nearest
 from rodjax.discretization.rod_pairs import NARROW_OF_PAIRS, found_between, joined, with_pair_wells
 from rodjax.discretization.self_contact import exerted_at, moving_gaps
@@ -23,7 +23,16 @@ from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, under_contact
 from rodjax.programs.compilation import compiled
 from rodjax.solving.result import Equilibrium
-from rodjax.solving.rod_contact import Members, Pairs, in_contact, joined_curves, pairs_of, split_by_pairs
+from rodjax.solving.rod_contact import (
+    Curves,
+    Members,
+    Pairs,
+    in_contact,
+    joined_curves,
+    pairs_of,
+    split_by_pairs,
+    stacked_curves,
+)
 
 # Of the contacts between rods of two groups, at most so many that push have derivatives; of more they are NaN.
 MOST_TOUCHING = 32
@@ -44,8 +53,8 @@ class RodContacts(eqx.Module):
     forces: Float[Array, "... n 3"]
 
 
-def curves_of_results(groups: tuple[Equilibrium, ...], which: list[int], length: Any) -> dict[int, Curve]:
-    """Of some groups, in units of a length."""
+def curves_of_results(groups: tuple[Equilibrium, ...], pairs: tuple[Pairs, ...], length: Any) -> Curves:
+    """Of rods that may touch, in units of a length."""
 
     def of_rod(rod: Equilibrium) -> Curve:
         begin, end = rod.s[:-1], rod.s[1:]
@@ -57,7 +66,7 @@ def curves_of_results(groups: tuple[Equilibrium, ...], which: list[int], length:
             rod.s / length, rod.nodes / length, rod.tangents.T, nowhere, jnp.ones_like(rod.s), middles / length
         )
 
-    return {number: jax.vmap(of_rod)(groups[number]) for number in which}
+    return stacked_curves(pairs, {number: jax.vmap(of_rod)(groups[number]) for number in in_contact(pairs)})
 
 
 def mean_length(groups: tuple[Equilibrium, ...]) -> Float[Array, ""]:
@@ -73,9 +82,8 @@ def rod_contacts(
     members: Members,
 ) -> dict[tuple[str, str], RodContacts]:
     """By the names of both rods, those of pairs in the order of the harness."""
-    mapped = functools.partial(
-        _rod_contacts, names=harness.names, pairs=pairs_of(harness.contact, members), members=members
-    )
+    pairs = pairs_of(harness.contact, members, _counts(groups))
+    mapped = functools.partial(_rod_contacts, names=harness.names, pairs=pairs, members=members)
     for _ in range(rod_pressures.ndim - 1):
         mapped = jax.vmap(mapped)
     found = mapped(groups, rod_pressures, wide_wells)
@@ -91,9 +99,8 @@ def _rod_contacts(
     members: Members,
 ) -> dict[tuple[str, str], RodContacts]:
     length = mean_length(groups)
-    curves, found = curves_of_results(groups, in_contact(pairs), length), {}
-    counts = [group.s.shape[1] - 1 for group in groups]
-    split = (split_by_pairs(pairs, counts, each) for each in (rod_pressures, wide_wells))
+    curves, found = curves_of_results(groups, pairs, length), {}
+    split = (split_by_pairs(pairs, _counts(groups), each) for each in (rod_pressures, wide_wells))
     for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements = pressures.shape[1]
 
@@ -106,14 +113,19 @@ def _rod_contacts(
             )
 
         stacked = jax.vmap(of_pair)(joined_curves(each, curves), pressures, is_wide)
+        named = [[names[number] for group in groups for number in members[group]] for groups in each.groups]
         for k, (first, second) in enumerate(each.places):
-            numbers = members[each.groups[0]][first], members[each.groups[1]][second]
-            found[names[numbers[0]], names[numbers[1]]] = jax.tree.map(lambda leaf, k=k: leaf[k], stacked)
+            found[named[0][first], named[1][second]] = jax.tree.map(lambda leaf, k=k: leaf[k], stacked)
     return found
 
 
+def _counts(groups: tuple[Equilibrium, ...]) -> list[int]:
+    """Of the elements of rods of each group, stacked once and more."""
+    return [group.s.shape[-1] - 1 for group in groups]
+
+
 class _Touch(NamedTuple):
-    """Of t contacts between rods of two groups: the place of both rods in their groups, their elements there, and the
+    """Of t contacts between rods of one kind of pairs: the place of both rods in these, their elements there, and the
     element of the first one whose contact it is, and whether that has a wide well; whether the place within the element
     stays; two directions across the force; whether it is there; and its number among all pressures.
     """
@@ -158,15 +170,17 @@ class TouchingRods(eqx.Module):
         mesh, lengths = self.meshes[group], scenes.rod.length
         on_positions = on_tangents = jnp.zeros((len(lengths), 3, 2, mesh.shape[1] - 1), mesh.dtype)
         for pairs, touch, (forces, places) in zip(self.pairs, self.touches, self._split(values), strict=True):
-            for side, (number, sign) in enumerate(zip(pairs.groups, (1.0, -1.0), strict=True)):
-                if number != group:
+            for side, ((groups, begins, _), sign) in enumerate(zip(pairs.sides, (1.0, -1.0), strict=True)):
+                if group not in groups:
                     continue
-                rods, elements = touch.rods[side], touch.elements[side]
+                rods, elements = touch.rods[side] - begins[groups.index(group)], touch.elements[side]
+                is_here = touch.exists & (rods >= 0) & (rods < len(lengths))
+                rods = jnp.clip(rods, 0, len(lengths) - 1)
                 # Of a curve of no place, as the weights are.
                 nowhere = jnp.zeros((len(rods), mesh.shape[1], 3), mesh.dtype)
                 along = lengths[rods][:, None] * mesh[rods]
                 weights = jax.vmap(_at)(along, nowhere, nowhere, elements, lengths[rods] * places[side])
-                pushes = sign * jnp.where(touch.exists[None], forces, 0.0).T[..., None]
+                pushes = sign * jnp.where(is_here[None], forces, 0.0).T[..., None]
                 at = rods, slice(None), slice(None), elements
                 on_positions = on_positions.at[at].add(pushes * weights.of_positions[:, 0, :, 0][:, None])
                 on_tangents = on_tangents.at[at].add(pushes * weights.of_tangents[:, 0, :, 0][:, None])
@@ -174,11 +188,11 @@ class TouchingRods(eqx.Module):
 
     def lacking(self, rods: list[Equilibrium], values: Float[Array, "5t"]) -> Float[Array, "5t"]:
         """What is to vanish; of contacts that are not there, how far they are from what they were."""
-        curves = curves_of_results(tuple(rods), in_contact(self.pairs), self.length)
+        curves = curves_of_results(tuple(rods), self.pairs, self.length)
         found = []
         parts = zip(self.pairs, self.touches, self._split(values), self._split(self.values), strict=True)
         for pairs, touch, (forces, places), (before, begin) in parts:
-            joined_pairs = [curves[number] for number in pairs.groups]
+            joined_pairs = [curves[groups] for groups in pairs.groups]
 
             def of_contact(
                 rods, elements, cell, is_wide, stays, across, force, place, begin, joined_pairs=joined_pairs
@@ -190,7 +204,7 @@ class TouchingRods(eqx.Module):
                 here, there = elements[:1], count + elements[1:]
                 a, b = (first.s[-1] * place[:1]), curve.s[count] + second.s[-1] * place[1:]
                 distance, slopes, _ = seen_distance(curve, cell[None], here, there, a, b)
-                _, normal = direction(side_at(curve, here, a), side_at(curve, there, b))
+                _, normal = direction(sides_at(curve, here, there, a, b))
                 force, normal = force / self.force, normal[:, 0]
                 gap = distance - curve.radius[cell[None]] - curve.radius[there]
                 slopes = jnp.where(stays, place - begin, jnp.concatenate(slopes))
@@ -226,15 +240,14 @@ def touching_rods(
     members: Members,
 ) -> TouchingRods | None:
     """At a result; `None` of a harness whose rods do not touch. `values` are NaN where too many push."""
-    pairs = pairs_of(harness.contact, members)
+    pairs = pairs_of(harness.contact, members, _counts(groups))
     if not pairs:
         return None
     length = mean_length(groups)
-    curves = curves_of_results(groups, in_contact(pairs), length)
+    curves = curves_of_results(groups, pairs, length)
     force = jnp.maximum(jnp.max(rod_pressures), jnp.finfo(length.dtype).tiny)
     touches, values, first = [], [], 0
-    counts = [group.s.shape[1] - 1 for group in groups]
-    split = (split_by_pairs(pairs, counts, each) for each in (rod_pressures, wide_wells))
+    split = (split_by_pairs(pairs, _counts(groups), each) for each in (rod_pressures, wide_wells))
     for each, pressures, is_wide in zip(pairs, *split, strict=True):
         elements, both = pressures.shape[1], joined_curves(each, curves)
 
@@ -242,7 +255,7 @@ def touching_rods(
             curve = with_pair_wells(curve, is_wide)
             found = found_between(curve, elements)
             _, a, b = moving_gaps(curve, found)
-            _, normal = direction(side_at(curve, found.element, a), side_at(curve, found.other, b))
+            _, normal = direction(sides_at(curve, found.element, found.other, a, b))
             ends = curve.s[elements], curve.s[-1] - curve.s[elements + 1]
             return found, a / ends[0], (b - curve.s[elements + 1]) / ends[1], normal
 

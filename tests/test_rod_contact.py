@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 import rodjax
 from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, Plane, PointForce, Rod, Scene, plot
 from rodjax.analysis.sensitivity import moved
+from rodjax.solving.rod_contact import pairs_of
 from rodjax.solving.rod_contact_results import touching_rods
 
 RADIUS, LENGTH, YOUNGS_MODULUS = 0.01, 1.0, 1e7
@@ -343,3 +344,47 @@ def test_numbers_of_a_harness_without_joints_change():
     changed = moved(crossing(0.016), {"cables.upper.rod.length": jnp.asarray(0.1)})
     assert float(changed["upper"].rod.length) == pytest.approx(LENGTH + 0.1, rel=1e-15)
     assert float(changed["lower"].rod.length) == LENGTH
+
+
+# --- rods of several structures --------------------------------------------------------------------------------------
+
+
+def test_pairs_on_one_mesh_are_of_one_kind():
+    """In the order in which their contacts stand in a result: by the groups of both rods, then as in the harness."""
+    contact = ((0, 1), (0, 2), (0, 3), (1, 3), (2, 3))
+    members, counts = ((0, 2), (1,), (3,)), (8, 8, 16)
+    kinds = pairs_of(contact, members, counts)
+    found = []
+    for kind in kinds:
+        stacks = [[number for group in groups for number in members[group]] for groups in kind.groups]
+        assert [[counts[group] for group in groups] for groups in kind.groups] in ([[8, 8], [8, 8]], [[8, 8], [16]])
+        found += [(stacks[0][first], stacks[1][second]) for first, second in kind.places]
+    assert found == [(0, 1), (0, 2), (0, 3), (2, 3), (1, 3)]
+    assert len(kinds) == 2
+
+
+@pytest.mark.slow
+def test_what_a_structure_is_changes_nothing_for_contacts():
+    """Two beams below a third one, one of them with a force of 0 N, which makes it another structure."""
+
+    def below(at: float, **more) -> Scene:
+        scene = beam((0, 1, 0), ACROSS, 0.008 - RADIUS, rod())
+        start, end = (Clamp(support.position + jnp.array([at, 0, 0]), ACROSS) for support in (scene.start, scene.end))
+        return Scene(scene.rod, start, end, **more)
+
+    upper = beam((1, 0, 0), ALONG, RADIUS - 0.008, rod())
+    alike = Harness({"upper": upper, "left": below(-0.2), "right": below(0.25)}, contact=True)
+    nothing = [PointForce(LENGTH / 2, (0, 0, 0))]
+    apart = Harness({"upper": upper, "left": below(-0.2), "right": below(0.25, point_forces=nothing)}, contact=True)
+    expected, found = (rodjax.solve(harness, segments=8, solver=TIGHT) for harness in (alike, apart))
+    assert expected.converged
+    assert found.converged
+    assert (len(expected.groups), len(found.groups)) == (1, 2)
+    for name in alike.names:
+        # Where the residual is 1e-11, by the stiffness of a beam.
+        np.testing.assert_allclose(found[name].nodes, expected[name].nodes, atol=1e-11)
+    for pair, contacts in expected.rod_contacts.items():
+        np.testing.assert_allclose(found.rod_contacts[pair].forces, contacts.forces, atol=1e-9)
+    for name in ("left", "right"):
+        assert float(found.rod_contacts["upper", name].forces[:, 2].sum()) > 0.1
+    assert not np.any(found.rod_contacts["left", "right"].forces)

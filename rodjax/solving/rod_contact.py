@@ -47,14 +47,19 @@ CONTACT_COMPLIANCE = 1e-9
 
 class Pairs(NamedTuple):
     """Rods that may touch. Of both sides the numbers of the groups with as many elements, whose rods are stacked one
-    after another, where those of each group begin in the stack, and of each pair the places of both rods there; `most`:
-    how many contacts of all pairs are sought in the model of a step.
+    after another, where those of each group begin in the stack, and of each pair the places of both rods there;
+    `kinds`: of how many two groups they are.
     """
 
     groups: tuple[tuple[int, ...], tuple[int, ...]]
     begins: tuple[tuple[int, ...], tuple[int, ...]]
     places: tuple[tuple[int, int], ...]
-    most: int
+    kinds: int
+
+    @property
+    def most(self) -> int:
+        """How many contacts of all pairs are sought in the model of a step."""
+        return self.kinds * MOST_BETWEEN
 
     @property
     def first(self) -> np.ndarray:
@@ -92,10 +97,10 @@ def pairs_of(contact: tuple[tuple[int, int], ...], members: Members, counts: Seq
         stacked = tuple((begins[first] + place, begins[second] + other) for place, other in places)
         if found and found[-1].groups == groups:
             last = found.pop()
-            found.append(last._replace(places=last.places + stacked, most=last.most + MOST_BETWEEN))
+            found.append(last._replace(places=last.places + stacked, kinds=last.kinds + 1))
         else:
             of_groups = tuple(begins[group] for group in groups[0]), tuple(begins[group] for group in groups[1])
-            found.append(Pairs(groups, of_groups, stacked, MOST_BETWEEN))
+            found.append(Pairs(groups, of_groups, stacked, 1))
     return tuple(found)
 
 

@@ -34,7 +34,8 @@ from rodjax.solving.rod_contact import (
     stacked_curves,
 )
 
-# Of the contacts between rods of two groups, at most so many that push have derivatives; of more they are NaN.
+# Of the contacts between rods of two groups, at most so many that push have derivatives; of more they are NaN. Of those
+# of several groups on the same meshes as many times that.
 MOST_TOUCHING = 32
 
 
@@ -260,8 +261,9 @@ def touching_rods(
             return found, a / ends[0], (b - curve.s[elements + 1]) / ends[1], normal
 
         found, a, b, normal = jax.vmap(of_pair)(both, is_wide)
-        pick = jnp.argsort(-pressures.reshape(-1))[:MOST_TOUCHING]
-        force = jnp.where(jnp.sum(pressures > 0) > MOST_TOUCHING, jnp.nan, force)
+        most = each.kinds * MOST_TOUCHING
+        pick = jnp.argsort(-pressures.reshape(-1))[:most]
+        force = jnp.where(jnp.sum(pressures > 0) > most, jnp.nan, force)
         pair, cell = pick // elements, pick % elements
         rods = jnp.stack([jnp.asarray(each.first)[pair], jnp.asarray(each.second)[pair]])
         normal = normal[pair, :, cell].T

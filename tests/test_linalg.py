@@ -11,7 +11,7 @@ from numpy_programs import by_numpy
 
 import rodjax as rj
 from rodjax.linalg.bordered import BorderedFactors, Vectors
-from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain import ChainSystem, Elimination
 from rodjax.linalg.chain_border import Border
 from rodjax.linalg.chain_factors import ChainFactors
 from rodjax.linalg.chain_rows import ContactRows, InnerRows, LoadRows
@@ -315,12 +315,13 @@ def random_loads(elements: int) -> LoadRows:
 
 
 @pytest.mark.parametrize("elements", [4, 7])
-@pytest.mark.parametrize("order", [{}, {"is_backward": True}, {"is_loose": True}], ids=lambda order: "".join(order))
+@pytest.mark.parametrize("elimination", Elimination, ids=lambda elimination: elimination.name)
 @pytest.mark.parametrize("loads", [None, random_loads])
 @pytest.mark.parametrize("others", [None, with_inner_contacts, with_far_contacts])
-def test_chains_are_solved_and_their_signs_counted(elements, order, loads, others):
+def test_chains_are_solved_and_their_signs_counted(elements, elimination, loads, others):
     """Also with loads that have no potential, without symmetry, and with contacts within and between elements."""
-    system = dataclasses.replace(random_chain(elements), loads=loads and loads(elements), **order)
+    random = random_chain(elements)
+    system = dataclasses.replace(random, loads=loads and loads(elements), elimination=elimination)
     check_chain(system if others is None else others(system))
 
 
@@ -333,8 +334,8 @@ def test_a_chain_with_two_free_ends_is_solved():
     held, ends = jnp.arange(8) == 3, jnp.array([0, -1])
     stiffness = system.stiffness.at[ends].set(0.0)
     turning = system.turning.at[..., ends].set(0.0)
-    changed = {"held": held, "stiffness": stiffness, "turning": turning, "contacts": nothing, "is_loose": True}
-    check_chain(dataclasses.replace(system, **changed))
+    changed = {"held": held, "stiffness": stiffness, "turning": turning, "contacts": nothing}
+    check_chain(dataclasses.replace(system, elimination=Elimination.WITH_FORCES, **changed))
 
 
 @pytest.mark.parametrize("is_closed", [False, True])

@@ -28,7 +28,7 @@ from rodjax.discretization.tangent_field import TangentField
 from rodjax.geometry.rotations import columns, rotated, turned
 from rodjax.geometry.vectors import cross
 from rodjax.linalg.blocks import product, short_sum
-from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain import ChainSystem, Elimination
 from rodjax.linalg.chain_rows import LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
 from rodjax.model.scene import Scene, has_free_ends, with_pins
@@ -110,8 +110,7 @@ class NodalTangents(NodalForm, MixedForm):
             contacts.rows,
             self.is_held,
             turning=None if fields is None else fields.turning,
-            is_backward=isinstance(self.scene.end, Held) and not isinstance(self.scene.start, Held),
-            is_loose=has_free_ends(self.scene),
+            elimination=_elimination(self.scene),
         )
         return Linearization(
             bases=bases,
@@ -279,8 +278,7 @@ class NodalFrames(NodalForm, FrameForm):
             self.is_held,
             None if self.has_potential else self._load_rows(point),
             None if fields is None else fields.turning,
-            is_backward=isinstance(self.scene.end, Held) and not isinstance(self.scene.start, Held),
-            is_loose=has_free_ends(self.scene),
+            elimination=_elimination(self.scene),
         )
         gaps = self.gap_of_elements(point, cells.segment_vectors.T)
         held = dataclasses.replace(self, ends_move=False)
@@ -327,3 +325,10 @@ class NodalFrames(NodalForm, FrameForm):
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
         value, segment_vectors = self.in_cells(elements, point.end_force + change)
         return value, segment_vectors.T
+
+
+def _elimination(scene: Scene) -> Elimination:
+    if has_free_ends(scene):
+        return Elimination.WITH_FORCES
+    is_from_end = isinstance(scene.end, Held) and not isinstance(scene.start, Held)
+    return Elimination.FROM_END if is_from_end else Elimination.FROM_START

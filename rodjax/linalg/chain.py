@@ -16,6 +16,7 @@ with the contact compliance c. Loads without a potential add rows of their own t
 """
 
 import dataclasses
+import enum
 from typing import Any
 
 import equinox as eqx
@@ -33,6 +34,18 @@ from rodjax.programs.parts import traced_once
 LOOSE = 1e-4
 
 
+class Elimination(enum.Enum):
+    """From which node to which one: a first node that nothing holds or touches has no pivot by itself.
+
+    `FROM_START`, also of an end that is free; `FROM_END`, of a start that is free; `WITH_FORCES`, of two free ends: the
+    force of an element goes with the node before it, and the last node is held softly (`LOOSE`).
+    """
+
+    FROM_START = enum.auto()
+    FROM_END = enum.auto()
+    WITH_FORCES = enum.auto()
+
+
 class ChainSystem(eqx.Module):
     """The matrix above, for n elements with m = 2 n + 1 points, nodes and middles in turn.
 
@@ -41,9 +54,7 @@ class ChainSystem(eqx.Module):
     place is given; `turning`: T, of what a field of forces has of both the place and the rotation of a node, `None` for
     none. What is no rotation comes as one vector: border, contacts, then the nodes, then the elements.
     `between`: what rotations and place (b, 3) of the last node of an element have by those of its first, beside H;
-    `None` for none. `is_backward`: elimination begins at the end, for a free start: a first node that nothing holds or
-    touches has no pivot. `is_loose`: both ends are free, and elimination takes the force of an element with the node
-    before it; the last node is held softly (`LOOSE`). `loads`: `None` where all have a potential.
+    `None` for none. `loads`: `None` where all have a potential.
     """
 
     diagonal: Float[Array, "b b m"]
@@ -59,8 +70,15 @@ class ChainSystem(eqx.Module):
     loads: LoadRows | None = None
     turning: Float[Array, "b 3 n+1"] | None = None
     between: Float[Array, "b+3 b+3 n"] | None = None
-    is_backward: bool = eqx.field(static=True, default=False)
-    is_loose: bool = eqx.field(static=True, default=False)
+    elimination: Elimination = eqx.field(static=True, default=Elimination.FROM_START)
+
+    @property
+    def is_backward(self) -> bool:
+        return self.elimination is Elimination.FROM_END
+
+    @property
+    def is_loose(self) -> bool:
+        return self.elimination is Elimination.WITH_FORCES
 
     def mirrored(self) -> "ChainSystem":
         """The same system of the rod counted from its end: the forces through the elements have the other sign.

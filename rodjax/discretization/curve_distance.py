@@ -86,7 +86,7 @@ def side_at(curve: Curve, element: Int[Array, "*k"], s: Float[Array, "*k"]) -> S
 def sides_at(
     curve: Curve, element: Int[Array, "k"], other: Int[Array, "k"], a: Float[Array, "k"], b: Float[Array, "k"]
 ) -> Side:
-    """Of places in an element and in another one, along a last axis but one of two."""
+    """Both places, in an element and in another one, along the last axis but one."""
     return side_at(curve, jnp.stack([element, other]), jnp.stack([a, b]))
 
 

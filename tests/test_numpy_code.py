@@ -346,3 +346,12 @@ def test_linear_programs_have_all_derivatives():
         return scaled_change({"x": x}, value, {"x": eye[0]})["sum"]
 
     np.testing.assert_allclose(jax.grad(of_factors)(factors["x"])[0], -4.0 * np.sin(0.1), rtol=1e-14)
+
+
+def test_operations_of_inner_programs_count_where_they_are_called():
+    """As a compiler has them, by which it is told how long NumPy code may run."""
+    inner = jax.jit(lambda x: jnp.sin(x) * x)  # 2 operations
+    code = AnswerCode.of(jax.jit(lambda x: inner(inner(x)) + 1.0).trace(jnp.ones(3)))
+    assert code.operations == 5
+    assert AnswerCode.unpacked(*code.packed()).operations == 5
+    assert answers.compile_seconds(20_000) == pytest.approx(40.0, rel=1e-12)  # 2 ms for each, of a large program

@@ -116,6 +116,27 @@ def test_a_thin_rod_pulled_by_a_tenth_converges_to_its_rounding_floor(slendernes
     np.testing.assert_allclose(result.tension, 0.1 * float(rod.EA), rtol=1e-9)
 
 
+@pytest.mark.parametrize("stiffness", [1.0, (1.0, 1.0)], ids=["tangents", "frames"])
+def test_a_slack_cable_between_clamps_nearly_on_one_line_turns_about_it(stiffness):
+    """Its bow costs nearly the same in all directions: the search goes along a valley, for a radian or more, whose
+    curvature is some 1e-2 EI/L^2. The scene is the same after half a turn about the axis at right angles to the line
+    and the offset: there the middle is.
+    """
+    rng = np.random.default_rng(5)
+    level = frame((1.0, 0.0, 0.0))
+    for _ in range(12):
+        rod = rj.Rod(1.0, stiffness, rng.uniform(0.5, 1.0), 1e5)
+        offset = np.array([0.0, *rng.uniform(-0.03, 0.03, 2)])
+        end = np.array([rng.uniform(0.6, 0.97), 0.0, 0.0]) + offset
+        found = rj.solve(Scene(rod, Clamp((0, 0, 0), level), Clamp(end, level)), segments=8)
+        assert found.converged
+        assert found.stable
+        assert found.iterations <= 20  # seen: 12; with shifts of 1 EI/L^2 and more one in ten took more than 100
+        away = found.nodes[4] - end / 2
+        # Forces are balanced to 1e-8, the flattest of these valleys has some 1e-4.
+        assert abs(away @ offset) < 1e-4 * np.linalg.norm(away) * np.linalg.norm(offset)
+
+
 def test_a_saddle_that_is_not_left_is_flagged(monkeypatch):
     """Without the pushes off a saddle; a mesh that no other test compiles, since they are part of the program."""
     monkeypatch.setattr(newton, "MAX_PUSHES", 0)

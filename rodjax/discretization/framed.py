@@ -28,6 +28,7 @@ from rodjax.discretization.cells import REFERENCE, Cells, strains_between
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, Form, Linearization
 from rodjax.discretization.frame_point import FramePoint, HeldFrame, Kinematics, Strained, turned_correction
 from rodjax.discretization.framed_parts import parts_of
+from rodjax.discretization.joints import turn_of_all
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.nodes import held_nodes
 from rodjax.discretization.rest_correction import RestCorrection
@@ -178,9 +179,23 @@ class FrameForm(Form):
         others: Any = None,
     ) -> FramePoint:
         # Rounding would grow with every step.
-        quaternions = unit(turned(point.quaternions, rotation))
+        quaternions = unit(self._turned(point, bases, rotation))
         nodal = self.retracted_nodal(point, others)
         return FramePoint(quaternions, point.end_force + force_change, point.total_twist, nodal)
+
+    def _turned(
+        self, point: FramePoint, bases: Float[Array, "3 3 m"], rotation: Float[Array, "3 m"]
+    ) -> Float[Array, "4 m"]:
+        """Tangents turn as those of a rod without frames do (`rotated_together`); the rest of a frame's spin is about
+        its tangent where that has come.
+        """
+        if not self.has_potential:  # as the square of what is out of balance falls, no rod turns as a whole
+            return turned(point.quaternions, rotation)
+        across = short_sum(bases[:, :2] * rotation[None, :2], axis=1)
+        spin = dot(turn_of_all(point.tangents, across)[:, None], point.tangents)
+        nothing = jnp.zeros_like(spin)
+        there = turned(point.quaternions, jnp.stack([rotation[0], rotation[1], spin]))
+        return turned(there, jnp.stack([nothing, nothing, rotation[2] - spin]))
 
     # --- forces, and what the spans lack -----------------------------------------------------------------------------
 

@@ -304,8 +304,9 @@ def at_rest(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> FramedCurv
     return FramedCurve(nodes.T, product(jnp.broadcast_to(turn[:, None], q.shape), q), s)
 
 
-# A rod is first sought at rest where its ends are then missed by less than this part of its length, or where it turns
-# by more than this angle [rad] on the way from one end to the other.
+# A rod is first sought at rest where its ends are then missed by less than this part of its length (times its turn at
+# rest, if that is less than 1 rad, as a straight one bends by the root of what it misses), or where it turns by more
+# than COILED [rad] on the way from one end to the other.
 NEAR_REST = 0.3
 COILED = 6.0
 
@@ -320,17 +321,18 @@ def first_frames(scene: Scene, s: Float[Array, "n+1"], of_joints: bool) -> Frame
     if not held_at_both_ends(scene) and not scene.clips:
         return resting
     bent = framed_through(scene, first_shape(scene, pieces), of_joints)
+    arclengths = jnp.linspace(0.0, 1.0, 65, dtype=s.dtype)
+    curvature = rest.at(arclengths, *_neighbours(arclengths))[:2]
+    angle = jnp.mean(jnp.sqrt(dot(curvature, curvature)))
+    near = NEAR_REST * jnp.minimum(angle, 1.0)
     if scene.clips:
-        is_near = _misses_clips(scene, resting) < NEAR_REST
+        is_near = _misses_clips(scene, resting) < near
         return jax.tree.map(lambda a, b: jnp.where(is_near, a, b), resting, bent)
     start, end = scene.start, scene.end
     assert isinstance(start, Held)
     assert isinstance(end, Held)
     missed = resting.nodes[-1] - end.position + resting.nodes[0] - start.position
-    arclengths = jnp.linspace(0.0, 1.0, 65, dtype=s.dtype)
-    curvature = rest.at(arclengths, *_neighbours(arclengths))[:2]
-    angle = jnp.mean(jnp.sqrt(dot(curvature, curvature)))
-    is_near = (jnp.sqrt(jnp.sum(missed**2)) < NEAR_REST) | (angle > COILED)
+    is_near = (jnp.sqrt(jnp.sum(missed**2)) < near) | (angle > COILED)
     return jax.tree.map(lambda a, b: jnp.where(is_near, a, b), resting, bent)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from rodjax.geometry.vectors import components, cross, dot
 from rodjax.linalg.blocks import short_sum
+from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.mechanics.energy import density
 from rodjax.mechanics.strain import squared_curvature_between
 from rodjax.model.rod import Rod
@@ -23,6 +24,9 @@ from rodjax.model.supports import Directed
 
 # In a Gauss-Newton Hessian a joint bent further than this counts as one bent so far: it stays definite.
 LEAST_COSINE = 0.1
+# Of the turn of a rod as a whole: the least share of a turn about the rod itself that its tangents show, and the most
+# that a step follows [rad].
+LEAST_SEEN, MOST_OF_ALL = 1e-4, 1.0
 
 
 class Joints(eqx.Module):
@@ -103,13 +107,48 @@ def rotated(
 ) -> Float[Array, "3 n"]:
     """Each tangent turned along a great circle, by an angle and in a direction given in its basis [rad]."""
     across = short_sum(bases * rotation[None], axis=1)
-    squared = dot(rotation, rotation)
+    cosine, sine_by_angle, _ = _by_angle(dot(rotation, rotation))
+    return cosine[None] * tangents + sine_by_angle[None] * across
+
+
+def rotated_together(
+    tangents: Float[Array, "3 n"], bases: Float[Array, "3 b n"], rotation: Float[Array, "b n"]
+) -> Float[Array, "3 n"]:
+    """The same to first order, of the tangents of one rod: each spins about itself as `turn_of_all` does.
+
+    So a rod that turns as a whole keeps its shape; along great circles half the square of the angle bends it.
+    """
+    if bases.shape[1] == 1:  # in a plane these are great circles
+        return rotated(tangents, bases, rotation)
+    across = short_sum(bases * rotation[None], axis=1)
+    about = cross(tangents, across)
+    spin = dot(turn_of_all(tangents, about)[:, None], tangents)
+    cosine, sine_by_angle, versine_by_square = _by_angle(dot(rotation, rotation) + spin**2)
+    along = cosine + versine_by_square * spin**2
+    return along[None] * tangents + sine_by_angle[None] * across + (versine_by_square * spin)[None] * about
+
+
+def _by_angle(squared: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """Cosine, sine by the angle, and one less the cosine by its square, of angles with these squares."""
     is_zero = squared == 0
     angle = jnp.sqrt(jnp.where(is_zero, 1.0, squared))
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
     # Series at zero, where the derivatives of the square root are infinite.
-    cosine = jnp.where(is_zero, 1 - squared / 2, jnp.cos(angle))
-    sine_by_angle = jnp.where(is_zero, 1 - squared / 6, jnp.sin(angle) / angle)
-    return cosine[None] * tangents + sine_by_angle[None] * across
+    return (
+        jnp.where(is_zero, 1 - squared / 2, cosine),
+        jnp.where(is_zero, 1 - squared / 6, sine / angle),
+        jnp.where(is_zero, 0.5 - squared / 24, (1 - cosine) / angle**2),
+    )
+
+
+def turn_of_all(tangents: Float[Array, "3 n"], turns: Float[Array, "3 n"]) -> Float[Array, "3"]:
+    """The one turn nearest to those of all tangents, each at right angles to its own; at most MOST_OF_ALL [rad]."""
+    n = tangents.shape[1]
+    # A turn about a straight rod itself shows in no tangent.
+    seen = (1 + LEAST_SEEN) * n * jnp.eye(3, dtype=tangents.dtype)
+    matrix = seen - jnp.sum(tangents[:, None] * tangents[None], axis=-1)
+    turn = inverse_matrix(matrix) @ jnp.sum(turns, axis=1)
+    return turn * MOST_OF_ALL / jnp.sqrt(jnp.maximum(jnp.sum(turn**2), MOST_OF_ALL**2))
 
 
 def bending_derivatives(

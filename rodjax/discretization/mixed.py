@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, EndTurn, Form, Linearization
-from rodjax.discretization.joints import rotated, tangent_bases
+from rodjax.discretization.joints import rotated_together, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.mixed_point import ByCells, Elastic, MixedPoint
 from rodjax.discretization.shape import Shape
@@ -213,7 +213,7 @@ class MixedForm(Form):
         force_change: Float[Array, "3 parts"],
         others: Any = None,
     ) -> MixedPoint:
-        tangents = rotated(point.tangents, bases, rotation)
+        tangents = rotated_together(point.tangents, bases, rotation)
         twist = point.total_twist
         if self.has_torsion:
             twist += self.field.swept(self.scene, point.tangents, tangents)

@@ -28,13 +28,11 @@ from rodjax.solving.assembly_balance import Balance, Here, changed_in_contact
 from rodjax.solving.contact_elimination import RodsInContact, moved_by
 from rodjax.solving.coupling import Coupling, free_points, solved_with_columns
 from rodjax.solving.harness_contact import ContactModel, ContactStep, contact_step
-from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, MAX_PUSHES, NEAR, PUSH, SHIFT_GROWTH, Find
+from rodjax.solving.newton import FIRST_SHIFT, MAX_FACTORS, MAX_PUSHES, NEAR, PUSH, SHIFT_GROWTH, Find, least_shift
 from rodjax.solving.rod_contact import Columns, Contacts, between, columns_of, in_contact
 
 # A motion of the bodies with less stiffness than this part of the largest energy unit of the rods counts as neutral.
 LEAST_STIFFNESS = NEUTRAL
-# Of the shifts of a rod that is not definite, the least one [EI/L^2].
-LEAST_SHIFT = 1e-3
 
 
 class Eliminated(NamedTuple):
@@ -126,7 +124,7 @@ def _eliminated(
 
     def again(trial: tuple[Array, Array, Eliminated]) -> tuple[Array, Array, Eliminated]:
         shift, tries, found = trial
-        larger = jnp.maximum(SHIFT_GROWTH * shift, _least_shift(last))
+        larger = jnp.maximum(SHIFT_GROWTH * shift, least_shift(last))
         shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
         push = pushes(shift)[:, None, None] * here.aside
         return shift, tries + 1, jax.vmap(eliminated)(*systems, shift, push)
@@ -145,13 +143,6 @@ def _first_shift(last: Float[Array, "k"], state: State, balance: Balance) -> Flo
     least = jnp.asarray(NEUTRAL, last.dtype)
     shift = jnp.where(balance.is_balanced | (last <= FIRST_SHIFT), least, last / SHIFT_GROWTH**2)
     return jnp.maximum(shift, state.damping)
-
-
-def _least_shift(last: Float[Array, "k"]) -> Float[Array, "k"]:
-    """That is tried where one of nothing is too little: less than last time, as shifts that are much larger than a
-    negative stiffness are crawled along.
-    """
-    return jnp.where(last > NEUTRAL, jnp.clip(last / SHIFT_GROWTH, LEAST_SHIFT, FIRST_SHIFT), FIRST_SHIFT)
 
 
 def _pushing(shift: Float[Array, "k"], state: State, balance: Balance) -> Float[Array, "k"]:
@@ -268,7 +259,7 @@ def with_contacts(
             touched = touched.touched(columns, together.pressures)
         groups.append(touched)
         shifts.append(shift)
-        least_shifts.append(_least_shift(last))
+        least_shifts.append(least_shift(last))
     push = jnp.where(may_push & balance.is_balanced, PUSH, 0.0).astype(dtype)
     pattern = jnp.asarray(_generic(len(force), dtype))
     parts = stiffness, force, push, pattern, LEAST_STIFFNESS, find == "minimum"

@@ -5,6 +5,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import not_negative, plain_number, whole_number
@@ -12,7 +13,7 @@ from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.saddle_point import factor
-from rodjax.model.scene import scene_axes
+from rodjax.model.scene import has_node_positions, scene_axes
 from rodjax.solving.status import Outcome, Status
 
 
@@ -45,9 +46,11 @@ class Newton(eqx.Module):
 # What is sought: a minimum of the energy, or the equilibrium that Newton's steps lead to, whatever its stability.
 Find = Literal["minimum", "equilibrium"]
 
-# Where the shift by NEUTRAL is not enough, it starts with FIRST_SHIFT and grows by SHIFT_GROWTH until the Hessian is
-# definite.
-FIRST_SHIFT = 1.0
+# Where the shift by NEUTRAL is not enough, it starts with the force that is out of balance, between these two, and
+# grows by SHIFT_GROWTH until the Hessian is definite. Later steps start with less than the last one had, down to
+# LEAST_SHIFT: under a shift much larger than the negative curvature a search crawls.
+FIRST_SHIFT, MOST_FIRST_SHIFT = 1.0, 64.0
+LEAST_SHIFT = 1e-3
 SHIFT_GROWTH = 4.0
 MAX_FACTORS = 30
 # Weight of the squared constraint residual in the augmented Lagrangian [EI/L^3]: about the stiffness of a bent rod.
@@ -84,6 +87,7 @@ class NewtonState(eqx.Module):
     residual: Float[Array, ""]
     floor: Float[Array, ""]  # what rounding leaves of the residual
     shift: Float[Array, ""]
+    last_shift: Float[Array, ""]  # of the last step that needed more than NEUTRAL
     rotation: Float[Array, "b n"]
     force_change: Float[Array, "3 parts"]
     others: Any  # what else it changes, as of `Form.others`
@@ -157,6 +161,11 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     )
 
 
+def least_shift(last: Float[Array, "*k"], first: ArrayLike = FIRST_SHIFT) -> Float[Array, "*k"]:
+    """That is tried where NEUTRAL is too little: less than that of the last step that needed more, if any did."""
+    return jnp.where(last > NEUTRAL, jnp.clip(last / SHIFT_GROWTH, LEAST_SHIFT, FIRST_SHIFT), first)
+
+
 def _descends(form: Form, find: Find) -> bool:
     """Whether steps are judged by the energy; else by the square of what is out of balance, which a step makes less."""
     return form.has_potential and find == "minimum"
@@ -187,7 +196,11 @@ def _advanced(
     # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
     least = jnp.asarray(NEUTRAL, dtype)
     first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
-    shift = jnp.where(state.tries == 0, first, jnp.maximum(SHIFT_GROWTH * state.shift, FIRST_SHIFT))
+    # Of nodes with places of their own the forces of contacts are out of balance too.
+    is_bending = form.has_potential and not has_node_positions(form.scene)
+    of_first = jnp.clip(here.residual, FIRST_SHIFT, MOST_FIRST_SHIFT) if is_bending else FIRST_SHIFT
+    larger = jnp.maximum(SHIFT_GROWTH * state.shift, least_shift(state.last_shift, of_first))
+    shift = jnp.where(state.tries == 0, first, larger)
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near
     push = jnp.where(may_push & (shift > least), PUSH * h * shift, 0.0)
@@ -265,6 +278,7 @@ def _advanced(
         residual=jnp.where(again, state.residual, here.residual),
         floor=floor,
         shift=shift,
+        last_shift=jnp.where(is_definite & (shift > least), shift, state.last_shift),
         rotation=rotation,
         force_change=force_change,
         others=others,
@@ -319,6 +333,7 @@ def begin(form: Form, point: Point) -> NewtonState:
         residual=zero,
         floor=zero,
         shift=zero,
+        last_shift=zero,
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),
         others=form.no_others(point),

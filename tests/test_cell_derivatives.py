@@ -11,6 +11,7 @@ from rodjax.discretization.cells import ElementCells, JointCells
 from rodjax.discretization.element_strains import ElementStrains
 from rodjax.discretization.frame_point import FramePoint
 from rodjax.discretization.framed import FrameForm
+from rodjax.geometry.rotations import turned
 from rodjax.model.scene import nondimensional
 
 CELLS = 3
@@ -87,8 +88,9 @@ def test_the_linearization_is_that_of_the_lagrangian(rod, kind):
     @by_numpy
     def found_and_expected(form, point):
         def at(unknowns):
-            retracted = form.retract(point, bases, unknowns[:-3].reshape(shape), unknowns[-3:, None])
-            return form.linearized(retracted)
+            rotation, force_change = unknowns[:-3].reshape(shape), unknowns[-3:, None]
+            force = point.end_force + force_change
+            return form.linearized(FramePoint(turned(point.quaternions, rotation), force, point.total_twist))
 
         def matrix(here):
             unit = jnp.eye(shape[0] * shape[1] + 3)

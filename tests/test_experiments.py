@@ -136,9 +136,9 @@ def test_first_answers(tmp_path, capsys):
 
 
 def test_cold_start():
-    shares = script("cold_start").main(["--count", "5", "--moments", "1", "--segments", "10"])
-    assert len(shares) == 3 + 2 * 4
-    assert all(share == 1.0 for name, share in shares.items() if name.startswith("clamps"))
+    shares = script("cold_start").main(["--count", "5", "--moments", "1", "--slack", "1", "--segments", "10"])
+    assert len(shares) == 3 + 2 * 4 + 3 * 4
+    assert all(share == 1.0 for name, share in shares.items() if name.startswith(("clamps", "slack")))
 
 
 @pytest.mark.slow

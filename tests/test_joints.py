@@ -160,8 +160,9 @@ def test_a_rod_that_turns_as_a_whole_keeps_its_shape(bent):
     turn = np.array([0.3, -0.5, 0.6])
     rotation = jnp.einsum("cbn,cn->bn", bases, np.cross(turn, tangents.T).T)
     moved = rotated_together(tangents, bases, rotation)
-    # `LEAST_SEEN` of the turn is taken off; great circles miss by its square.
-    np.testing.assert_allclose(moved.T, Rotation.from_rotvec(turn).apply(np.array(tangents.T)), rtol=0, atol=1e-4)
+    # `LEAST_SEEN` of the turn is taken off, of which tangents in all directions show two thirds; great circles miss by
+    # its square.
+    np.testing.assert_allclose(moved.T, Rotation.from_rotvec(turn).apply(np.array(tangents.T)), rtol=0, atol=2e-3)
     assert np.max(np.abs(moved - rotated(tangents, bases, rotation))) > 0.1
     np.testing.assert_allclose(np.linalg.norm(moved, axis=0), 1.0, rtol=1e-14)
     # To first order the same: a step of 1e-6 differs by its square.

@@ -219,6 +219,10 @@ class Form(eqx.Module):
         """The point as a search begins from it."""
         return point
 
+    def touches(self, point: Any) -> Bool[Array, ""]:
+        """Whether forces of contacts act."""
+        return jnp.array(False)
+
     @property
     def refines(self) -> bool:
         """Whether `refined` does something."""

@@ -47,7 +47,7 @@ from rodjax.linalg.blocks import product as block_product
 from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import Sections
-from rodjax.model.scene import Scene, has_potential, with_pins
+from rodjax.model.scene import Scene, has_node_positions, has_potential, with_pins
 from rodjax.model.supports import Clamp, Directed
 from rodjax.programs.parts import traced_once
 
@@ -189,7 +189,7 @@ class FrameForm(Form):
         """Tangents turn as those of a rod without frames do (`rotated_together`); the rest of a frame's spin is about
         its tangent where that has come.
         """
-        if not self.has_potential:  # as the square of what is out of balance falls, no rod turns as a whole
+        if has_node_positions(self.scene):
             return turned(point.quaternions, rotation)
         across = short_sum(bases[:, :2] * rotation[None, :2], axis=1)
         spin = dot(turn_of_all(point.tangents, across)[:, None], point.tangents)

@@ -26,7 +26,7 @@ from rodjax.model.supports import Directed
 LEAST_COSINE = 0.1
 # Of the turn of a rod as a whole: the least share of a turn about the rod itself that its tangents show, and the most
 # that a step follows [rad].
-LEAST_SEEN, MOST_OF_ALL = 1e-4, 1.0
+LEAST_SEEN, MOST_OF_ALL = 1e-3, 1.0
 
 
 class Joints(eqx.Module):

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from rodjax.discretization.first_twist import FirstTwist, twist_on
 from rodjax.discretization.form import FLOOR_SAFETY, NEUTRAL, EndTurn, Form, Linearization
-from rodjax.discretization.joints import rotated_together, tangent_bases
+from rodjax.discretization.joints import rotated, rotated_together, tangent_bases
 from rodjax.discretization.layout import ForceLayout, SpanForces
 from rodjax.discretization.mixed_point import ByCells, Elastic, MixedPoint
 from rodjax.discretization.shape import Shape
@@ -41,7 +41,7 @@ from rodjax.linalg.blocks import short_sum
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem, SaddlePointSystem
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene, dead_end_moment, with_pins
+from rodjax.model.scene import Scene, dead_end_moment, has_node_positions, with_pins
 from rodjax.model.supports import Clamp, Free
 from rodjax.programs.parts import traced_once
 
@@ -213,7 +213,9 @@ class MixedForm(Form):
         force_change: Float[Array, "3 parts"],
         others: Any = None,
     ) -> MixedPoint:
-        tangents = rotated_together(point.tangents, bases, rotation)
+        # Nodes with places of their own move straight, and do not go along in a turn of all.
+        turned = rotated if has_node_positions(self.scene) else rotated_together
+        tangents = turned(point.tangents, bases, rotation)
         twist = point.total_twist
         if self.has_torsion:
             twist += self.field.swept(self.scene, point.tangents, tangents)

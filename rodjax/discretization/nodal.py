@@ -118,6 +118,9 @@ class NodalForm(PositionForm):
         point, pressures = _with_wells(point, jnp.ones(len(self.field.s) - 1, bool)), point.nodal.pressures[-1]
         return _with_wells(point, wide_cells(curve(self, point), pressures) | ~jnp.any(pressures > 0))
 
+    def touches(self, point: Any) -> Bool[Array, ""]:
+        return jnp.any(point.nodal.contact_forces != 0)
+
     @property
     def refines(self) -> bool:
         return has_wells(self.scene)

@@ -196,10 +196,11 @@ def _advanced(
     # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
     least = jnp.asarray(NEUTRAL, dtype)
     first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
-    # Of nodes with places of their own the forces of contacts are out of balance too.
+    # At a node that touches something neither what is out of balance nor what bent the last time says much.
     is_bending = form.has_potential and not has_node_positions(form.scene)
     of_first = jnp.clip(here.residual, FIRST_SHIFT, MOST_FIRST_SHIFT) if is_bending else FIRST_SHIFT
-    larger = jnp.maximum(SHIFT_GROWTH * state.shift, least_shift(state.last_shift, of_first))
+    of_next = jnp.where(form.touches(point), FIRST_SHIFT, least_shift(state.last_shift, of_first))
+    larger = jnp.maximum(SHIFT_GROWTH * state.shift, of_next)
     shift = jnp.where(state.tries == 0, first, larger)
     is_near = is_balanced | ((here.residual <= NEAR * shift) & (state.pushes < MAX_PUSHES))
     may_push = (state.pushes == 0) | is_near

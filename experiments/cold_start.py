@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, float]:
     jax.config.update("jax_enable_x64", True)
     rng = np.random.default_rng(0)
     columns = f"{'converged':>12}{'iterations: median':>20}{'90 %':>7}{'max':>7}{'evaluations: mean':>19}"
-    print(f"{'scenes':44}{columns}")
+    print(f"{'scenes':52}{columns}")
     shares = {}
     for slenderness in (20.0, 200.0, 2000.0):
         scenes = clamps(problems.cable(slenderness), rng, options.count)
@@ -63,7 +63,7 @@ def row(name: str, scenes: Iterable[Scene], segments: int) -> float:
     converged = [bool(result.converged) for result in results]
     iterations = [int(result.iterations) for result in results]
     low, high = np.percentile(iterations, [50, 90])
-    found = f"{name:44}{f'{sum(converged)} of {len(results)}':>12}"
+    found = f"{name:52}{f'{sum(converged)} of {len(results)}':>12}"
     evaluations = np.mean([int(result.evaluations) for result in results])
     print(f"{found}{low:20.0f}{high:7.0f}{max(iterations):7}{evaluations:19.1f}", flush=True)
     return float(np.mean(converged))

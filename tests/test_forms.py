@@ -12,6 +12,8 @@ from numpy_programs import by_numpy
 import rodjax as rj
 from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
 from rodjax.discretization.nodal_point import NodalChange
+from rodjax.discretization.sliding import SlidingForm, SlidingPoint
+from rodjax.model.scene import sliding_arclengths
 from rodjax.solving.result_form import form_and_point
 
 AXIS = jnp.array([1.0, 0.0, 0.0])
@@ -137,3 +139,22 @@ def test_the_rounding_floor_is_near_to_what_rounding_leaves(kind):
     lowest = rj.solve(KINDS[kind], segments=8, solver=rj.Newton(tolerance=0.0))
     assert lowest.status == rj.Status.ROUNDING_FLOOR
     assert 1 / 30 < lowest.residual / floor(lowest) < 1
+
+
+@pytest.mark.parametrize("height", [-0.05, -1.0])
+def test_it_is_known_whether_contact_forces_act(height):
+    """Also where the rod slides: a search shifts by less where nothing touches."""
+    floor = rj.Plane((0, 0, height), (0, 0, 1))
+    rod = Rod(1.0, 1.0, 0.7, 1e4, mass_per_length=5.0, radius=0.01)
+    clips = [Clip(0.4, (0.35, 0.0, 0.1), sliding=True)]
+    scene = Scene(rod, Pin((0, 0, 0)), Pin((0.8, 0, 0)), (0.0, 0.0, -9.81), clips=clips, obstacles=[floor])
+    result = rj.solve(scene, segments=8)
+    assert result.converged
+    form, point = form_and_point(result)
+    arclengths = sliding_arclengths(form.scene)
+    sliding = SlidingForm.of(form.scene, result.state.shape)
+    inner = SlidingPoint(point, arclengths, jnp.array(True), jnp.zeros_like(arclengths))
+    is_lying = height > -0.5
+    assert (jnp.sum(result.contact_forces[:, 2]) > 0) == is_lying
+    assert form.touches(point) == is_lying
+    assert sliding.touches(inner) == is_lying

@@ -133,6 +133,9 @@ class SlidingForm(MovingMeshForm):
     def is_closed(self, constraint_residual: Float[Array, "k"], tolerance: float) -> Bool[Array, ""]:
         return self.first.is_closed(constraint_residual[len(self._numbers) :], tolerance)
 
+    def touches(self, point: SlidingPoint) -> Bool[Array, ""]:
+        return self.first.touches(point.inner)
+
     def rounding_floor(self, point: SlidingPoint) -> Float[Array, ""]:
         return self.at(point.arclengths).rounding_floor(point.inner)
 

@@ -162,7 +162,9 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
 
 
 def least_shift(last: Float[Array, "*k"], first: ArrayLike = FIRST_SHIFT) -> Float[Array, "*k"]:
-    """That is tried where NEUTRAL is too little: less than that of the last step that needed more, if any did."""
+    """The shift that is tried first where NEUTRAL is too little [EI/L^2]: a quarter of `last`, that of the last step
+    that needed more, or `first` where none did.
+    """
     return jnp.where(last > NEUTRAL, jnp.clip(last / SHIFT_GROWTH, LEAST_SHIFT, FIRST_SHIFT), first)
 
 
@@ -196,7 +198,8 @@ def _advanced(
     # Whether the point is a minimum shows without shift; on the way there the shift need not be found anew.
     least = jnp.asarray(NEUTRAL, dtype)
     first = jnp.where(is_balanced | (state.shift <= FIRST_SHIFT), least, state.shift / SHIFT_GROWTH**2)
-    # At a node that touches something neither what is out of balance nor what bent the last time says much.
+    # Contact forces are part of what is out of balance, and where they act the negative curvature of one step tells
+    # little of the next one.
     is_bending = form.has_potential and not has_node_positions(form.scene)
     of_first = jnp.clip(here.residual, FIRST_SHIFT, MOST_FIRST_SHIFT) if is_bending else FIRST_SHIFT
     of_next = jnp.where(form.touches(point), FIRST_SHIFT, least_shift(state.last_shift, of_first))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.discretization.cells import ElementCells, JointCells, strains_between
@@ -14,7 +15,7 @@ from rodjax.discretization.nonconservative import point_couples
 from rodjax.discretization.potentials import OnElements
 from rodjax.discretization.results import Resultants
 from rodjax.geometry.interpolation import cubic
-from rodjax.geometry.rotations import columns, inverse, rotated, tangent
+from rodjax.geometry.rotations import by_rotation_vector, columns, inverse, product, rotated, tangent
 from rodjax.geometry.vectors import cross, dot, root
 from rodjax.linalg.blocks import short_sum
 from rodjax.mechanics.energy import Sections
@@ -232,11 +233,17 @@ def _strains_at_end(
     return strains, sections.stretched(axial), tension, shear_under(sections, q, force[:, None])
 
 
+# Ways from the first node of an element, by its length and the slopes at its quarters: integrals of the polynomial
+# through these, by the powers of the part of the element from 1 on.
+QUARTERS = np.arange(5) / 4
+WAYS = np.linalg.inv(np.vander(QUARTERS, increasing=True)).T / np.arange(1, 6)
+
+
 def positions_between_frames(
     form: FrameForm, point: FramePoint, nodes: Float[Array, "n+1 3"], s: Float[Array, "k"]
 ) -> Float[Array, "k 3"]:
-    """The centerline at arclengths between the nodes: by cubics through positions and slopes, of elements also in the
-    middle, where a parabola through the slopes leads.
+    """The centerline at arclengths between the nodes: of elements a polynomial of fifth degree by the slopes at their
+    quarters, where the frames turn as their strains say; of joints cubics through positions and slopes.
     """
     field, q = form.field, point.quaternions
     slopes = form.strained(point).slopes
@@ -248,18 +255,29 @@ def positions_between_frames(
             assert at_nodes.shear is not None
             t = (1 + at_nodes.axial)[None] * t + short_sum(columns(frames)[:, :2] * at_nodes.shear[None], axis=1)
         return cubic(field.s, nodes, t.T, s)
-    a, b, c = slopes[:, 0], slopes[:, 1], slopes[:, 2]
-    half_vectors = field.h[None] * (5 * a + 8 * b - c) / 24
-    if form.rest_correction is not None:
-        whole = short_sum(field.lengths[None] * slopes, axis=1)
-        half_vectors += (form.edges(point).T - whole) / 2
-    middles = nodes[:-1] + half_vectors.T
-    arclengths = jnp.stack([field.s[:-1], (field.s[:-1] + field.s[1:]) / 2], axis=1).reshape(-1)
-    points = jnp.stack([nodes[:-1], middles], axis=1).reshape(-1, 3)
-    bends = jnp.stack([a.T, b.T], axis=1).reshape(-1, 3)
-    return cubic(
-        jnp.concatenate([arclengths, field.s[-1:]]),
-        jnp.concatenate([points, nodes[-1:]]),
-        jnp.concatenate([bends, c.T[-1:]]),
-        s,
-    )
+    early, late = jnp.unstack(_slopes_at_quarters(field, field.gather(q), slopes), axis=1)
+    start, middle, end = jnp.unstack(slopes, axis=1)
+    at_quarters = jnp.stack([start, early, middle, late, end])
+    # The node beyond is where the elements' own quadrature and rest shape say.
+    missing = jnp.diff(nodes, axis=0).T - field.h[None] * jnp.tensordot(WAYS.sum(1).astype(s.dtype), at_quarters, 1)
+    cell = jnp.clip(jnp.searchsorted(field.s, s, side="right") - 1, 0, len(field.h) - 1)
+    h = field.h[cell]
+    x = (s - field.s[cell]) / h
+    powers = jnp.stack([x**k for k in range(1, 6)])
+    weights = h[None] * jnp.tensordot(WAYS.astype(s.dtype), powers, 1)
+    ways = jnp.sum(weights[:, None] * at_quarters[:, :, cell], axis=0) + (x**2 * (3 - 2 * x))[None] * missing[:, cell]
+    return nodes[cell] + ways.T
+
+
+def _slopes_at_quarters(
+    field: ElementCells, frames: Float[Array, "4 3 n"], slopes: Float[Array, "3 3 n"]
+) -> Float[Array, "3 2 n"]:
+    """Of elements a quarter before and beyond the middle: parabolas in the axes of the frames, which turn from the
+    middle by rotation vectors that are parabolas too.
+    """
+    own = rotated(inverse(frames), slopes)
+    start, middle, end = own[:, :1], own[:, 1:2], own[:, 2:]
+    own = jnp.concatenate([3 * start - end, 3 * end - start], axis=1) / 8 + 3 * middle / 4
+    vectors = field.strains(field.seen(frames)[field.coordinates]).vectors
+    turns = (3 * vectors - vectors[:, ::-1]) / 8
+    return rotated(product(jnp.broadcast_to(frames[:, 1:2], (4, *turns.shape[1:])), by_rotation_vector(turns)), own)

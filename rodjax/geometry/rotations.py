@@ -185,14 +185,25 @@ def screw(
     rotation: Float[Array, "3 *k"], translation: Float[Array, "3 *k"]
 ) -> tuple[Float[Array, "4 *k"], Float[Array, "3 *k"]]:
     """What a unit of time makes of a motion with this constant rate of turn and velocity, both in its own axes."""
-    squared = dot(rotation, rotation)
-    is_small = squared < SMALL**2
-    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
-    half = jnp.where(is_small, 0.5 - squared / 48 + squared**2 / 3840, jnp.sin(angle / 2) / angle)
-    cosine = jnp.where(is_small, 1 - squared / 8 + squared**2 / 384, jnp.cos(angle / 2))
+    squared, is_small, angle, half, quaternion = _by_vector(rotation)
     first = 2 * half**2  # (1 - cos)/angle^2
     series = 1 / 6 - squared / 120 + squared**2 / 5040
     second = jnp.where(is_small, series, (angle - jnp.sin(angle)) / angle**3)
     across = cross(rotation, translation)
     way = translation + first[None] * across + second[None] * cross(rotation, across)
-    return jnp.concatenate([cosine[None], half[None] * rotation]), way
+    return quaternion, way
+
+
+def by_rotation_vector(rotation: Float[Array, "3 *k"]) -> Float[Array, "4 *k"]:
+    """The quaternion of a rotation vector [rad]."""
+    return _by_vector(rotation)[-1]
+
+
+def _by_vector(rotation: Float[Array, "3 *k"]) -> tuple[Array, Array, Array, Array, Float[Array, "4 *k"]]:
+    """Square and length of a rotation vector (1 where it is small), whether it is, sin(angle/2)/angle, quaternion."""
+    squared = dot(rotation, rotation)
+    is_small = squared < SMALL**2
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    half = jnp.where(is_small, 0.5 - squared / 48 + squared**2 / 3840, jnp.sin(angle / 2) / angle)
+    cosine = jnp.where(is_small, 1 - squared / 8 + squared**2 / 384, jnp.cos(angle / 2))
+    return squared, is_small, angle, half, jnp.concatenate([cosine[None], half[None] * rotation])

@@ -16,6 +16,7 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
+from rodjax.discretization.turning import MOST_TURN, turn_between_points
 from rodjax.model.plane import check_planar
 from rodjax.model.scene import Scene, dead_end_moment, has_contacts, has_node_positions, has_potential, needs_frames
 from rodjax.solving.guess import Guess
@@ -37,6 +38,8 @@ LEAST_SEGMENTS = {"finite_difference": 2, "hermite": 1}
 SPAN_SEGMENTS = 10
 # The same beside obstacles: on fewer a rod that touches takes many iterations, and then finer meshes.
 CONTACT_SEGMENTS = 32
+# The first mesh leaves so much of a turn [rad] of the rod at rest, or of `turns`, between two of its points.
+MOST_FIRST_TURN = math.pi / 4
 # Of the only mesh inside jit, where no error can be looked at.
 TRACED_SEGMENTS = {"finite_difference": 50, "hermite": 32}
 # Beyond this a mesh is taken for a mistake: two nodes of a rod 100 m long would be closer than a millimetre.
@@ -120,14 +123,21 @@ def checked_options(
     least = max(LEAST_SEGMENTS[discretization], len(scene.clips) + 1)
     if of_frames and discretization == "hermite":
         least = _least_for_jumps(scene, segments, least)
+    may_turn = of_frames and is_known(scene)
     if segments is not None:
         segments = whole_number(segments, "segments", least, MAX_SEGMENTS)
+        if may_turn:
+            _check_turning(scene, segments, discretization)
     elif isinstance(guess, Equilibrium):
         segments = max(guess.s.shape[-1] - 1, least)
+        if may_turn and _turn(scene, segments, discretization) >= MOST_TURN:
+            segments = _size_for_turning(scene, discretization)
     elif rtol is not None and is_known(scene, guess):
         wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
         if has_contacts(scene):
             wanted = max(wanted, CONTACT_SEGMENTS)
+        if may_turn:
+            wanted = max(wanted, _size_for_turning(scene, discretization))
         segments = first_size(rtol, discretization, max(wanted, least))
     else:
         segments = TRACED_SEGMENTS[discretization]
@@ -157,6 +167,29 @@ def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
         f"{where}: got jumps as near as {gap:.3g} of the length to one another or to an end, a load or a clip, which "
         f"needs segments = {count} or more, and {given}"
     )
+
+
+def _turn(scene: Scene, segments: int, discretization: Discretization) -> float:
+    return float(np.max(turn_between_points(scene, segments, discretization)))
+
+
+def _check_turning(scene: Scene, segments: int, discretization: Discretization) -> None:
+    """Raises where the frames on a mesh of so many segments could not tell how far the rod turns."""
+    turn = _turn(scene, segments, discretization)
+    if turn >= MOST_TURN:
+        raise ValueError(
+            f"segments must be some {math.ceil(1.1 * segments * turn / MOST_TURN)} or more, as the rod at rest, or by "
+            f"its turns, turns by {turn / (2 * math.pi):.2g} of a whole turn between neighbouring frames (two for each "
+            f"element), which tell less than half of one: got a mesh of {segments}"
+        )
+
+
+def _size_for_turning(scene: Scene, discretization: Discretization) -> int:
+    """The first mesh of a rod that turns: see `MOST_FIRST_TURN`."""
+    sizes = SIZES[discretization]
+    size = next((size for size in sizes if _turn(scene, size, discretization) < MOST_FIRST_TURN), sizes[-1])
+    _check_turning(scene, size, discretization)
+    return size
 
 
 def check_single(guess: Guess | Equilibrium | None) -> None:

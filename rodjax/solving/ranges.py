@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
 from rodjax.discretization.cells import segments_for_jumps
+from rodjax.discretization.turning import MOST_TURN, turn_between_points
 from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
@@ -65,9 +66,11 @@ def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
     scenes = jax.lax.stop_gradient(scenes)
     is_wrong = _is_wrong(scenes)
     # What is told by an error where numbers are known, as the mesh is chosen.
+    segments = result.s.shape[-1] - 1
     needed = segments_for_jumps(scenes) if result.discretization == "hermite" else None
     if needed is not None:
-        is_wrong |= needed[0] > result.s.shape[-1] - 1
+        is_wrong |= needed[0] > segments
+    is_wrong |= turn_between_points(scenes, segments, result.discretization) >= MOST_TURN
     flags = (
         jnp.where(is_wrong, Status.OUT_OF_RANGE, result.status),
         result.converged & ~is_wrong,

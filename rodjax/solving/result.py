@@ -221,8 +221,8 @@ class Equilibrium(eqx.Module):
     def position_at(self, s: Any) -> Float[Array, "... k 3"]:
         """Centerline at arclengths `s` (k,) [m] from 0 to L, [..., k, 3].
 
-        Between the nodes of elements a polynomial of fifth degree by position, tangent and curvature, as accurate as
-        the nodes; between those of finite differences a cubic.
+        Between the nodes of elements a polynomial of fifth degree, as accurate as the nodes: by position, tangent and
+        curvature, or by the slopes of a rod with frames; between those of finite differences a cubic.
 
         Raises `ValueError` where an arclength lies beyond the rod.
         """

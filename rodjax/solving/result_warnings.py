@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rodjax.checks import is_known
+from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.solving.description import largest_strain, outcome_told, too_short
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT, Equilibrium
 from rodjax.solving.status import Status
@@ -36,6 +37,8 @@ class PrecisionWarning(UserWarning):
 def warn_if_coarse(equilibrium: Equilibrium) -> None:
     """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that."""
     curvature, s = np.asarray(equilibrium.curvature), np.asarray(equilibrium.s)
+    if equilibrium.discretization == "hermite" and isinstance(equilibrium.state.shape, FramedCurve):
+        curvature = np.hypot(curvature, np.asarray(equilibrium.twist))
     turn = np.maximum(curvature[..., 1:], curvature[..., :-1]) * (s[..., 1:] - s[..., :-1])
     by_tangent = equilibrium.discretization == "finite_difference"  # their curvature is 2 tan(turn/2)/h
     limit = MOST_TURN[equilibrium.discretization]

@@ -41,7 +41,8 @@ class Status(enum.IntEnum):
             Status.COLLAPSED: "not converged: loads press the rod to nothing (axial strain below -1): EA is too small",
             Status.OVERSTRETCHED: "converged, but the rod is strained by more than `strain_limit`",
             Status.OUT_OF_RANGE: "not converged: a number of the scene makes no sense, such as a stiffness that is not "
-            "positive, an arclength beyond the rod, or jumps of `Steps` too near to one another for the mesh",
+            "positive, an arclength beyond the rod, or too coarse a mesh for jumps of `Steps` near to one another or "
+            "for a rod that turns often at rest",
             Status.CROWDED: "not converged: rods of a harness touch one another on more elements than are sought "
             "together, 32 of a pair of cables: fewer `segments` may do",
             Status.SLID_OUT: "not converged: a rod slides out of a clip",

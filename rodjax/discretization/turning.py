@@ -22,29 +22,28 @@ POINTS_OF_SEGMENT = {"finite_difference": 1, "hermite": 2}
 PARTS = 1024
 
 
-def turn_between_points(scene: Scene, segments: int, discretization: str) -> Float[Numbers, "..."]:
+def turn_between_points(scene: Scene, segments: int, discretization: str) -> Float[Numbers, "..."] | None:
     """The largest angle [rad] by which the sections of a rod turn between neighbouring points of a mesh of equal
-    segments, at rest or by `turns`; 0 where neither has to be resolved. Also of stacked scenes, known or traced.
+    segments, at rest or by `turns`; `None` where neither has to be resolved. Also of stacked scenes, known or traced.
     """
-    dtype = scene.rod.length.dtype
-    xp, stack = namespace(scene), scene.rod.length.shape
-    most = xp.zeros(stack, dtype)
     if not needs_frames(scene):
-        return most
-    count = segments * POINTS_OF_SEGMENT[discretization]
-    if scene.turns is not None:
-        most = 2 * np.pi / count * xp.abs(xp.asarray(scene.turns))
+        return None
+    xp, count = namespace(scene), segments * POINTS_OF_SEGMENT[discretization]
+    asked = None if scene.turns is None else 2 * np.pi / count * xp.abs(xp.asarray(scene.turns))
     rates = _rest_rates(scene.rod, xp)
-    if rates is not None:
-        if rates.shape[-1] == 1:
-            return xp.maximum(most, rates[..., 0] / count)
-        s = xp.broadcast_to(xp.linspace(0.0, 1.0, count + 1, dtype=dtype), (*stack, count + 1))
+    if rates is None:
+        return asked
+    if rates.shape[-1] == 1:
+        at_rest = rates[..., 0] / count
+    else:
+        s = xp.linspace(0.0, 1.0, count + 1, dtype=rates.dtype)
+        s = xp.broadcast_to(s, (*rates.shape[:-1], count + 1))
         before = (xp.cumsum(rates, axis=-1) - rates) / PARTS
         part = xp.clip(xp.floor(s * PARTS), 0, PARTS - 1)
         within, part = s - part / PARTS, part.astype(int)
         angles = xp.take_along_axis(before, part, -1) + within * xp.take_along_axis(rates, part, -1)
-        most = xp.maximum(most, xp.max(xp.diff(angles, axis=-1), axis=-1))
-    return most
+        at_rest = xp.max(xp.diff(angles, axis=-1), axis=-1)
+    return at_rest if asked is None else xp.maximum(asked, at_rest)
 
 
 def _rest_rates(rod: Rod, xp: ModuleType) -> Float[Numbers, "... parts"] | None:

@@ -170,7 +170,8 @@ def _least_for_jumps(scene: Scene, segments: int | None, least: int) -> int:
 
 
 def _turn(scene: Scene, segments: int, discretization: Discretization) -> float:
-    return float(np.max(turn_between_points(scene, segments, discretization)))
+    turn = turn_between_points(scene, segments, discretization)
+    return 0.0 if turn is None else float(np.max(turn))
 
 
 def _check_turning(scene: Scene, segments: int, discretization: Discretization) -> None:

@@ -70,7 +70,9 @@ def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
     needed = segments_for_jumps(scenes) if result.discretization == "hermite" else None
     if needed is not None:
         is_wrong |= needed[0] > segments
-    is_wrong |= turn_between_points(scenes, segments, result.discretization) >= MOST_TURN
+    turn = turn_between_points(scenes, segments, result.discretization)
+    if turn is not None:
+        is_wrong |= turn >= MOST_TURN
     flags = (
         jnp.where(is_wrong, Status.OUT_OF_RANGE, result.status),
         result.converged & ~is_wrong,

@@ -72,7 +72,8 @@ def solve(
         for `rtol` rods of one structure get as many as their estimated errors need, with their ends held.
     - `segments`: of a mesh of equal ones (that of a guess with as many is kept). `None`: as many as `rtol` needs. The
         errors on a given mesh are not estimated unless asked for (`error_estimate`, `describe`); outside `jit` a
-        `MeshWarning` is given where a segment turns by so much that it is far too long.
+        `MeshWarning` is given where a segment turns by so much that it is far too long. Refused (in `jit`:
+        `OUT_OF_RANGE`) are meshes too coarse to tell how often a coiled or twisted rod turns at rest, or by `turns`.
     - `rtol`: the relative error of the shape that is wanted; `None` for 1e-3. Segments are added, elements where they
         are needed, until the estimated `error_estimate` is below it and `force_error`, `moment_error` and
         `curvature_error` below ten times it: by default 0.1 % of the length, and 1 % of the largest force, moment and

@@ -81,6 +81,12 @@ def test_stated_turns_are_those_of_the_rod(turns):
     np.testing.assert_allclose(result.energy, energy, rtol=1e-5)
 
 
+def test_a_guess_on_too_coarse_a_mesh_gets_a_finer_one():
+    guess = rj.solve(twisted(rest_twist=0.0, turns=0), segments=8)
+    result = rj.solve(twisted(rest_twist=0.0, turns=10), guess=guess)
+    np.testing.assert_allclose(result.total_twist, 20 * math.pi, atol=1e-4)
+
+
 def test_meshes_on_which_turns_are_lost_are_refused():
     for scene in (twisted(), twisted(rest_twist=0.0, turns=10)):
         with pytest.raises(ValueError, match=r"segments must be some 1[12] or more, as the rod at rest"):

@@ -370,6 +370,15 @@ class TwoSlopes(rj.Law):
         return bending + 0.7 / 2 * twist**2 + 1e5 / 2 * axial_strain**2
 
 
+def test_places_between_nodes_are_as_accurate_as_the_nodes():
+    rod = rj.Rod(1.0, (1.0, 2.0), 0.7, 1e4, mass_per_length=0.1)
+    fine, coarse = (rj.solve(rj.Scene(rod, START, END, HEAVY), segments=segments) for segments in (96, 24))
+    between = np.linspace(0, 1, 481)
+    off = [np.linalg.norm(coarse.position_at(s) - fine.position_at(s), axis=1).max() for s in (coarse.s, between)]
+    # 1.35 times as far off were seen, 2.4 times by cubics.
+    assert off[1] < 1.5 * off[0]
+
+
 @pytest.mark.slow
 def test_a_law_of_two_slopes():
     law = TwoSlopes(jnp.array(1.0), jnp.array(0.2), jnp.array(2.0))

@@ -15,8 +15,8 @@ from rodjax.model.rest import SpaceCurve
 from rodjax.model.rod import Rod
 from rodjax.model.scene import Scene, needs_frames
 
-# Between neighbouring points [rad]; elements have one in their middle too.
-MOST_TURN = np.pi
+# What two frames tell is less [rad]; elements have one in their middle too.
+HALF_TURN = np.pi
 POINTS_OF_SEGMENT = {"finite_difference": 1, "hermite": 2}
 # Equal parts of a rod in each of which what varies along it counts as constant.
 PARTS = 1024

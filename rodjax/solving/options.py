@@ -16,7 +16,7 @@ from rodjax.discretization.finite_difference import Polyline
 from rodjax.discretization.framed_curve import FramedCurve
 from rodjax.discretization.nodes import LEAST_ELEMENT
 from rodjax.discretization.shape import Shape
-from rodjax.discretization.turning import MOST_TURN, turn_between_points
+from rodjax.discretization.turning import HALF_TURN, turn_between_points
 from rodjax.model.plane import check_planar
 from rodjax.model.scene import Scene, dead_end_moment, has_contacts, has_node_positions, has_potential, needs_frames
 from rodjax.solving.guess import Guess
@@ -130,7 +130,7 @@ def checked_options(
             _check_turning(scene, segments, discretization)
     elif isinstance(guess, Equilibrium):
         segments = max(guess.s.shape[-1] - 1, least)
-        if may_turn and _turn(scene, segments, discretization) >= MOST_TURN:
+        if may_turn and _turn(scene, segments, discretization) >= HALF_TURN:
             segments = _size_for_turning(scene, discretization)
     elif rtol is not None and is_known(scene, guess):
         wanted = SPAN_SEGMENTS * (len(scene.clips) + 1) if scene.clips else 0
@@ -177,9 +177,9 @@ def _turn(scene: Scene, segments: int, discretization: Discretization) -> float:
 def _check_turning(scene: Scene, segments: int, discretization: Discretization) -> None:
     """Raises where the frames on a mesh of so many segments could not tell how far the rod turns."""
     turn = _turn(scene, segments, discretization)
-    if turn >= MOST_TURN:
+    if turn >= HALF_TURN:
         raise ValueError(
-            f"segments must be some {math.ceil(1.1 * segments * turn / MOST_TURN)} or more, as the rod at rest, or by "
+            f"segments must be some {math.ceil(1.1 * segments * turn / HALF_TURN)} or more, as the rod at rest, or by "
             f"its turns, turns by {turn / (2 * math.pi):.2g} of a whole turn between neighbouring frames (two for each "
             f"element), which tell less than half of one: got a mesh of {segments}"
         )

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from rodjax.checks import ROTATION_TOLERANCE, Numbers, is_known, namespace
 from rodjax.discretization.cells import segments_for_jumps
-from rodjax.discretization.turning import MOST_TURN, turn_between_points
+from rodjax.discretization.turning import HALF_TURN, turn_between_points
 from rodjax.model.along import Along, Smooth, Steps
 from rodjax.model.obstacles import Box, Capsule, Cylinder, Pipe, Plane, Sphere, Union
 from rodjax.model.rod import ARCLENGTH_TOLERANCE, Law, Rod
@@ -72,7 +72,7 @@ def with_ranges(scenes: Scene, result: Equilibrium) -> Equilibrium:
         is_wrong |= needed[0] > segments
     turn = turn_between_points(scenes, segments, result.discretization)
     if turn is not None:
-        is_wrong |= turn >= MOST_TURN
+        is_wrong |= turn >= HALF_TURN
     flags = (
         jnp.where(is_wrong, Status.OUT_OF_RANGE, result.status),
         result.converged & ~is_wrong,

@@ -28,6 +28,8 @@ def wire() -> rj.Equilibrium:
 COVARIANCE = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]) * 1e-8
 OF_WIRE = [Tolerance("end.position", COVARIANCE), Tolerance("rod.length", 1e-4)]
 LIMITS = Limits(end_force=104.0, bend_radius=5.0)
+# Of `CHUNKS`: samples sixteen at a time, in the program of the few solves.
+SIXTEEN = ((16, math.inf),)
 
 
 def test_a_taut_wire():
@@ -76,20 +78,21 @@ def test_rods_are_drawn_within_tolerances():
 
 
 @pytest.mark.slow
-def test_the_softest_motion_of_a_rod_that_slides():
-    """Its deviation beside the difference of two solves."""
+def test_the_softest_motion_of_a_rod_that_slides(monkeypatch):
+    """Its deviation beside the difference of two solves; without the few solves, which tell nothing of it."""
+    monkeypatch.setattr("rodjax.routing.tolerances.by_few", lambda *_: (0,))
 
     def scene(EI: float) -> Scene:
         ends = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.6, 0.2, 0.0), frame((1, 1, 0)))
         return Scene(Rod(1.0, EI, 1.0, EA), *ends, clips=[Clip(0.5, (0.35, 0.05, 0.1), sliding=True)])
 
-    result = rj.solve(scene(1.0), segments=12, solver=rj.Newton(tolerance=1e-12))
+    def solved(EI: float) -> rj.Equilibrium:
+        return rj.solve(scene(EI), segments=12, solver=rj.Newton(tolerance=1e-12))
+
+    result = solved(1.0)
     envelope = rj.tolerances(result, [Tolerance("rod.EI", 0.001)])
     assert envelope.stiffness == float(rj.lowest_mode(result).stiffness)
-    most, least = (
-        rj.lowest_mode(rj.solve(scene(EI), segments=12, guess=result, solver=rj.Newton(tolerance=1e-12))).stiffness
-        for EI in (1.001, 0.999)
-    )
+    most, least = (rj.lowest_mode(solved(EI)).stiffness for EI in (1.001, 0.999))
     # Differences of second order.
     assert envelope.stiffness_deviation == pytest.approx(abs(float(most - least)) / 2, rel=1e-4)
 
@@ -115,12 +118,13 @@ def test_rods_that_do_not_come_to_rest_are_left_out(monkeypatch):
         return eqx.tree_at(lambda rods: (rods.converged, rods.nodes, rods.start_force), rods, parts)
 
     monkeypatch.setattr(scatter, "solve_stack", solved)
-    few = rj.tolerances(wire(), OF_WIRE, limits=LIMITS)
-    many = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=2000)
-    # The first of each call, which takes 256 rods at most.
+    monkeypatch.setattr("rodjax.paths.batch.CHUNKS", SIXTEEN)
+    few = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=0)
+    many = rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=640)
+    # The first of each call, which takes 16 rods at most.
     assert few.flags["rod"].startswith("1 of the rods with other numbers did not come to rest")
-    assert many.flags["rod"].startswith("8 of the rods")
-    assert many.samples == 1992
+    assert many.flags["rod"].startswith("40 of the rods")
+    assert many.samples == 600
     assert set(few.flags) == set(many.flags) == {"rod", "bend radius"}
     assert many.sampled is not None
     assert np.all(np.isfinite(many.sampled.position))
@@ -131,7 +135,7 @@ def held_by_clips() -> tuple[rj.Equilibrium, list[Tolerance], Limits, list]:
     rod = problems.cable(40.0)
     clips = [Clip(0.3, (0.25, 0.08, -0.05), (1, 0.2, -0.1)), Clip(0.65, (0.5, 0.15, 0.05))]
     ends = Clamp(ORIGIN, frame((1, 0, -1))), Clamp((0.75, 0.2, 0.0), frame((1, 1, 0)))
-    result = rj.solve(Scene(rod, *ends, (0, 0, -9.81), clips=clips), segments=32)
+    result = rj.solve(Scene(rod, *ends, (0, 0, -9.81), clips=clips), segments=12)
     given = [
         *(Tolerance(f"clips.{k}.position", 5e-4) for k in range(2)),
         Tolerance("clips.0.tangent", 0.005),
@@ -163,7 +167,6 @@ def test_a_cable_in_clips_beside_a_monte_carlo():
     assert sampled is not None
     assert envelope.samples == 5_000
     assert envelope.flags == {}
-    assert rj.tolerances(result, given, limits=limits, obstacles=obstacles).flags == {}
     # The moment of a clip that holds no direction is none.
     moved = first.deviation > 0
     assert int(np.sum(~moved)) == 1
@@ -181,8 +184,9 @@ def test_a_cable_in_clips_beside_a_monte_carlo():
 
 
 @pytest.mark.slow
-def test_a_column_near_buckling_is_flagged_and_sampled():
+def test_a_column_near_buckling_is_flagged_and_sampled(monkeypatch):
     """Between clamps it buckles at 4 pi^2 EI/L^2; a small side force keeps the bow to one side."""
+    monkeypatch.setattr("rodjax.paths.batch.CHUNKS", SIXTEEN)
     rod = Rod(1.0, 1.0, 1.0, EA)
     sigma = 4e-5
 
@@ -219,7 +223,9 @@ def test_a_column_near_buckling_is_flagged_and_sampled():
         rod, Clamp(ORIGIN, LEVEL), Clamp((end[8], 0, 0), LEVEL), point_forces=[PointForce(0.5, (0, 0, 0.005))]
     )
     scenes = [eqx.tree_at(lambda s: s.end.position, nominal, jax.numpy.array([x, 0.0, 0.0])) for x in end]
-    rods = solve_batch(scenes, segments=8)
+    # Warm, in the program of the samples.
+    options = dict(segments=8, discretization=few.scattering.equilibrium.discretization, strain_limit=None)
+    rods = solve_batch(scenes, guess=few.scattering.equilibrium, **options)
     moments = np.linalg.norm(rods.start_moment, axis=1)
     assert np.all(np.diff(moments) < 0)
     expected = stats.norm.cdf(np.interp(limit, moments[::-1], z[::-1]))
@@ -285,12 +291,10 @@ def test_bad_arguments():
 
 
 def test_samples_by_threads_and_an_executor_are_the_same(monkeypatch):
-    monkeypatch.setattr("rodjax.paths.batch.CHUNKS", ((16, math.inf),))
-    tolerance = [Tolerance("rod.length", 1e-3)]
-    equilibrium = rj.solve(rj.problems.hanging_cable(), segments=4)
+    monkeypatch.setattr("rodjax.paths.batch.CHUNKS", SIXTEEN)
     with ThreadPoolExecutor(2) as engine:
         kinds: list[dict] = [{"threads": 1}, {"threads": 2}, {"executor": engine}]
-        first, *others = (rj.tolerances(equilibrium, tolerance, samples=40, **kind) for kind in kinds)
+        first, *others = (rj.tolerances(wire(), OF_WIRE, limits=LIMITS, samples=40, **kind) for kind in kinds)
     assert first.samples == 40
     for other in others:
         for ours, theirs in zip(vars(other.sampled).values(), vars(first.sampled).values(), strict=True):

@@ -149,6 +149,31 @@ def compiled_at_once():
         yield
 
 
+@pytest.fixture
+def by_numpy_code(monkeypatch):
+    """NumPy code for sweeps and windows too, which compile at once: where their numbers are what is tested."""
+    for module in ("programs.tasks", "window.session"):
+        monkeypatch.setattr(f"rodjax.{module}.compiled_only", lambda is_so=True: contextlib.nullcontext())
+
+
+@pytest.fixture(scope="session")
+def for_processes():
+    """`with for_processes():` the library's programs are made as processes make them that tests start, and kept where
+    these look for them.
+    """
+
+    @contextlib.contextmanager
+    def kept():
+        rodjax.keep_programs(os.environ["RODJAX_CACHE"])
+        try:
+            with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+                yield
+        finally:
+            rodjax.keep_programs(False)
+
+    return kept
+
+
 @pytest.fixture(scope="session")
 def cable() -> rodjax.Rod:
     """Cable C: 1 m long, 10 mm thick, EI = 4.9087e-3 N m^2, GJ/EI = 2/3, EA L^2/EI = 1.6e5."""

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,28 @@ from rodjax.sweeps.sweep import sweep
 pytest.importorskip("distributed", reason="Dask is not installed: pip install 'rodjax[cluster]'")
 PAGE = Path(__file__).parents[1] / "docs" / "cluster.md"
 CHUNK = 4
-# 400 cases in 100 chunks, so that there is time to kill somebody.
-MANY = GRID.replace("count = 5", "count = 200")
+# In 60 chunks, so that there is time to kill somebody.
+CASES = 240
+MANY = GRID.replace("count = 5", f"count = {CASES // 2}")
+# Of which programs are small.
+CANTILEVER = """
+[rod]
+length = "1 m"
+EI = "4.9e-3 N m^2"
+GJ = "3.3e-3 N m^2"
+EA = "785 N"
+[start]
+support = "clamp"
+position = "[0, 0, 0] m"
+tangent = [1, 0, 0]
+d2 = [0, 1, 0]
+[end]
+support = "free"
+force = "[0, 0, -0.01] N"
+[solve]
+segments = 4
+discretization = "finite_difference"
+"""
 SECONDS = 120.0
 
 
@@ -76,6 +97,17 @@ def wait_until(holds: Callable[[], Any]) -> None:
         time.sleep(0.01)
 
 
+@contextmanager
+def threads_as_cluster() -> Iterator[str]:
+    """The address of a scheduler with a worker, which are threads of this process that hear on 127.0.0.1."""
+    from distributed import LocalCluster
+
+    settings: dict[str, Any] = dict(processes=False, protocol="tcp", host="127.0.0.1", dashboard_address=None)
+    with LocalCluster(n_workers=1, threads_per_worker=1, **settings) as cluster:
+        assert cluster.scheduler_address.startswith("tcp://127.0.0.1:")
+        yield cluster.scheduler_address
+
+
 @pytest.fixture
 def cluster(tmp_path) -> Iterator[Cluster]:
     folder = tmp_path / "cluster"
@@ -92,63 +124,65 @@ def files(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     Path("scene.toml").write_text(SCENE)
     Path("grid.toml").write_text(MANY)
-    sweep("scene.toml", "grid.toml", "whole.h5", chunk=CHUNK)
     return tmp_path
 
 
-def command(cluster: Cluster, *more: str) -> list[str]:
-    arguments = ["sweep", "scene.toml", "--over", "grid.toml", "-o", "out.h5", "--chunk", str(CHUNK)]
-    return [*arguments, "--scheduler", cluster.address, *more]
+def command(address: str, output: str, *more: str) -> list[str]:
+    arguments = ["sweep", "scene.toml", "--over", "grid.toml", "-o", output, "--chunk", str(CHUNK)]
+    return [*arguments, "--scheduler", address, *more]
 
 
-def started(cluster: Cluster) -> subprocess.Popen:
-    arguments = [sys.executable, "-W", "error", "-m", "rodjax", *command(cluster)]
+def started(cluster: Cluster, output: str) -> subprocess.Popen:
+    """The command, of which some chunks are done and more are not."""
+    arguments = [sys.executable, "-W", "error", "-m", "rodjax", *command(cluster.address, output)]
     # How long a scheduler that is lost is looked for.
     environment = {**os.environ, "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s"}
     options: dict[str, Any] = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     process = subprocess.Popen(arguments, **options)
-    wait_until(lambda: len(list(Path("out.h5.parts").glob("chunk-*.h5"))) > 5 or process.poll() is not None)
+    wait_until(lambda: done(output) > 5 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
     return process
 
 
+def done(output: str) -> int:
+    return len(list(Path(f"{output}.parts").glob("chunk-*.h5")))
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not PAGE.exists(), reason="the tests run without the repository")
-def test_the_block_of_the_documentation_runs(cluster, tmp_path, monkeypatch):
+def test_the_block_of_the_documentation_runs(tmp_path, monkeypatch, by_numpy_code):
+    """On a worker in this process, which no compiler is needed for."""
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(SCENE)
+    Path("scene.toml").write_text(CANTILEVER)
     Path("table.csv").write_text("rod.EI\n0.004\n0.005\n")
     scene = read_scene("scene.toml")
     points = rj.solve(scene, segments=4).nodes[1:-1]
     experiments = [rj.Experiment(scene, [rj.Centerline(points, sd=1e-3)])] * 2
-    cluster.scheduler()
-    cluster.worker()
     block = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)[0]
     assert "tcp://10.0.0.1:8786" in block
     variables = {"__name__": "__main__", "experiments": experiments}
-    exec(block.replace("tcp://10.0.0.1:8786", cluster.address), variables)
+    with threads_as_cluster() as address:
+        exec(block.replace("tcp://10.0.0.1:8786", address), variables)
     assert summary(Path("sweep.h5")).cases == 2
 
 
 @pytest.mark.slow
-def test_a_worker_is_killed(cluster, files):
-    cluster.scheduler()
-    first, _ = cluster.worker(), cluster.worker()
-    process = started(cluster)
+def test_a_worker_and_the_scheduler_are_killed(cluster, files, capsys, for_processes):
+    """And the sweep is finished, or resumed on another cluster; its bits are those of a sweep without one."""
+    with for_processes():
+        sweep("scene.toml", "grid.toml", "whole.h5", chunk=CHUNK)
+    scheduler = cluster.scheduler()
+    first, second = cluster.worker(), cluster.worker()
+    process = started(cluster, "one.h5")
     first.send_signal(signal.SIGKILL)
     out, err = process.communicate(timeout=SECONDS)
     assert process.returncode == 0, err
-    assert "400 of 400 cases converged" in out
+    assert f"{CASES} of {CASES} cases converged" in out
     assert err in ("", f"rodjax: the scheduler at {cluster.address} has no workers yet: waiting for them\n")
-    assert_same("out.h5", "whole.h5")
-    assert sorted(path.name for path in files.glob("out*")) == ["out.h5"]
+    assert_same("one.h5", "whole.h5")
+    assert sorted(path.name for path in files.glob("one*")) == ["one.h5"]
 
-
-@pytest.mark.slow
-def test_the_scheduler_is_killed_and_the_sweep_resumed(cluster, files, capsys):
-    scheduler = cluster.scheduler()
-    workers = cluster.worker(), cluster.worker()
-    process = started(cluster)
+    process = started(cluster, "two.h5")
     scheduler.send_signal(signal.SIGKILL)
     _, err = process.communicate(timeout=SECONDS)
     assert process.returncode == 2, err
@@ -156,16 +190,14 @@ def test_the_scheduler_is_killed_and_the_sweep_resumed(cluster, files, capsys):
     assert len(err.splitlines()) <= 2
     assert said.startswith("rodjax: ")
     assert "go on with --resume" in said
-    done = len(list(Path("out.h5.parts").glob("chunk-*.h5")))
-    assert 5 < done < 100
-    for worker in workers:
-        worker.kill()
-    cluster.scheduler()
-    cluster.worker()
-    assert main(command(cluster, "--resume")) == 0
+    chunks, count = CASES // CHUNK, done("two.h5")
+    assert 5 < count < chunks
+    second.kill()
+    with threads_as_cluster() as address:
+        assert main(command(address, "two.h5", "--resume")) == 0
     out, _ = capsys.readouterr()
-    assert f"resumed: {done} of 100 chunks are there" in out
-    assert_same("out.h5", "whole.h5")
+    assert f"resumed: {count} of {chunks} chunks are there" in out
+    assert_same("two.h5", "whole.h5")
 
 
 def test_a_scheduler_that_does_not_answer_is_told_in_one_line(files, capsys, monkeypatch):

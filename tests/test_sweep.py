@@ -78,12 +78,13 @@ def files(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The result of an uninterrupted sweep."""
+def whole(tmp_path_factory, for_processes):
+    """The result of an uninterrupted sweep, by compiled programs."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "scene.toml").write_text(SCENE)
     (folder / "grid.toml").write_text(GRID)
-    sweep(folder / "scene.toml", folder / "grid.toml", folder / "whole.h5", chunk=CHUNK)
+    with for_processes():
+        sweep(folder / "scene.toml", folder / "grid.toml", folder / "whole.h5", chunk=CHUNK)
     return folder / "whole.h5"
 
 
@@ -578,7 +579,7 @@ def test_without_segments_the_first_case_decides_on_the_mesh(files, whole, capsy
 
 
 @pytest.mark.slow
-def test_the_mesh_of_the_first_case_serves_cases_like_it(files):
+def test_the_mesh_of_the_first_case_serves_cases_like_it(files, by_numpy_code):
     Path("scene.toml").write_text(SCENE.replace('segments = 4\ndiscretization = "finite_difference"', ""))
     sweep("scene.toml", "grid.toml", "out.h5", chunk=CHUNK)
     found = contents("out.h5")
@@ -593,7 +594,7 @@ SHARP = '"end.position.0" = [0.9, 0.8, 0.6, 0.4, 0.2]\n'
 
 
 @pytest.mark.slow
-def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
+def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch, by_numpy_code):
     Path("scene.toml").write_text(ROUGH)
     Path("grid.toml").write_text(SHARP)
     command = ["sweep", "scene.toml", "--over", "grid.toml", "-o"]
@@ -628,7 +629,7 @@ def test_every_case_is_within_rtol_or_counted(files, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_quantities_are_chosen_by_name(files, capsys):
+def test_quantities_are_chosen_by_name(files, capsys, by_numpy_code):
     """Those of single solves on the same mesh, to the solver's tolerance; and as a table."""
     scene = SCENE.replace('segments = 4\ndiscretization = "finite_difference"', "segments = 16")
     scene = scene.replace("[rod]", '[rod]\nradius = "4 mm"')

@@ -208,8 +208,9 @@ FONTS = get_cachedir()
 
 
 def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
-    """And reads no file but the scene and programs, and writes none."""
-    rj.write_scene(scene(), tmp_path / "scene.toml", segments=10)
+    """And reads no file but the scene and programs, and writes none. It compiles what a cantilever needs."""
+    cantilever = rj.Scene(rj.problems.cable(), rj.Clamp((0, 0, 0), LEVEL), rj.Free(force=(0, 0, -1e-3)))
+    rj.write_scene(cantilever, tmp_path / "scene.toml", segments=4)
     main = WATCHED
     command = [sys.executable, "-W", "error", "-c", main, "view", "scene.toml", "--port", "0", "--no-browser"]
     process = subprocess.Popen(
@@ -237,7 +238,7 @@ def test_the_command_opens_a_window_and_ends_at_ctrl_c(tmp_path):
     assert not listening(port, "127.0.0.1")
 
 
-def test_what_is_recorded_is_played_and_undone_without_a_browser():
+def test_what_is_recorded_is_played_and_undone_without_a_browser(by_numpy_code):
     """By the commands that the buttons give."""
     window = rj.view(scene(), 0, open_browser=False, block=False, segments=10)
     session, panel = window.session, window.panel

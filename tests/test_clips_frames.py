@@ -1,10 +1,12 @@
 """Clips on rods by frames, and clips that hold the twist: closed forms, rods by tangents, rods cut at the clips."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy_programs import by_numpy
+from numpy_programs import Through, by_numpy
 from test_clips import BETWEEN_PINS, GRAVITY, LEVEL, ORIGIN, TIGHT, in_space, supported, three_moments, weight
 
 import rodjax as rj
@@ -136,9 +138,13 @@ def test_a_twisted_span_buckles_by_itself():
     assert np.all(np.asarray(branch.index)[np.asarray(branch.parameter) < float(found.parameter) - 1e-6] == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_route_finds_how_a_clip_should_be_turned():
-    """A straight rod costs nothing in a clip that is turned by nothing."""
+    """A straight rod costs nothing in a clip that is turned by nothing.
+
+    Its parts are proven by others: frames as variables (`test_frames_of_clips_have_keys_and_names`), derivatives by
+    them (`test_derivatives_by_place_position_and_frame`) and the search (`test_route.py`).
+    """
     begin = Clip(0.4, (0.4, 0.0, 0.0), frame=rotate(LEVEL, (0.1, 0.2, -0.15)))
     scene = Scene(Rod(1.0, 1.0, GJ, 1e4), Clamp(ORIGIN, LEVEL), Clamp((1.0, 0, 0), LEVEL), clips=[begin])
     found = rj.route(scene, [rj.Turned("clips.0.frame", 0.5)], objective=rj.Objective(energy=1), starts=2, segments=8)
@@ -356,28 +362,25 @@ def test_derivatives_by_place_position_and_frame(is_plain):
         scene = Scene(problems.cable(20.0), ends.start, ends.end, GRAVITY, clips=[first, held])
     base = rj.solve(scene, **options)
     assert base.converged
-    direction = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (len(scene.clips), 7)))
+    direction = np.random.default_rng(0).uniform(-1, 1, (len(scene.clips), 7))
     frames = [None if clip.tangent is None else frame(clip.tangent) for clip in scene.clips]
 
-    def found(by):
-        return numbers(rj.solve(with_changes(scene, frames, by), guess=base, **options))
-
-    def derivatives(weights):
-        nowhere = jnp.zeros_like(direction)
-        values, change = jax.jvp(found, (nowhere,), (direction,))
-        return values, change, jax.vjp(found, nowhere)[1](weights)[0]
+    solve = functools.partial(rj.solve, guess=base, **options)
+    found = Through(functools.partial(with_changes, scene, frames), solve, numbers)
 
     def at(h):
         return found(h * direction)
 
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=found(0 * direction).shape))
-    values, change, by_weights = derivatives(weights)
+    nowhere = np.zeros_like(direction)
+    change = found.change(nowhere, direction)
     h = 1e-3
     expected = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
     # Differences of fourth order: h^4 of the fifth derivative, and roundings by h.
     np.testing.assert_allclose(change, expected, rtol=0, atol=1e-7 * float(np.max(np.abs(expected))))
-    np.testing.assert_allclose(values, found(0 * direction), rtol=1e-9, atol=1e-11 * float(np.max(np.abs(values))))
-    np.testing.assert_allclose(jnp.sum(by_weights * direction), jnp.sum(weights * change), rtol=1e-9)  # roundings
+    if not is_plain:  # its transpose: `test_a_reaction_is_the_derivative_of_the_energy` of test_clips
+        weights = np.random.default_rng(1).normal(size=change.shape)
+        by_weights = found.pulled(nowhere)(weights)
+        np.testing.assert_allclose(np.sum(by_weights * direction), np.sum(weights * change), rtol=1e-9)  # roundings
 
 
 @pytest.mark.slow
@@ -429,6 +432,23 @@ def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
     """Of spans, and of elements under loads without a potential of every kind, at both ends too."""
     from rodjax.solving.result_form import form_and_point
 
+    def both_ways(result, is_pushed):
+        form, point = form_and_point(result)
+        here = form.linearized(point)
+        generator = np.random.default_rng(0)
+        x = jnp.asarray(generator.normal(size=form.is_free.shape)) * form.is_free
+        y = jnp.asarray(generator.normal(size=here.constraint_residual.shape))
+        if is_pushed:
+            nodes = slice(-form.layout.size - 3 * len(form.field.s), -form.layout.size)
+            y = y.at[nodes].multiply(jnp.repeat(jnp.where(form.is_held, 0.0, 1.0), 3))  # a held node does not move
+
+        def residual_at(part):
+            change = form.layout.forces(form.force_components(y))
+            others = jax.tree.map(lambda change: part * change, form.others(y))
+            return form.residual_vectors(form.retract(point, here.bases, part * x, part * change, others))
+
+        return here.system.times(x, y), jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))[1]
+
     rod = Rod(1.0, (1.0, 1.5), 0.7, 1e4)
     loads = [
         *(rj.DistributedForce((0.5, 4.0, 3.0), follower=follows) for follows in (False, True)),
@@ -444,24 +464,7 @@ def test_systems_are_the_derivatives_of_what_is_out_of_balance(resting):
     ]
     for result in (resting, *pushed):
         assert result.converged
-        form, point = form_and_point(result)
-        here = by_numpy(form.linearized)(point)
-        generator = np.random.default_rng(0)
-        x = jnp.asarray(generator.normal(size=form.is_free.shape)) * form.is_free
-        y = jnp.asarray(generator.normal(size=here.constraint_residual.shape))
-        if result is not resting:
-            nodes = slice(-form.layout.size - 3 * len(form.field.s), -form.layout.size)
-            y = y.at[nodes].multiply(jnp.repeat(jnp.where(form.is_held, 0.0, 1.0), 3))  # a held node does not move
-
-        def residual_at(part, form=form, point=point, here=here, x=x, y=y):
-            change = form.layout.forces(form.force_components(y))
-            others = jax.tree.map(lambda change: part * change, form.others(y))
-            return form.residual_vectors(form.retract(point, here.bases, part * x, part * change, others))
-
-        expected = by_numpy(
-            lambda residual_at=residual_at: jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))[1]
-        )()
-        found = by_numpy(here.system.times)(x, y)
+        found, expected = by_numpy(both_ways)(result, is_pushed=result is not resting)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9 * float(np.max(np.abs(b))))  # the solver's 1e-12
 
@@ -650,12 +653,12 @@ def test_what_frames_in_clips_do_not_go_with_is_said():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["position", "tangent and moment"])
-def test_a_rod_that_slides_by_frames_is_that_by_tangents(kind):
-    """The same equations in other unknowns, on the same mesh; with its derivative."""
-    has_moment = kind != "position"
-    clip = Clip(0.4, (0.35, 0.0, 0.05), tangent=(1.0, 0.0, 0.2) if has_moment else None, sliding=True)
-    end = Free(moment=(0.2, 0.5, 0.1)) if has_moment else Free()
+@pytest.mark.parametrize("moment", [(0.0, 0.0, 0.0), (0.2, 0.5, 0.1)], ids=["no moment", "moment"])
+def test_a_rod_that_slides_by_frames_is_that_by_tangents(moment):
+    """The same equations in other unknowns, on the same mesh; with its derivative. Both cases share programs."""
+    has_moment = any(moment)
+    clip = Clip(0.4, (0.35, 0.0, 0.05), tangent=(1.0, 0.0, 0.2), sliding=True)
+    end = Free(moment=moment)
     found = []
     for EI in (1.0, (1.0, 1.0)):
 

@@ -1,13 +1,14 @@
 """Rods that touch obstacles, against closed forms, another solver, rods that touch nothing, and finite differences."""
 
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy_programs import by_numpy
+from numpy_programs import Through, by_numpy
 from scipy.integrate import solve_bvp
 
 import rodjax as rj
@@ -16,7 +17,7 @@ from rodjax.discretization.inner_contacts import Elements, Places
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.discretization.node_contacts import contacts_at
 from rodjax.model.supports import Support
-from rodjax.solving import options
+from rodjax.solving import equilibrium, options
 from rodjax.solving.options import checked_options
 from rodjax.solving.result_form import form_and_point
 
@@ -213,6 +214,7 @@ def test_a_rod_that_begins_across_a_box_and_stays_there_is_told(monkeypatch):
     """
     monkeypatch.setattr(options, "CONTACT_SEGMENTS", 8)
     monkeypatch.setattr(options, "SPAN_SEGMENTS", 4)
+    monkeypatch.setattr(equilibrium, "MOST_FAILURES", 2)
     with pytest.warns(rj.NotConvergedWarning, match=r"within obstacles\[0\] \(Box\) at s = "):
         result = rj.solve(across_a_box(clips=[rj.Clip(1.15, (0.76, 0, 0.095))]))
     assert not result.converged
@@ -233,7 +235,7 @@ def test_a_thin_pipe_between_nodes_carries_a_heavy_cable():
     s = np.linspace(0, 1, 65)
     above = np.stack([0.9 * s, 0 * s, 0.2 * s * (1 - s)], axis=1)
     pipe = rj.Capsule((0.45625, -1, -0.05), (0.45625, 1, -0.05), 0.001)
-    ends = Pin((0, 0, 0)), Pin((0.9, 0, 0))
+    ends = rj.Swivel((0, 0, 0), (0.9, 0, 0.2)), rj.Swivel((0.9, 0, 0), (0.9, 0, -0.2))
     scene = Scene(Rod(1.0, 1.0, 0.8, 1e6, 300.0, radius=RADIUS), *ends, (0, 0, -1.0), obstacles=[pipe])
     result = rj.solve(scene, guess=rj.Guess(above))
     assert result.converged
@@ -286,12 +288,17 @@ def test_contact_points_within_elements_have_exact_derivatives():
     def pushed(change: jax.Array) -> jax.Array:
         return -jnp.sum(found(change)[1].gaps[0] * pressures)
 
-    def derivatives(change: jax.Array) -> tuple[jax.Array, jax.Array, Places]:
-        elements, place = found(change)
-        return place.rates(elements)[0], place.second(elements, (capsule,), jnp.asarray(pressures)[None]), place
+    everywhere = np.linspace(0, 1, 2001)
 
-    nothing = jnp.zeros((3, 5))
-    rates, blocks, place = (jax.tree.map(np.asarray, part) for part in by_numpy(derivatives)(nothing))
+    def derivatives(change: jax.Array) -> tuple[jax.Array, jax.Array, Places, jax.Array]:
+        elements, place = found(change)
+        second = place.second(elements, (capsule,), jnp.asarray(pressures)[None])
+        points = jax.vmap(lambda t: elements.at(jnp.full(2, t)))(jnp.asarray(everywhere))
+        thinner = 1e-5 + 8e-5 * (2 * everywhere[:, None] - 1) ** 2
+        return place.rates(elements)[0], second, place, capsule.distance(jnp.moveaxis(points, 1, -1)) + 0.05 * thinner
+
+    nothing = np.zeros((3, 5))
+    rates, blocks, place, distances = (jax.tree.map(np.asarray, part) for part in by_numpy(derivatives)(nothing))
     assert 0.5 < place.t[0, 0] < 0.75
     assert place.t[0, 1] == 0
     first, second = np.zeros((3, 5)), np.zeros((3, 5, 3, 5))
@@ -302,19 +309,15 @@ def test_contact_points_within_elements_have_exact_derivatives():
     expected = by_numpy(jax.hessian(pushed))(nothing)
     np.testing.assert_allclose(second, expected, rtol=0, atol=1e-14 * np.max(np.abs(expected)))
     # No place of 2001 is nearer; the second derivative of the gap by the place is 23 radii an element's length.
-    elements, _ = found(nothing)
-    everywhere = np.linspace(0, 1, 2001)
-    points = np.asarray(jax.vmap(lambda t: elements.at(jnp.full(2, t)))(everywhere))
-    thinner = 1e-5 + 8e-5 * (2 * everywhere[:, None] - 1) ** 2
-    gaps = np.asarray(capsule.distance(np.moveaxis(points, 1, -1))) - 0.05 * (1 - thinner)
-    np.testing.assert_allclose(place.gaps[0], np.min(gaps, axis=0), rtol=0, atol=0.9 * 2.5e-4**2)
+    np.testing.assert_allclose(place.gaps[0], np.min(distances - 0.05, axis=0), rtol=0, atol=0.9 * 2.5e-4**2)
     # On a circle of an element's length/8 points are where the circle is, to the sixth order.
     angle, turn = np.array([0.0, 0.125]), np.zeros((3, 2, 2))
     circle = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)
     along = np.stack([np.cos(angle), 0 * angle, np.sin(angle)])
-    of_circle = *map(jnp.asarray, (circle, along, turn)), jnp.ones(2), jnp.asarray(angle)
+    of_circle = circle, along, turn, np.ones(2), angle
+    point_at = by_numpy(lambda part, *nodes: Elements.of(*nodes).at(part[None])[:, 0])
     for part in (0.25, 0.5):
-        point = Elements.of(*of_circle).at(jnp.full(1, part))[:, 0]
+        point = np.asarray(point_at(np.float64(part), *of_circle))
         assert abs(np.hypot(point[0], 1 - point[2]) - 1) < 0.125**6
     np.testing.assert_allclose(point, [np.sin(0.0625), 0, 1 - np.cos(0.0625)], rtol=0, atol=0.125**6)
 
@@ -328,7 +331,7 @@ def test_without_gravity_there_are_derivatives_by_it():
         rod, end = Rod(1.0, 1.0, 0.8, 1e4, 0.5, radius=0.01), Free(force=(0, 0, -3.0))
         down = jnp.array([0.0, 0.0, -1.0]) * gravity
         scene = Scene(rod, Clamp((0, 0, 0.05), LEVEL), end, down, obstacles=[floor])
-        return rj.solve(scene, segments=6, solver=rj.Newton(tolerance=1e-11)).nodes[3, 2]
+        return rj.solve(scene, segments=32, solver=rj.Newton(tolerance=1e-11)).nodes[16, 2]
 
     step = 1e-4
     difference = (float(height(step)) - float(height(-step))) / (2 * step)
@@ -350,7 +353,7 @@ def test_a_rod_too_short_for_its_side_is_told_by_how_much():
     lacking = f"{needed - 0.5:.2g}"
     message = rf"at least {lacking} m too short to pass obstacles\[0\] \(Cylinder\) on the side where it was"
     with pytest.warns((rj.NotConvergedWarning, rj.OverstretchedWarning), match=message):
-        rj.solve(scene, segments=32, guess=below)
+        rj.solve(scene, segments=32, guess=below, solver=rj.Newton(max_iterations=20))
 
 
 # --- over a cylinder -------------------------------------------------------------------------------------------------
@@ -395,6 +398,7 @@ def among_obstacles(p: jax.Array) -> Scene:
 
 
 NOMINAL = jnp.zeros(6)
+SEGMENTS = 24
 
 
 @pytest.fixture(scope="module")
@@ -402,7 +406,7 @@ def touching() -> rj.Equilibrium:
     over = np.stack(
         [np.linspace(0, 0.8, 9), np.linspace(0, 0.03, 9), [0.2, 0.21, 0.22, 0.22, 0.2, 0.15, 0.1, 0.05, 0.1]]
     )
-    return solved(among_obstacles(NOMINAL), segments=48, guess=rj.Guess(over.T))
+    return solved(among_obstacles(NOMINAL), segments=SEGMENTS, guess=rj.Guess(over.T))
 
 
 def test_clips_and_obstacles_share_the_weight(touching):
@@ -417,7 +421,7 @@ def test_clips_and_obstacles_share_the_weight(touching):
 
 def test_no_step_along_a_cylinder_is_shortened(touching):
     """Before, with contacts as stiff in the merit as in the model, this one did not converge in 100 iterations."""
-    there = rj.solve(among_obstacles(NOMINAL.at[5].set(-0.02)), segments=48, guess=touching)
+    there = rj.solve(among_obstacles(NOMINAL.at[5].set(-0.02)), segments=SEGMENTS, guess=touching)
     assert there.converged
     assert int(there.evaluations) == int(there.iterations) + 1
     assert int(there.iterations) <= 6  # 5 seen
@@ -456,68 +460,66 @@ def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences(touching):
-    def seen(p, tolerance=1e-8):
-        result = rj.solve(among_obstacles(p), segments=48, guess=touching, solver=rj.Newton(tolerance=tolerance))
+    def numbers(result):
         contacts = jnp.sum(result.contact_forces, axis=0)
-        return jnp.concatenate(
-            [
-                result.start_force,
-                result.end_moment,
-                result.nodes[16],
-                contacts,
-                result.clip_forces[0],
-                result.energy[None],
-            ]
-        )
+        ends = result.start_force, result.end_moment
+        return jnp.concatenate([*ends, result.nodes[8], contacts, result.clip_forces[0], result.energy[None]])
 
-    forward = np.asarray(jax.jacfwd(seen)(NOMINAL))
-    step, tight = 1e-6, 1e-11
-    there, back = (
-        np.stack([seen(NOMINAL.at[k].add(change), tight) for k in range(6)], axis=1) for change in (step, -step)
-    )
+    def solve(scene, tolerance=1e-8):
+        return rj.solve(scene, segments=SEGMENTS, guess=touching, solver=rj.Newton(tolerance=tolerance))
+
+    seen = Through(among_obstacles, solve, numbers)
+    tight = Through(among_obstacles, functools.partial(solve, tolerance=1e-11), numbers)
+    nominal, step = np.zeros(6), 1e-6
+    there, back = (np.stack([tight(nominal + change * one) for one in np.eye(6)], axis=1) for change in (step, -step))
     differences = (there - back) / (2 * step)
+    # A row at a time, by the transpose; columns are those of `test_derivatives_of_a_curved_cable_in_a_clip_on_a_floor`.
+    pulled = seen.pulled(nominal)
+    backward = np.stack([pulled(one) for one in np.eye(len(differences))])
     # A difference loses 1e-11 EI/L^2 of residual over 1e-6; the largest derivatives are some 100.
     sizes = np.max(np.abs(differences), axis=1, keepdims=True)
-    np.testing.assert_allclose(forward / sizes, differences / sizes, rtol=0, atol=1e-5)
-    weights = jnp.linspace(1.0, 2.0, len(forward))
-    backward = jax.grad(lambda p: weights @ seen(p))(NOMINAL)
-    np.testing.assert_allclose(backward, weights @ forward, rtol=1e-9, atol=1e-9 * np.max(sizes))
+    np.testing.assert_allclose(backward / sizes, differences / sizes, rtol=0, atol=1e-5)
 
 
 def test_the_system_is_the_derivative_of_what_is_out_of_balance(touching):
     """With what the curvature of the cylinder changes as nodes slide on it."""
-    form, point = form_and_point(touching)
     generator = np.random.default_rng(0)
-    # The equilibrium is touched within an element: at nodes, too.
-    count = len(touching.scene.obstacles)
-    at_nodes = jnp.asarray(generator.uniform(1.0, 2.0, (count, point.nodal.pressures.shape[1])))
-    nodal = dataclasses.replace(point.nodal, pressures=point.nodal.pressures.at[:count].set(at_nodes))
-    point = dataclasses.replace(point, nodal=nodal)
-    here = by_numpy(form.linearized)(point)
-    rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
-    change = jnp.asarray(generator.normal(size=point.end_force.shape))
-    displacements = jnp.asarray(generator.normal(size=point.nodal.positions.shape))
-    displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
-    # Pressures stay, as their contacts are soft in the system.
-    step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
 
-    def residual_at(part):
-        others = jax.tree.map(lambda change: part * change, step)
-        return form.residual_vectors(form.retract(point, here.bases, part * rotation, part * change, others))
+    def both_ways(result):
+        form, point = form_and_point(result)
+        # The equilibrium is touched within an element: at nodes, too.
+        count = len(result.scene.obstacles)
+        at_nodes = jnp.asarray(generator.uniform(1.0, 2.0, (count, point.nodal.pressures.shape[1])))
+        nodal = dataclasses.replace(point.nodal, pressures=point.nodal.pressures.at[:count].set(at_nodes))
+        point = dataclasses.replace(point, nodal=nodal)
+        here = form.linearized(point)
+        rotation = jnp.asarray(generator.normal(size=here.gradient.shape))
+        change = jnp.asarray(generator.normal(size=point.end_force.shape))
+        displacements = jnp.asarray(generator.normal(size=point.nodal.positions.shape))
+        displacements = jnp.where(form.is_held[:, None], 0.0, displacements)
+        # Pressures stay, as their contacts are soft in the system.
+        step = NodalChange(displacements, jnp.zeros_like(point.nodal.pressures))
 
-    (_, rows), (_, expected) = by_numpy(lambda: jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),)))()
-    before = len(rows) - form.layout.size - displacements.size - step.pressures.size
-    multipliers = jnp.concatenate(
-        [jnp.zeros(before), step.pressures.ravel(), displacements.ravel(), form.layout.components(change)]
-    )
-    _, found = by_numpy(here.system.times)(rotation, multipliers)
-    nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
+        def residual_at(part):
+            others = jax.tree.map(lambda change: part * change, step)
+            return form.residual_vectors(form.retract(point, here.bases, part * rotation, part * change, others))
+
+        (_, rows), (_, expected) = jax.jvp(residual_at, (jnp.array(0.0),), (jnp.array(1.0),))
+        before = len(rows) - form.layout.size - displacements.size - step.pressures.size
+        multipliers = jnp.concatenate(
+            [jnp.zeros(before), step.pressures.ravel(), displacements.ravel(), form.layout.components(change)]
+        )
+        _, found = here.system.times(rotation, multipliers)
+        nodes = slice(-form.layout.size - displacements.size, -form.layout.size)
+        curved = contacts_at(form, point).inner
+        assert curved is not None
+        return found[nodes], expected[nodes], curved
+
+    found, expected, curved = map(np.asarray, by_numpy(both_ways)(touching))
     # Where a node is held the system holds its displacement, which is none.
-    np.testing.assert_allclose(found[nodes], expected[nodes], atol=1e-9 * float(jnp.max(jnp.abs(expected[nodes]))))
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.max(np.abs(expected)))
     # The cylinder curves where it is touched.
-    curved = by_numpy(lambda point: contacts_at(form, point))(point).inner
-    assert curved is not None
-    assert float(jnp.max(jnp.abs(curved))) > 1.0
+    assert np.max(np.abs(curved)) > 1.0
 
 
 def test_what_is_far_away_changes_nothing():
@@ -537,7 +539,7 @@ def test_what_is_far_away_changes_nothing():
 
 @pytest.mark.slow
 def test_batches_and_paths_touch_too():
-    scenes = [lifted(force) for force in (0.3, 0.32, 0.34)]
+    scenes = [lifted(force) for force in (0.3, 0.34)]
     each = [rj.solve(scene, segments=32) for scene in scenes]
     batch, path = rj.solve_batch(scenes, segments=32), rj.solve_path(scenes, segments=32)
     for k, one in enumerate(each):
@@ -588,17 +590,24 @@ def test_a_flat_cable_lies_as_a_plain_one(tmp_path):
     assert by_frames.iterations <= plain.iterations + 1
     np.testing.assert_allclose(by_frames.error_estimate, plain.error_estimate, rtol=0, atol=1e-3)
 
-    def height(stiffness, other):
-        return rj.solve(scene(flat(stiffness, other)), segments=32, guess=by_frames).nodes[-1, 2]
+    def solve(scene, tolerance=1e-8):
+        return rj.solve(scene, segments=32, guess=by_frames, solver=rj.Newton(tolerance=tolerance))
 
-    in_plane, across = jax.grad(height, argnums=(0, 1))(EI, 3 * EI)
-    of_plain = jax.grad(lambda stiffness: rj.solve(scene(Rod(1.0, stiffness, GJ, 1e6, DENSITY, radius=RADIUS)),
-                                                   segments=32).nodes[-1, 2])(EI)  # fmt: skip
-    step, tight = 1e-5 * EI, rj.Newton(tolerance=1e-11)
-    there, back = (
-        rj.solve(scene(flat(stiffness, 3 * EI)), segments=32, guess=by_frames, solver=tight).nodes[-1, 2]
-        for stiffness in (EI + step, EI - step)
-    )
+    def made(stiffnesses):
+        return scene(flat(*stiffnesses))
+
+    def height(result):
+        return result.nodes[-1, 2]
+
+    at, seen = np.array([EI, 3 * EI]), Through(made, solve, height)
+    in_plane, across = (seen.change(at, one) for one in np.eye(2))
+    of_plain = Through(
+        lambda stiffness: scene(Rod(1.0, stiffness, GJ, 1e6, DENSITY, radius=RADIUS)),
+        functools.partial(rj.solve, segments=32),
+        height,
+    ).pulled(np.array(EI))(np.array(1.0))
+    step, tight = 1e-5 * EI, Through(made, functools.partial(solve, tolerance=1e-11), height)
+    there, back = (tight(at + change) for change in (np.array([step, 0.0]), np.array([-step, 0.0])))
     np.testing.assert_allclose(in_plane, (there - back) / (2 * step), rtol=1e-6)  # seen: 1e-9
     np.testing.assert_allclose(in_plane, of_plain, rtol=1e-5)
     assert abs(across) < 1e-5 * abs(of_plain)
@@ -614,26 +623,30 @@ def test_derivatives_of_a_curved_cable_in_a_clip_on_a_floor():
     """A clip that holds the frame, a rod curved out of the plane of gravity: nothing is symmetric."""
     frame_of_clip = frame((1.0, 0.1, 0.0))
 
-    def seen(p, tolerance=1e-8):
+    def scene_of(p):
         rod = flat(EI, 2 * EI, rest_curvature=(0.8, 0.5 * p[0]))
         floor = rj.Plane((0, 0, -0.06 + 0.1 * p[1]), (0, 0.1, 1))
         ends = Clamp((0, 0, 0), LEVEL), Free(force=(0, 0.02, 0))
         clips = [Clip(0.3, (0.29, 0.0, 0.02 + 0.1 * p[2]), frame=frame_of_clip)]
-        scene, solver = Scene(rod, *ends, GRAVITY, clips=clips, obstacles=[floor]), rj.Newton(tolerance=tolerance)
-        result = rj.solve(scene, segments=32, guess=guess, solver=solver)
+        return Scene(rod, *ends, GRAVITY, clips=clips, obstacles=[floor])
+
+    def numbers(result):
         contacts = jnp.sum(result.contact_forces, axis=0)
-        return jnp.concatenate([contacts, result.clip_moments[0], result.nodes[-1], result.energy[None]]), result
+        return jnp.concatenate([contacts, result.clip_moments[0], result.nodes[-1], result.energy[None]])
+
+    def solve(scene, tolerance=1e-8):
+        return rj.solve(scene, segments=16, guess=guess, solver=rj.Newton(tolerance=tolerance))
 
     guess = None
-    nominal = jnp.array([1.0, 0.0, 0.0])
-    values, guess = seen(nominal)
+    seen = Through(scene_of, solve, numbers)
+    tight = Through(scene_of, functools.partial(solve, tolerance=1e-11), numbers)
+    nominal, step = np.array([1.0, 0.0, 0.0]), 1e-5
+    guess = solve(seen.made(nominal))
     assert guess.converged
-    assert values[2] > 0.2  # N: it lies on the floor
-    forward = np.asarray(jax.jacfwd(lambda p: seen(p)[0])(nominal))
-    step, tight = 1e-5, 1e-11
-    there, back = (
-        np.stack([seen(nominal.at[k].add(change), tight)[0] for k in range(3)], axis=1) for change in (step, -step)
-    )
+    assert np.sum(guess.contact_forces, axis=0)[2] > 0.2  # N: it lies on the floor
+    # A column at a time: of all at once a program of its own would be traced, batched.
+    forward = np.stack([seen.change(nominal, one) for one in np.eye(3)], axis=1)
+    there, back = (np.stack([tight(nominal + change * one) for one in np.eye(3)], axis=1) for change in (step, -step))
     differences = (there - back) / (2 * step)
     # Of the residual of 1e-11 EI/L^2 over 1e-5.
     np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-6 * np.max(np.abs(differences)))

@@ -83,7 +83,7 @@ def test_what_begins_from_it(held, tmp_path):
 def test_reactions_are_the_derivatives_of_the_energy(held):
     """In reverse mode by every number of the scene at once."""
     scene, _, truth = held
-    by = jax.grad(lambda scene: rj.solve_continuum(scene, truth).energy)(scene)
+    by = by_numpy(jax.grad(lambda scene: rj.solve_continuum(scene, truth, intervals=4).energy))(scene)
     scale = float(np.max(np.abs(truth.clip_forces)))
     for clip, force in zip(by.clips, truth.clip_forces, strict=True):
         np.testing.assert_allclose(clip.position, force, atol=1e-8 * scale)
@@ -270,7 +270,7 @@ def test_derivatives_by_the_clips():
             Clip(second.at, second.position + d[7:], None, sliding=True),
         ]
         moved = Scene(scene.rod, scene.start, scene.end, scene.gravity, clips=clips)
-        result = rj.solve_continuum(moved, base)
+        result = rj.solve_continuum(moved, base, intervals=8)
         forces = (result.start_force, result.end_moment, result.clip_forces.reshape(-1), result.clip_moments[0])
         return jnp.concatenate([*forces, result.scene.clips[1].at[None], result.energy[None]])
 
@@ -278,10 +278,8 @@ def test_derivatives_by_the_clips():
     ahead, behind, far_ahead, far_behind = (values(jnp.asarray(step)) for step in (h, -h, 2 * h, -2 * h))
     central = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * h)
     weights = jnp.linspace(0.5, 1.5, len(central))
-    # One program, as XLA takes longer for two.
-    forward, reverse = jax.jit(
-        lambda step: (jax.jacfwd(found)(step), jax.grad(lambda step: weights @ found(step))(step))
-    )(jnp.zeros(()))
+    both = by_numpy(lambda step: (jax.jacfwd(found)(step), jax.grad(lambda step: weights @ found(step))(step)))
+    forward, reverse = both(jnp.zeros(()))
     # Of h^4, and of rounding and rtol, 1e-12, by h.
     np.testing.assert_allclose(forward, central, rtol=1e-6, atol=1e-8 * float(np.max(np.abs(central))))
     np.testing.assert_allclose(reverse, weights @ forward, rtol=1e-9)

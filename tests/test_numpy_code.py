@@ -12,7 +12,7 @@ from jax import lax
 
 import rodjax as rj
 from rodjax.linalg.small_matrices import inverse_matrix, negative_count
-from rodjax.programs import answers, compilation, numpy_operations
+from rodjax.programs import answers, compilation, kept, numpy_operations
 from rodjax.programs.answers import ANSWERS, one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
@@ -186,6 +186,10 @@ OPERATIONS = {
         lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(POSITIVE)), x[:, 0], throw=False).value,
         jax.vmap(decayed)(x[0]),
     ],
+    "functions of Python's": lambda x: [
+        jax.pure_callback(lambda x: np.sort(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x),
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(POSITIVE)), x[:, 0]).value,
+    ],
 }
 
 
@@ -211,6 +215,23 @@ def test_a_singular_triangle_spoils_no_other():
     np.testing.assert_allclose(inverses[2:4] @ STACK, np.broadcast_to(np.eye(4), (2, 4, 4)), atol=1e-12)
     assert np.isnan(inverses[[0, 1, 4]]).all()
     np.testing.assert_array_equal(numpy_operations.negative_counts(np.concatenate([singular[:1], -STACK])), [0, 4, 4])
+
+
+def test_an_error_of_another_package_is_raised_and_no_code_of_it_kept(tmp_path):
+    def solved(x):
+        return lx.linear_solve(lx.MatrixLinearOperator(x), x[0]).value
+
+    code = AnswerCode.of(jax.jit(solved).trace(POSITIVE))
+    np.testing.assert_allclose(code([POSITIVE], np.inf), np.linalg.solve(POSITIVE, POSITIVE[0]), rtol=1e-12)
+    with pytest.raises(RuntimeError, match="linear solver"):
+        code([np.zeros((4, 4))], np.inf)
+    rj.keep_programs(tmp_path)
+    try:
+        kept.store_code("with an error", code)
+        kept.store_code("without one", AnswerCode.of(jax.jit(lambda x: 2 * x).trace(X)))
+    finally:
+        rj.keep_programs(False)
+    assert [path.stem for path in tmp_path.iterdir()] == ["without one"]
 
 
 def test_single_precision_stays_single():

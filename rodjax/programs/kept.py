@@ -31,6 +31,7 @@ from jax.experimental import serialize_executable
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, shown
 from rodjax.programs.numpy_code import AnswerCode, skeleton
+from rodjax.programs.numpy_operations import Callback
 
 # The environment variable: "off", or a folder.
 VARIABLE = "RODJAX_CACHE"
@@ -177,6 +178,8 @@ def store(name: str, program: Any) -> None:
 
 def store_code(name: str, code: AnswerCode) -> None:
     """Keeps NumPy code, if that is possible."""
+    if any(isinstance(value, Callback) for value in code.constants):
+        return
     if _folder is not None and not _is_broken and _tree_text(code.out_tree) is not None:
         _write(name + CODE_SUFFIX, code.packed())
 

@@ -91,6 +91,16 @@ def scan(
     return carry + rows
 
 
+class Callback:
+    """A function of Python's, as JAX calls it from programs. It is not kept on disk, nor is what calls it."""
+
+    def __init__(self, function: Callable[..., Sequence[Any]]):
+        self.function = function
+
+    def __call__(self, *given: Any) -> Values:
+        return tuple(map(np.asarray, self.function(*given)))
+
+
 # --- shapes ----------------------------------------------------------------------------------------------------------
 
 

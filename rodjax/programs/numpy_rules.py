@@ -367,6 +367,11 @@ def _linear_solve(body: Any, equation: Any, *given: str) -> str:
     return f"{body.writer.function(programs.solve)}({', '.join([*constants, *right])})"
 
 
+def _callback(body: Any, equation: Any, *given: str) -> str:
+    """What runs outside of the program, such as the error that Equinox raises where a matrix is singular."""
+    return f"{body.writer.constant(numpy_operations.Callback(equation.params['callback']))}({', '.join(given)})"
+
+
 def _same(body: Any, equation: Any, *given: str) -> Any:
     return list(given) if equation.primitive.multiple_results else given[0]
 
@@ -424,6 +429,7 @@ INNER: dict[str, Rule] = {
     "scan": _scan,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
+    "pure_callback": _callback,
 }
 
 OTHERS: dict[str, Rule] = {

@@ -115,8 +115,15 @@ def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):
 @pytest.mark.slow
 def test_a_softest_motion_may_be_limited(shortest):
     stiffness = float(rj.lowest_mode(shortest.verified).stiffness)
-    limits = rj.Limits(bend_radius=1e-3, stability=4 * stiffness)
+    limits = rj.Limits(bend_radius=9.0, stability=0.9 * stiffness)
     route = rj.route(corner(), VARIABLES, limits=limits, starts=1, segments=16, solver=TIGHT)
+    assert route.feasible
+    kept = dict(zip(route.margins.names, np.asarray(route.margins.margin), strict=True))
+    # The same arc as without: what is asked of the motion it has, to the reserve of the bend radius.
+    assert kept["stability"] == pytest.approx(1 / 0.9 - 1, abs=5e-3)
+    assert route.objective == pytest.approx(shortest.objective, rel=1e-4)
+    stiffer = rj.Limits(bend_radius=1e-3, stability=4 * stiffness)  # the same programs
+    route = rj.route(corner(), VARIABLES, limits=stiffer, starts=1, segments=16, solver=TIGHT)
     assert route.feasible
     found = float(rj.lowest_mode(route.verified).stiffness)
     assert found >= 4 * stiffness

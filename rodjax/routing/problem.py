@@ -239,8 +239,24 @@ def group_starts(problem: Problem, guesses: Solution) -> tuple[int, ...]:
 
 def nothing_evaluated(problem: Problem, designs: Float[Array, "k n"], guesses: Solution) -> Evaluation:
     """What comes before the first evaluation."""
-    found = jax.eval_shape(_evaluated, problem, *_kind_of_one((designs, guesses)))
-    return jax.tree.map(lambda leaf: jnp.zeros((len(designs), *leaf.shape), leaf.dtype), found)
+    count, unknowns = designs.shape
+
+    def zeros(*shape: int, dtype: Any = designs.dtype) -> jax.Array:
+        return jnp.zeros((count, *shape), dtype)
+
+    # By the shapes of values alone: those of rates follow, and tracing derivatives takes seconds.
+    one = _kind_of_one(guesses)
+    objective, slacks, spare, kept = jax.eval_shape(_values, problem, solved_in(one), one)
+    return Evaluation(
+        design=zeros(unknowns),
+        objective=zeros(dtype=objective.dtype),
+        slacks=zeros(*slacks.shape, dtype=slacks.dtype),
+        spare=zeros(*spare.shape, dtype=spare.dtype),
+        kept=[jax.tree.map(lambda leaf: zeros(1, *leaf.shape[1:], dtype=leaf.dtype), each) for each in kept],
+        rates=zeros(1 + slacks.shape[0] + len(kept), unknowns),
+        result=jax.tree.map(jnp.zeros_like, guesses),
+        is_valid=zeros(dtype=bool),
+    )
 
 
 def _kind_of_one(stack: T) -> T:

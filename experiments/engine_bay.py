@@ -104,9 +104,9 @@ def in_the_continuum(route: rj.Route) -> rj.Margins:
     return rj.margins(exact, LIMITS, list(OBSTACLES.values()), list(OBSTACLES))
 
 
-def save(route: rj.Route, folder: Path) -> None:
+def save(route: rj.Route, exact: rj.Margins, folder: Path) -> None:
+    """`exact`: the margins in the continuum."""
     reported(route).save(folder)
-    exact = in_the_continuum(route)
     with (folder / "verified.csv").open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["name", "unit", "kind", "limit", "value", "margin", "value_continuum", "margin_continuum"])
@@ -317,8 +317,9 @@ def main(arguments: list[str] | None = None) -> rj.Route:
     route = found(options.starts, options.seed, progress=sys.stderr.isatty())
     print(route)
     print(route.margins)
-    save(route, options.out)
-    print(f"least margin in the continuum: {float(np.min(in_the_continuum(route).margin)):.2e}")
+    exact = in_the_continuum(route)
+    save(route, exact, options.out)
+    print(f"least margin in the continuum: {float(np.min(exact.margin)):.2e}")
     if options.compare:
         begin = time.perf_counter()
         found(options.starts, options.seed)  # compiled by now

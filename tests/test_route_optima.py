@@ -1,4 +1,4 @@
-"""What a route calls an optimum is one: no better neighbour, for five problems with active limits of one structure."""
+"""What a route calls an optimum is one: no better neighbour, for problems with active limits of one structure."""
 
 import jax
 import jax.numpy as jnp
@@ -31,23 +31,26 @@ def cable() -> rj.Scene:
     return rj.Scene(rod, *ends, (0, 0, -9.81), clips=[rj.Clip(0.5, (0.4, 0.05, 0.0))])
 
 
+# The first are those of a cable that came to 0.80652 and was called the best, where 0.80586 could be had.
+NUMBERS = [
+    dict(bend_radius=12, clearance=0.01, end_force=2.0, clip_force=2.0, twist=1.0),
+    dict(bend_radius=24, clearance=0.01, end_force=1.5, clip_force=3.0, twist=1.0),
+    dict(bend_radius=12, clearance=0.02, end_force=1.0, clip_force=1.5, twist=1.0),
+    dict(bend_radius=20, clearance=0.005, end_force=0.8, clip_force=1.0, twist=1.0),
+    dict(bend_radius=8, clearance=0.015, end_force=3.0, clip_force=0.8, twist=0.02),
+]
+
+
 @pytest.mark.slow
-def test_no_neighbour_of_an_optimum_is_better(compiled_at_once):
-    """Of 500 at random, half within a thousandth of the ranges, half within a ten thousandth."""
-    # The first are those of a cable that came to 0.80652 and was called the best, where 0.80586 could be had.
-    numbers = [
-        dict(bend_radius=12, clearance=0.01, end_force=2.0, clip_force=2.0, twist=1.0),
-        dict(bend_radius=12, clearance=0.02, end_force=1.0, clip_force=1.5, twist=1.0),
-        dict(bend_radius=20, clearance=0.005, end_force=0.8, clip_force=1.0, twist=1.0),
-        dict(bend_radius=8, clearance=0.015, end_force=3.0, clip_force=0.8, twist=0.02),
-        dict(bend_radius=24, clearance=0.01, end_force=1.5, clip_force=3.0, twist=1.0),
-    ]
+@pytest.mark.parametrize("numbers", [NUMBERS[:1], pytest.param(NUMBERS[1:], marks=pytest.mark.exhaustive)])
+def test_no_neighbour_of_an_optimum_is_better(numbers):
+    """Of 200 at random, half within a thousandth of the ranges, half within a ten thousandth."""
     objective = rj.Objective(length=1, energy=0.02)
     variables = checked_variables([rj.Between(*one) for one in RANGES], cable())
     scales = np.concatenate([variable.scales() for variable in variables])
     offsets = np.concatenate([variable.offsets() for variable in variables])
     rng = np.random.default_rng(0)
-    sizes = np.repeat([1e-3, 1e-4], 250)[:, None]
+    sizes = np.repeat([1e-3, 1e-4], 100)[:, None]
     costs = jax.jit(jax.vmap(objective.of))
     for given in numbers:
         limits = rj.Limits(**given)
@@ -60,7 +63,7 @@ def test_no_neighbour_of_an_optimum_is_better(compiled_at_once):
         # The best of those that keep to the limits.
         assert route.objective == np.min(route.starts.objective[route.starts.feasible])
         design = (np.asarray(route.numbers) - offsets) / scales
-        near = np.clip(design + sizes * rng.uniform(-1, 1, (500, len(design))), 0, 1)
+        near = np.clip(design + sizes * rng.uniform(-1, 1, (200, len(design))), 0, 1)
         scenes = jax.vmap(lambda u: with_numbers(cable(), variables, u))(jnp.asarray(near))
         # As in the search, but for the limits, which are those of the finer mesh.
         guess = route.verified

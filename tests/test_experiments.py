@@ -43,6 +43,15 @@ def script(name: str, is_compiled: bool = True):
     return module
 
 
+@pytest.mark.parametrize("path", sorted(EXPERIMENTS.glob("*.py")), ids=lambda path: path.stem)
+def test_every_experiment_is_read_and_says_what_it_does(path, capsys):
+    module = script(path.stem)
+    if hasattr(module, "main"):  # others are called by tests, or by experiments
+        with pytest.raises(SystemExit, match="0"):
+            module.main(["--help"])
+        assert "usage:" in capsys.readouterr().out
+
+
 def test_mass_spring(tmp_path, capsys):
     rows = script("mass_spring").main(["--segments", "10", "--out", str(tmp_path)])
     before, bent, *_, turned = rows
@@ -160,7 +169,7 @@ def test_work_precision(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "work_precision.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_scaling(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     options = ["--segments", "6", "200", "--slenderness", "20", "--repeats", "1", "--out", str(tmp_path)]
@@ -179,7 +188,7 @@ def test_scaling(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_window_latency(tmp_path):
     pytest.importorskip("viser", reason="the window needs viser: pip install 'rodjax[view]'")
     rows = script("window_latency").main(["--scene", "two clips", "--moves", "50", "--out", str(tmp_path)])
@@ -206,7 +215,7 @@ def test_shapes_in_a_browser():
     assert not module.carries_shape("text")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_interactive(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     options = ["--segments", "6", "--scene", "hanging", "--moves", "40", "--out", str(tmp_path)]
@@ -234,7 +243,7 @@ def test_a_hand_moves_by_millimetres_and_degrees_within_reach():
     assert 0.7 < np.max(reach) <= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_peers(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
     peers = script("peers")
@@ -304,7 +313,7 @@ def test_derivative_table(tmp_path, capsys, monkeypatch):
     assert "| EI | finite difference, 6 | cold |" in table.costs_markdown(costs, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_batch(capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     rows = script("batch").main(["--count", "50", "--segments", "6", "--repeats", "1", "--lbfgs", "0"])
@@ -316,7 +325,7 @@ def test_batch(capsys, monkeypatch):
     assert "solve_batch" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_accelerator(capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     (row,) = script("accelerator").main(["--count", "16", "--of-core", "16", "--kinds", "differences"])
@@ -327,7 +336,7 @@ def test_accelerator(capsys, monkeypatch):
     assert float(found[1]) < 1e-6  # of a difference by 1e-5 of the stiffness
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sweep_stress(tmp_path, capsys):
     runs = script("sweep_stress").main(
         ["--cases", "20", "--segments", "4", "--chunk", "8", "--kills", "1", "--out", str(tmp_path)]
@@ -468,7 +477,7 @@ def test_wire_loops(tmp_path):
     assert (tmp_path / "wire_loops.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_identify_synthetic(tmp_path):
     rows = script("identify_synthetic").main(
         ["--count", "16", "--peers", "1", "--joint", "2", "--joint-peer", "0", "--out", str(tmp_path)]
@@ -491,7 +500,7 @@ def test_contact_free_force(tmp_path, capsys):
     assert "best first" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_engine_bay(tmp_path):
     route = script("engine_bay").main(["--starts", "1", "--out", str(tmp_path)])
     assert route.feasible

@@ -131,6 +131,7 @@ def test_lees_frame_through_its_limit_points():
             assert sign * load_of(*LEE, "load", load, point.equilibrium, lower) < sign * load - 1e-6
 
 
+@pytest.mark.exhaustive
 def test_a_toggle_snaps_through():
     """Williams' (1964) toggle with a rise of 0.7 in: at its own of 0.386 in the load grows all the way."""
     corners = {"a": (0.0, 0.0), "apex": (12.943, 0.7), "b": (25.886, 0.0)}

@@ -16,7 +16,7 @@ def rod(length: float, stiffer: float = 1.0, heavier: float = 1.0) -> Rod:
     return Rod(length, stiffer * one.EI, one.GJ, one.EA, heavier * one.mass_per_length)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_fit_of_a_cable_that_is_cut_is_that_of_the_cable():
     true = rj.solve(Scene(rod(1.0), START, END, gravity=GRAVITY), segments=8)
     draw = np.random.default_rng(0)

@@ -35,7 +35,13 @@ def cut(rod, clip, length=0.5, gravity=GRAVITY, **loads) -> Harness:
 
 
 # A clip by frames turns the rod that slides through it, one by tangents holds its direction.
-@pytest.mark.parametrize(("rod", "direction"), [(plain, None), (bent, (0.6, 0.1, -0.8))], ids=["plain", "bent"])
+@pytest.mark.parametrize(
+    ("rod", "direction"),
+    [
+        pytest.param(plain, None, id="plain"),
+        pytest.param(bent, (0.6, 0.1, -0.8), id="bent", marks=pytest.mark.slow),
+    ],
+)
 def test_a_cut_rod_slides_as_the_rod(rod, direction):
     def scene(at: float) -> Scene:
         return Scene(rod(1.0), START, END, GRAVITY, clips=[Clip(at, PLACE, direction, sliding=True)])

@@ -169,7 +169,7 @@ def lying(name: str, guess: rj.Equilibrium | None) -> rj.Equilibrium:
     return rj.solve(scene, segments=96, planar=True, guess=shape, strain_limit=None)
 
 
-@pytest.mark.parametrize("name", ["plain", pytest.param("flat and curved", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["plain", pytest.param("flat and curved", marks=pytest.mark.exhaustive)])
 def test_a_chain_of_links_has_the_same_forces_places_and_gaps(name, plain):
     result = plain if name == "plain" else lying(name, plain)
     assert result.converged

@@ -69,7 +69,7 @@ def test_mass_spring(tmp_path, capsys):
     assert (tmp_path / "mass_spring.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kernels(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")  # the script would set it for all that comes after
     kernels = script("kernels")
@@ -150,7 +150,7 @@ def test_cold_start():
     assert all(share == 1.0 for name, share in shares.items() if name.startswith(("clamps", "slack")))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_work_precision(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     meshes = ["--segments", "6", "12", "--truth", "60", "--others-up-to", "6", "6", "6"]
@@ -436,7 +436,7 @@ def test_general_rods(tmp_path):
         assert len(list(csv.DictReader(file))) == len(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_wire_loops(tmp_path):
     """One made-up loop in the data's form; the data themselves are not part of the project."""
     loops = script("wire_loops")

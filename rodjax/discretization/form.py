@@ -49,6 +49,18 @@ class Linearization(eqx.Module):
     reference_displacements: Float[Array, "n+1 3"] | None = None
 
 
+class HeldLoads(NamedTuple):
+    """What loads without a potential exert at a point on rotations and nodes. The merit of a step has their work as if
+    they stayed so.
+    """
+
+    moments: Float[Array, "b m"]
+    forces: Float[Array, "3 n+1"]
+
+    def work(self, rotation: Float[Array, "b m"], others: NodalChange) -> Float[Array, ""]:
+        return jnp.sum(self.moments * rotation) + jnp.sum(self.forces * others.displacements.T)
+
+
 class EndTurn(NamedTuple):
     """What turns with the frame of a clamped end about global axes, beside the position: `rotation`, the rotations at
     the end in the bases of a released linearisation, and what these leave out of the derivatives of L: `torque`, by the
@@ -218,6 +230,15 @@ class Form(eqx.Module):
     def searching(self, point: Any) -> Any:
         """The point as a search begins from it."""
         return point
+
+    @property
+    def holds_loads(self) -> bool:
+        """Whether there are loads without a potential, and `held_loads` tells them."""
+        return False
+
+    def held_loads(self, point: Any) -> HeldLoads:
+        """What loads without a potential exert at a point."""
+        raise NotImplementedError(f"{type(self).__name__} holds no loads")
 
     def touches(self, point: Any) -> Bool[Array, ""]:
         """Whether forces of contacts act."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from rodjax.discretization import nonconservative
 from rodjax.discretization.cell_derivatives import CellDerivatives, first_derivatives
 from rodjax.discretization.cells import Cells, ElementCells
-from rodjax.discretization.form import Linearization
+from rodjax.discretization.form import HeldLoads, Linearization
 from rodjax.discretization.frame_point import FramePoint, HeldFrame, Kinematics
 from rodjax.discretization.framed import OUT_OF_PLANE, FrameForm
 from rodjax.discretization.framed_parts import parts_of
@@ -189,9 +189,24 @@ class NodalFrames(NodalForm, FrameForm):
         of_fields = super().loads_on_nodes(point)
         if self.has_potential:
             return of_fields
+        loads = self._following_at_nodes(point)
+        return loads if of_fields is None else loads + of_fields
+
+    def _following_at_nodes(self, point: FramePoint) -> Float[Array, "3 n+1"]:
         loads = nonconservative.on_nodes(self.scene, self._elements, self.field.gather(point.quaternions))
-        total = jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
-        return total if of_fields is None else total + of_fields
+        return jnp.pad(loads[0], ((0, 0), (0, 1))) + jnp.pad(loads[1], ((0, 0), (1, 0)))
+
+    @property
+    def holds_loads(self) -> bool:
+        return not self.has_potential
+
+    def held_loads(self, point: FramePoint) -> HeldLoads:
+        moments = nonconservative.couples(self.scene, self._elements, self.field.gather(point.quaternions))
+        if self.following(point.quaternions) is not None:
+            without = dataclasses.replace(self, scene=nonconservative.conservative(self.scene))
+            moments += without.by_rotations(point.quaternions, point.end_force)
+            moments -= self.by_rotations(point.quaternions, point.end_force)
+        return HeldLoads(self.projected(self.field.scatter_add(moments)), self._following_at_nodes(point))
 
     def end_forces(self, point: FramePoint, fields: OnElements | None) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         if self.has_potential:

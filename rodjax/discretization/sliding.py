@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rodjax.discretization.form import NEUTRAL, Form, Linearization
+from rodjax.discretization.form import NEUTRAL, Form, HeldLoads, Linearization
 from rodjax.discretization.forms import form_of
 from rodjax.discretization.moving_mesh import MovingMeshForm
 from rodjax.discretization.nodal import NodalForm
@@ -135,6 +135,13 @@ class SlidingForm(MovingMeshForm):
 
     def touches(self, point: SlidingPoint) -> Bool[Array, ""]:
         return self.first.touches(point.inner)
+
+    @property
+    def holds_loads(self) -> bool:
+        return dataclasses.replace(self.first, scene=self.scene).holds_loads
+
+    def held_loads(self, point: SlidingPoint) -> HeldLoads:
+        return self.at(point.arclengths).held_loads(point.inner)
 
     def rounding_floor(self, point: SlidingPoint) -> Float[Array, ""]:
         return self.at(point.arclengths).rounding_floor(point.inner)

@@ -55,6 +55,11 @@ class SlidingChange(NamedTuple):
     arclengths: Float[Array, "j"]
     others: Any
 
+    @property
+    def displacements(self) -> Float[Array, "n+1 3"]:
+        """Of the nodes, where these have positions of their own."""
+        return self.others.displacements
+
 
 class SlidingLinearization(Linearization):
     """A linearisation with the arclengths, whether a step changes them, and dW/ds + R . t (`excess`)."""

@@ -413,12 +413,12 @@ class _Lanes(eqx.Module):
 
 def _ends(searches: Search, count: Int[Array, ""], lanes: int, solver: Newton, find: Find) -> NewtonEnd:
     """Where the first `count` of the searches end."""
-    total = searches.point.total_twist.shape[0]
+    total, begun = searches.point.total_twist.shape[0], jax.vmap(functools.partial(begin, find=find))
 
     def started(search: Int[Array, "lanes"]) -> tuple[MixedForm, NewtonState]:
         at = jnp.minimum(search, total - 1)
         forms, points = jax.tree.map(lambda leaf: leaf[at], (searches.form, searches.point))
-        return forms, jax.vmap(begin)(forms, points)
+        return forms, begun(forms, points)
 
     def advanced(lanes: _Lanes) -> _Lanes:
         going = is_running(lanes.states)
@@ -443,7 +443,7 @@ def _ends(searches: Search, count: Int[Array, ""], lanes: int, solver: Newton, f
 
     first = jnp.minimum(jnp.arange(lanes), count)
     forms, states = started(first)
-    nothing = jax.eval_shape(jax.vmap(ended), searches.form, jax.vmap(begin)(searches.form, searches.point))
+    nothing = jax.eval_shape(jax.vmap(ended), searches.form, begun(searches.form, searches.point))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), nothing)
     start = _Lanes(first, forms, states, jnp.minimum(jnp.full_like(count, lanes), count), nothing)
     return jax.lax.while_loop(lambda lanes: jnp.any(lanes.search < count), advanced, start).ends

@@ -1,8 +1,9 @@
 """Searches under loads without a potential: from the rod without them, and by parts of them where all are too much.
 
-No energy leads to such an equilibrium. A search that makes the square of what is out of balance less ends where this
-has a minimum, or in another equilibrium, where it begins far away. So a cold search begins with the minimum without
-these loads; where it fails from there, it goes on with a half of them, a quarter, and from what that leads to.
+No energy leads to such an equilibrium. A search by the square of what is out of balance, or by the energy with these
+loads held as they are, may end in another equilibrium, or in none, where it begins far away. So a cold search begins
+with the minimum without these loads; where it fails from there, it goes on with a half of them, a quarter, and from
+what that leads to.
 """
 
 import dataclasses

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.checks import not_negative, plain_number, whole_number
-from rodjax.discretization.form import NEUTRAL, Form, Linearization, Point
+from rodjax.discretization.form import NEUTRAL, Form, HeldLoads, Linearization, Point
 from rodjax.discretization.joints import generic_field
 from rodjax.geometry.vectors import components, dot
 from rodjax.linalg.saddle_point import factor
@@ -22,7 +22,7 @@ class Newton(eqx.Module):
 
     A step solves the linearised equilibrium. Where the energy has negative curvature the Hessian is shifted until it
     has none. A step is shortened until an augmented Lagrangian falls: energy, closure constraint of the polyline and
-    its square.
+    its square; loads without a potential do the work of what they are before the step.
 
     **Arguments:**
 
@@ -58,6 +58,9 @@ CLOSURE_WEIGHT = 100.0
 # A step is accepted when this fraction of the fall that its slope promises comes true, up to the rounding of energies.
 SUFFICIENT_DECREASE = 1e-4
 ENERGY_ROUNDING = 1e-9
+# Under loads without a potential a whole step is accepted as well when it makes the square of what is out of balance
+# less by this part.
+FALL_OF_SQUARE = 0.2
 MAX_HALVINGS = 12
 # A step that finds no better point in so many halvings is sought anew with a larger shift, below this one.
 MAX_SHIFT = 1e8
@@ -91,6 +94,9 @@ class NewtonState(eqx.Module):
     rotation: Float[Array, "b n"]
     force_change: Float[Array, "3 parts"]
     others: Any  # what else it changes, as of `Form.others`
+    # Of the point, where steps are judged with loads held: these, and the square of what is out of balance.
+    loads: HeldLoads | None
+    squares: Float[Array, ""] | None
     # The augmented Lagrangian at the point with the new force, its slope along the step, and the fraction of it to try.
     weight: Float[Array, ""]
     merit: Float[Array, ""]
@@ -114,7 +120,7 @@ def is_stable(form: Form, point: Point) -> Bool[Array, ""]:
 
 def find_equilibrium(form: Form, point: Point, solver: Newton, find: Find = "minimum") -> NewtonEnd:
     """The equilibrium reached from `point`."""
-    state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver, find), begin(form, point))
+    state = jax.lax.while_loop(is_running, lambda state: turn(form, state, solver, find), begin(form, point, find))
     return ended(form, state)
 
 
@@ -147,15 +153,21 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
     objective = (
         form.objective(linearization, state.point, state.others) if descends else form.half_square(linearization)
     )
+    if state.loads is not None:
+        objective -= state.loads.work(rotation, others)
     merit = objective + state.weight / 2 * jnp.sum(constraint_residual**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
     bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
+    is_better = merit <= bound
+    if state.squares is not None:
+        falls = _squares(form, linearization) <= (1 - FALL_OF_SQUARE * state.step) * state.squares
+        is_better |= (state.halvings == 0) & falls
     state = eqx.tree_at(lambda state: state.evaluations, state, state.evaluations + 1)
     # Out of the branches XLA computes once for all turns what does not change.
     floor = form.rounding_floor(trial)
     pattern = generic_field(trial.tangents, scene_axes(form.scene))
     return jax.lax.cond(
-        state.restart | form.accepts(state.point, trial, state.is_pushed | (merit <= bound)),
+        state.restart | form.accepts(state.point, trial, state.is_pushed | is_better),
         lambda: _advanced(form, state, trial, linearization, floor, pattern, solver, find),
         lambda: _shortened(form, state, find),
     )
@@ -169,8 +181,15 @@ def least_shift(last: Float[Array, "*k"], first: ArrayLike = FIRST_SHIFT) -> Flo
 
 
 def _descends(form: Form, find: Find) -> bool:
-    """Whether steps are judged by the energy; else by the square of what is out of balance, which a step makes less."""
-    return form.has_potential and find == "minimum"
+    """Whether steps are judged by the energy, with the work of loads that have none; else by the square of what is out
+    of balance, which a step makes less.
+    """
+    return find == "minimum" and (form.has_potential or form.holds_loads)
+
+
+def _squares(form: Form, here: Linearization) -> Float[Array, ""]:
+    closure = form.force_components(here.constraint_residual)
+    return form.half_square(here) + CLOSURE_WEIGHT / 2 * jnp.sum(closure**2)
 
 
 def _advanced(
@@ -229,6 +248,10 @@ def _advanced(
     if _descends(form, find):
         force_change, others = step * force_change, form.scaled(others, 1.0, step)
 
+    loads, squares = state.loads, state.squares
+    if loads is not None:
+        loads, squares = form.held_loads(point), _squares(form, here)
+
     if _descends(form, find):
         # With the new forces in place of the old ones.
         constraint_residual, constraint_rate, change, along = form.under_force(
@@ -236,6 +259,8 @@ def _advanced(
         )
         objective = form.objective(here, point, others) + change
         along += jnp.sum(rotation * here.gradient)
+        if loads is not None:  # whose moments the gradient has
+            along -= loads.work(jnp.zeros_like(rotation), others)
     else:
         constraint_residual = form.force_components(here.constraint_residual)
         constraint_rate = -constraint_residual
@@ -286,6 +311,8 @@ def _advanced(
         rotation=rotation,
         force_change=force_change,
         others=others,
+        loads=loads,
+        squares=squares,
         weight=weight,
         merit=objective + weight / 2 * jnp.sum(constraint_residual**2),
         slope=along - weight * falls,
@@ -322,10 +349,10 @@ def _shortened(form: Form, state: NewtonState, find: Find) -> NewtonState:
     )
 
 
-def begin(form: Form, point: Point) -> NewtonState:
+def begin(form: Form, point: Point, find: Find) -> NewtonState:
     """Before the first turn, whose trial is the point itself."""
     point = form.searching(point)
-    dtype = point.tangents.dtype
+    dtype, holds_loads = point.tangents.dtype, _descends(form, find) and form.holds_loads
     zero = jnp.zeros((), dtype)
     of_bases = jax.eval_shape(form.bases_at, point)
     bases = jnp.zeros(of_bases.shape, of_bases.dtype)
@@ -341,6 +368,8 @@ def begin(form: Form, point: Point) -> NewtonState:
         rotation=jnp.zeros(bases.shape[1:], dtype),
         force_change=jnp.zeros_like(point.end_force),
         others=form.no_others(point),
+        loads=form.held_loads(point) if holds_loads else None,
+        squares=zero if holds_loads else None,
         weight=zero,
         merit=zero,
         slope=zero,

@@ -4,7 +4,7 @@
 
 Prints how many converge, iterations, and which of the rest are too short for their side; of the pegs also milliseconds
 of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
-scenes as the cables become heavier, beside paths. Cables under loads without a potential, beside walls and without.
+scenes as the cables become heavier, beside paths. Cables under loads without a potential, beside a floor and a wall.
 Of friction the pull of a taut cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a
 floor, and back, beside its closed form; of ropes over a cylinder, which nothing else holds, how many are found at rest.
 """
@@ -130,7 +130,7 @@ def cold(count: int, seed: int = 0, segments: int = 48, has_guess: bool = True, 
     )
 
 
-def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float, has_walls: bool) -> rj.Scene:
+def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:
     """A cable under a load without a potential, of a part of `size`, beside a floor and a wall."""
 
     def about_level(scatter: float) -> np.ndarray:
@@ -148,24 +148,24 @@ def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float, has
     }[kind]
     ends = {"clamp": rj.Clamp(place, rj.frame(last)), "swivel": rj.Swivel(place, last), "free": rj.Free()}
     floor, wall = min(0, place[2]) - rng.uniform(0.05, 0.15), min(0, place[1]) - rng.uniform(0.03, 0.1)
-    walls = [rj.Plane((0, 0, floor), (0, 0, 1)), rj.Plane((0, wall, 0), (0, 1, 0))] if has_walls else []
+    walls = [rj.Plane((0, 0, floor), (0, 0, 1)), rj.Plane((0, wall, 0), (0, 1, 0))]
     rod = rj.Rod(1.0, 1.0, 0.7, 1e4, mass_per_length=0.3, radius=0.01)
     start = rj.Clamp((0, 0, 0), rj.frame(first))
     return rj.Scene(rod, start, ends[end], (0, 0, -9.81), obstacles=walls, **loads)
 
 
-def turned(count: int, seed: int = 0, segments: int = 32, size: float = 1.0, has_walls: bool = True) -> None:
+def turned(count: int, seed: int = 0, segments: int = 32, size: float = 1.0) -> None:
     rng, found = np.random.default_rng(seed), []
     kinds = "follower force along", "couple along", "follower point force", "point couple"
     cases = itertools.product(("clamp", "swivel", "free"), kinds)
     for end, kind in itertools.islice(itertools.cycle(cases), count):
-        result = rj.solve(turned_scene(rng, kind, end, size, has_walls), segments=segments, strain_limit=None)
+        result = rj.solve(turned_scene(rng, kind, end, size), segments=segments, strain_limit=None)
         found.append((bool(result.converged), int(result.iterations)))
     converged, iterations = np.array(found).T
     print(
-        f"under loads without a potential of {size:g}, {'' if has_walls else 'no '}walls, seed {seed}, {segments} "
-        f"elements: {converged.sum()} of {count} converged; iterations median {np.median(iterations):g}, 90 % "
-        f"{np.percentile(iterations, 90):g}, most {iterations.max()}"
+        f"under loads without a potential of {size:g}, seed {seed}, {segments} elements: {converged.sum()} of {count} "
+        f"converged; iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}, most "
+        f"{iterations.max()}"
     )
 
 
@@ -301,6 +301,4 @@ if __name__ == "__main__":
     cold(scenes, EI=(1.0, 2.0), rest_curvature=(1.0, 0.0))
     turned(scenes)
     turned(scenes, size=4.0)
-    turned(scenes, size=4.0, has_walls=False)
-    turned(scenes, size=12.0, has_walls=False)
     branches(scenes)

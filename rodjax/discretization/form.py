@@ -233,7 +233,7 @@ class Form(eqx.Module):
 
     @property
     def holds_loads(self) -> bool:
-        """Whether there are loads without a potential, and `held_loads` tells them."""
+        """Whether steps are judged with loads that have no potential held as they are at the point."""
         return False
 
     def held_loads(self, point: Any) -> HeldLoads:

@@ -31,7 +31,7 @@ from rodjax.linalg.blocks import product, short_sum
 from rodjax.linalg.chain import ChainSystem, Elimination
 from rodjax.linalg.chain_rows import LoadRows
 from rodjax.mechanics.energy import axial_strain_under, density
-from rodjax.model.scene import Scene, has_free_ends, with_pins
+from rodjax.model.scene import Scene, has_contacts, has_free_ends, with_pins
 from rodjax.model.supports import Free, Held
 from rodjax.programs.parts import traced_once
 
@@ -198,7 +198,7 @@ class NodalFrames(NodalForm, FrameForm):
 
     @property
     def holds_loads(self) -> bool:
-        return not self.has_potential
+        return not self.has_potential and has_contacts(self.scene)
 
     def held_loads(self, point: FramePoint) -> HeldLoads:
         moments = nonconservative.couples(self.scene, self._elements, self.field.gather(point.quaternions))

@@ -1,5 +1,6 @@
 """Rods whose frames are unknown, against closed forms, the elastica and the rods whose tangents suffice."""
 
+import dataclasses
 import functools
 import math
 import warnings
@@ -13,6 +14,8 @@ from numpy_programs import Through, by_numpy
 from scipy.integrate import solve_ivp
 
 import rodjax as rj
+from rodjax.discretization.nonconservative import conservative
+from rodjax.solving.result_form import form_and_point
 
 DISCRETIZATIONS = ("hermite", "finite_difference")
 LEVEL = rj.frame((1, 0, 0))
@@ -474,6 +477,33 @@ def test_follower_loads_and_couples():
     expected = np.trapezoid(np.cos(angle), s), 0, np.trapezoid(np.sin(angle), s)
     couple = rj.DistributedCouple((0, -2, 0))
     np.testing.assert_allclose(tip(rj.Free(), [couple]), expected, rtol=0, atol=tolerance)
+
+
+def test_loads_that_a_step_holds_are_those_of_its_gradient():
+    """Of all kinds at once, at a bent point, beside a floor: the gradients with these loads and without."""
+    tilted = np.array([0.3, -0.5, 0.7])
+    loads = {
+        "distributed": [rj.DistributedForce(tilted, follower=True), rj.DistributedCouple(tilted[::-1])],
+        "point_forces": [rj.PointForce(0.5, 2 * tilted, follower=True)],
+        "point_couples": [rj.PointCouple(0.25, tilted**2)],
+    }
+    end, floor = rj.Free(force=tilted, moment=-tilted, follower=True), rj.Plane((0, 0, -5), (0, 0, 1))
+    rod = rj.Rod(1.0, (1.0, 2.0), 0.7, 1e4, radius=0.01)
+    form, point = form_and_point(
+        rj.solve(rj.Scene(rod, rj.Clamp((0, 0, 0), LEVEL), end, obstacles=[floor], **loads), segments=4)
+    )
+    without = dataclasses.replace(form, scene=conservative(form.scene))
+
+    def at(point):
+        moments = without.residual_vectors(point)[0] - form.residual_vectors(point)[0]
+        return form.held_loads(point), moments, without.applied(point) - form.applied(point)
+
+    held, moments, forces = by_numpy(at)(point)
+    # Roundings of moments of about 1.
+    np.testing.assert_allclose(held.moments, moments, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(held.forces, forces, rtol=0, atol=1e-12)
+    assert np.max(np.abs(held.moments)) > 0.1
+    assert np.max(np.abs(held.forces)) > 0.1
 
 
 @pytest.mark.slow

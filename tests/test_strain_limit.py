@@ -45,6 +45,19 @@ def test_warnings_point_at_the_line_that_called():
         assert {warning.filename for warning in caught} == {__file__}
 
 
+def test_of_a_harness_the_strained_cable_is_named():
+    stiff = rj.Rod(LENGTH, 4.9e-3, 3.3e-3, 100 * EA, radius=0.005)
+    joint = rj.Joint("joint", LEVEL)
+    clamps = rj.Clamp((0, 0, 0), LEVEL), rj.Clamp((1.353, 0, 0), LEVEL)
+    cables = {"feed": rj.Scene(stiff, clamps[0], joint), "return": rj.Scene(ROD, joint, clamps[1])}
+    with pytest.warns(rj.OverstretchedWarning) as caught:
+        rj.solve(rj.Harness(cables), **MESH)
+    # In series: (1.353 - 1.2)/1.01 of the length of the softer one.
+    assert [str(warning.message) for warning in caught] == [
+        "cable 'return' is strained by more than strain_limit = 5 %: largest axial strain +25.2 % at s = 0 m"
+    ]
+
+
 def test_in_the_continuum_too():
     with pytest.warns(rj.OverstretchedWarning, match=r"largest axial strain \+25 % at s = "):
         rj.solve_continuum(between_clamps(0.75))

@@ -13,7 +13,7 @@ from rodjax.discretization.node_contacts import SLIPS, STICKS
 from rodjax.mechanics.passage import Passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.rod import Rod
-from rodjax.model.scene import Scene, has_potential
+from rodjax.model.scene import has_potential
 from rodjax.model.supports import Held
 from rodjax.solving import applied_forces
 from rodjax.solving.penetration import MOST_PENETRATION, passage_of, penetration
@@ -154,60 +154,69 @@ def outcome_told(equilibrium: Equilibrium) -> str:
     codes, counts = np.unique(np.asarray(equilibrium.status), return_counts=True)
     messages = {code: Status(code).message for code in codes}
     if Status.PASSED_THROUGH in messages:
-        messages[Status.PASSED_THROUGH] += _passages(equilibrium)
-    if Status.SLID_OUT in messages and equilibrium.status.ndim == 0:
-        messages[Status.SLID_OUT] += _last_clips(equilibrium.scene)
+        messages[Status.PASSED_THROUGH] += "".join(f" ({part})" for part in _passages(equilibrium))
     if equilibrium.status.ndim == 0:
+        clips = "".join(f", {part}" for part in _last_clips(equilibrium))
+        told = "".join(f"; {part}" for part in _stuck_within(equilibrium) + too_short(equilibrium))
         return (
-            f"{messages[codes[0]]}; residual {float(equilibrium.residual):.1e} EI/L^2 "
-            f"after {int(equilibrium.iterations)} iterations{_stuck_within(equilibrium)}{too_short(equilibrium)}"
+            f"{messages[codes[0]]}{clips}; residual {float(equilibrium.residual):.1e} EI/L^2 "
+            f"after {int(equilibrium.iterations)} iterations{told}"
         )
     return "\n".join(f"{count} {messages[code]}" for code, count in zip(codes, counts, strict=True))
 
 
-def _last_clips(scene: Scene) -> str:
+def places_told(equilibrium: Equilibrium) -> list[str]:
+    """Of one that found no equilibrium: the obstacles that it came through or lies in, the clips that it leaves, and
+    how much too short it is.
+    """
+    found = _passages(equilibrium) + _last_clips(equilibrium) + _stuck_within(equilibrium)
+    return found + too_short(equilibrium)
+
+
+def _last_clips(equilibrium: Equilibrium) -> list[str]:
     """Which clips hold nothing any more, or have come to the next one."""
+    if equilibrium.status != Status.SLID_OUT:
+        return []
+    scene = equilibrium.scene
     length = float(scene.rod.length)
     places = np.array([0.0, *(float(clip.at) for clip in scene.clips), length])
     near = np.diff(places) < NEARLY_OUT * length
     which = [k for k, clip in enumerate(scene.clips) if clip.sliding and (near[k] or near[k + 1])]
-    return "".join(f", clips[{k}], which has come to {places[k + 1]:.4g} of {length:.4g} m" for k in which)
+    return [f"clips[{k}], which has come to {places[k + 1]:.4g} of {length:.4g} m" for k in which]
 
 
-def _stuck_within(equilibrium: Equilibrium) -> str:
+def _stuck_within(equilibrium: Equilibrium) -> list[str]:
     """In which obstacle a rod lies that found no equilibrium, and where."""
     if bool(equilibrium.converged) or equilibrium.status == Status.PASSED_THROUGH or not equilibrium.scene.obstacles:
-        return ""
+        return []
     found = passage_of(equilibrium)
-    if not found.is_within:
-        return ""
-    return f"; the rod lies {_place_of(found, equilibrium)}"
+    return [f"the rod lies {_place_of(found, equilibrium)}"] if found.is_within else []
 
 
-def too_short(equilibrium: Equilibrium) -> str:
+def too_short(equilibrium: Equilibrium) -> list[str]:
     """By how much a rod that found no equilibrium, or a far too strained one, is shorter than a string that is pulled
     taut around the obstacles on the side where the rod last was sound.
     """
     scene, before = equilibrium.scene, equilibrium.state.before
     start, end = scene.start, scene.end
     if before is None or not isinstance(start, Held) or not isinstance(end, Held) or scene.clips:
-        return ""
+        return []
     if bool(equilibrium.converged) and not bool(_is_overstretched(equilibrium)):
-        return ""
+        return []
     radius, length = float(np.min(_radii(scene.rod))), float(scene.rod.length)
     ends = np.asarray(start.position), np.asarray(end.position)
     points = np.asarray(before.points).copy()
     points[0], points[-1] = ends
     distances = np.min([np.asarray(obstacle.distance(points[1:-1])) for obstacle in scene.obstacles], axis=0)
     if not np.all(distances > 0):  # it began on no side
-        return ""
+        return []
     needed, touched = taut(leaf(points), scene.obstacles, leaf(np.asarray(radius)))
     lacking = float(needed) - length
     if lacking < LEAST_LACKING * length:
-        return ""
+        return []
     names = [f"obstacles[{k}] ({type(scene.obstacles[k]).__name__})" for k in np.flatnonzero(np.asarray(touched))]
     where = f" to pass {' and '.join(names)} on the side where it was" if names else " to reach from end to end"
-    return f"; the rod is at least {lacking:.2g} m too short{where}"
+    return [f"the rod is at least {lacking:.2g} m too short{where}"]
 
 
 def _radii(rod: Rod) -> Float[np.ndarray, "k"]:
@@ -216,8 +225,10 @@ def _radii(rod: Rod) -> Float[np.ndarray, "k"]:
     return np.atleast_1d(np.asarray(getattr(rod.radius, "values", rod.radius)))
 
 
-def _passages(equilibrium: Equilibrium) -> str:
+def _passages(equilibrium: Equilibrium) -> list[str]:
     """Which obstacles those that came through one did, and where."""
+    if not np.any(equilibrium.status == Status.PASSED_THROUGH):
+        return []
     found = passage_of(equilibrium)
     passed = np.argwhere((np.asarray(equilibrium.status) == Status.PASSED_THROUGH) & ~np.asarray(found.is_sound))
     named = []
@@ -225,7 +236,7 @@ def _passages(equilibrium: Equilibrium) -> str:
         which = f"{list(map(int, index))}: " if index else ""
         named.append(which + _place_of(found, equilibrium, index))
     more = [f"and {len(passed) - MOST_NAMED} more"] if len(passed) > MOST_NAMED else []
-    return "".join(f" ({part})" for part in [", ".join([*named, *more])] if part)
+    return [", ".join([*named, *more])] if named else []
 
 
 def _place_of(found: Passage, equilibrium: Equilibrium, index: tuple[int, ...] = ()) -> str:

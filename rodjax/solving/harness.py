@@ -6,12 +6,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rodjax.checks import instance, is_known
 from rodjax.model.harness import Bodies, Harness, of_one_rod
 from rodjax.model.scene import Scene, has_friction
 from rodjax.programs.compilation import compiled
 from rodjax.solving.assembly import Poses
+from rodjax.solving.description import places_told
 from rodjax.solving.equilibrium import is_here
 from rodjax.solving.first_poses import Shapes, first_poses
 from rodjax.solving.guess import Guess
@@ -133,14 +135,19 @@ def _of_one_rod(result: HarnessEquilibrium) -> Equilibrium:
 
 def warn_of_harness(result: HarnessEquilibrium, strain_limit: Any, *, is_given: bool = False) -> None:
     """Outside `jit`, what is wrong with the result; `is_given`: whether its mesh was, which may be too coarse."""
+    names = [f"cable {name!r}" for name in result.names] if len(result) > 1 else ["the rod"]
     if is_given:
-        for group in result.groups:
-            warn_if_coarse(group)
+        for members, group in zip(result.members, result.groups, strict=True):
+            warn_if_coarse(group, [names[number] for number in members])
     if not bool(result.converged):
-        warn(result.in_words().splitlines()[0], NotConvergedWarning)
+        told = [
+            f"{name}: {part}" for name, rod in zip(names, result.values(), strict=True) for part in places_told(rod)
+        ]
+        warn("; ".join([result.outcome, *told]), NotConvergedWarning)
         return
-    for rod in result.groups:
-        warn_of_outcome(rod, strain_limit)
+    if any(np.any(np.asarray(group.status)) for group in result.groups):
+        for name, rod in zip(names, result.values(), strict=True):
+            warn_of_outcome(rod, strain_limit, name)
 
 
 # --- the start -------------------------------------------------------------------------------------------------------

@@ -129,13 +129,18 @@ class HarnessEquilibrium(Described):
         if np.ndim(self.status):
             codes, counts = np.unique(np.asarray(self.status), return_counts=True)
             return "\n".join(f"{count} {Status(code).message}" for code, count in zip(codes, counts, strict=True))
-        outcome = Status(int(self.status)).message
-        lines = [f"{outcome}; residual {float(self.residual):.1e} EI/L^2 after {int(self.iterations)} iterations"]
+        lines = [self.outcome]
         if bool(self.converged) and int(self.index) > 0:
             lines[0] += f"; a saddle: {int(self.index)} motions lower the energy"
         if bool(self.converged) and not self.harness.has_potential:
             lines[0] += "; under loads without a potential, so that no energy tells whether it is stable"
         return "\n".join(lines + self._contacts_told() + [f"{name}: {describe(rod)}" for name, rod in self.items()])
+
+    @property
+    def outcome(self) -> str:
+        """Of one equilibrium, in words."""
+        told = Status(int(self.status)).message
+        return f"{told}; residual {float(self.residual):.1e} EI/L^2 after {int(self.iterations)} iterations"
 
     def _contacts_told(self) -> list[str]:
         """Of one equilibrium, which rods touch one another, with which force and where."""

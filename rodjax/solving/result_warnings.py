@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -34,8 +35,11 @@ class PrecisionWarning(UserWarning):
     """Numbers of single precision, and what they cost."""
 
 
-def warn_if_coarse(equilibrium: Equilibrium) -> None:
-    """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that."""
+def warn_if_coarse(equilibrium: Equilibrium, names: Sequence[str] | None = None) -> None:
+    """Where the numbers alone show that a given mesh is far too coarse: no program is needed for that.
+
+    `names`: of each of stacked equilibria, as those of the cables of a harness.
+    """
     curvature, s = np.asarray(equilibrium.curvature), np.asarray(equilibrium.s)
     if equilibrium.discretization == "hermite" and isinstance(equilibrium.state.shape, FramedCurve):
         curvature = np.hypot(curvature, np.asarray(equilibrium.twist))
@@ -48,6 +52,8 @@ def warn_if_coarse(equilibrium: Equilibrium) -> None:
     is_coarse &= np.asarray(equilibrium.converged)
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
+        if names is not None:
+            many = f" of {' and '.join(names[int(k)] for k in np.flatnonzero(is_coarse))}"
         most = np.max(turn[is_coarse])
         most = 2 * np.arctan(most / 2) if by_tangent else most
         most = f"{most:.1f} rad" if most < 2 * math.pi else "more than a whole turn"  # no figure on such a mesh
@@ -80,7 +86,9 @@ def warn_of_single_precision() -> None:
     )
 
 
-def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT) -> None:
+def warn_of_outcome(
+    equilibrium: Equilibrium, strain_limit: Float[Array, ""] | float = DEFAULT_STRAIN_LIMIT, rod: str = "the rod"
+) -> None:
     """Where statuses are known, of those that are not converged and of those above a strain."""
     if not is_known(equilibrium.status):
         return
@@ -94,9 +102,9 @@ def warn_of_outcome(equilibrium: Equilibrium, strain_limit: Float[Array, ""] | f
     if not is_overstretched.any() or not is_known(equilibrium.axial_strain, strain_limit):
         return
     count = int(np.sum(is_overstretched))
-    rods = "the rod is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
+    rods = f"{rod} is" if not status.ndim else "1 rod is" if count == 1 else f"{count} rods are"
     warn(
         f"{rods} strained by more than strain_limit = {100 * float(strain_limit):g} %: {largest_strain(equilibrium)}"
-        f"{'' if status.ndim else too_short(equilibrium)}",
+        + "".join(f"; {part}" for part in ([] if status.ndim else too_short(equilibrium))),
         OverstretchedWarning,
     )

@@ -5,6 +5,7 @@ Tracing takes seconds for each pair of supports, so that most pairs are slow tes
 
 import itertools
 import math
+import warnings
 
 import equinox as eqx
 import jax
@@ -18,6 +19,7 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 import rodjax as rj
 from rodjax import Clamp, Free, Pin, PointForce, Rod, Scene, Swivel, frame, problems, solve_continuum
+from rodjax.analysis import continuum
 
 LEVEL = frame((1, 0, 0))
 ORIGIN = (0.0, 0.0, 0.0)
@@ -256,6 +258,32 @@ def test_a_heavy_cable_converges():
         np.testing.assert_allclose(first, second, rtol=1e-10, atol=1e-8, err_msg=name)
 
 
+@pytest.mark.parametrize("enough", [2, 8])
+def test_where_a_search_fails_more_intervals_are_tried(figure_1, monkeypatch, enough):
+    """As happens from a guess that is far off: from 4 intervals on under thirty times its weight."""
+    tried, solved = [], continuum._solve
+
+    def failing(scene, guess, rtol, intervals, segments):
+        tried.append(intervals)
+        result = solved(scene, guess, rtol, tried[0], segments)
+        found = intervals >= enough * tried[0]
+        outcome = jnp.array(found), jnp.array(rj.Status.CONVERGED if found else rj.Status.NOT_FINITE)
+        return eqx.tree_at(lambda result: (result.converged, result.status), result, outcome)
+
+    monkeypatch.setattr(continuum, "_solve", failing)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = solve_continuum(*figure_1)
+    # Four times as many are the most.
+    assert [count // tried[0] for count in tried] == ([1, 2] if enough == 2 else [1, 2, 4])
+    assert bool(result.converged) == (enough == 2)
+    assert [warning.category for warning in caught] == ([] if enough == 2 else [rj.NotConvergedWarning])
+    tried.clear()
+    with pytest.warns(rj.NotConvergedWarning):
+        solve_continuum(*figure_1, intervals=8)
+    assert tried == [8]
+
+
 def outputs(scene: Scene, guess: rj.Equilibrium) -> jax.Array:
     result = solve_continuum(scene, guess)
     return jnp.concatenate([result.end_force, result.end_moment, result.energy[None], result.nodes[25]])
@@ -318,13 +346,13 @@ def test_says_that_it_did_not_converge(figure_1):
     scene, guess = figure_1
     broken = eqx.tree_at(lambda guess: guess.frames, guess, jnp.full_like(guess.frames, jnp.nan))
     with pytest.warns(rj.NotConvergedWarning, match="not a finite number"):
-        result = solve_continuum(scene, broken)
+        result = solve_continuum(scene, broken, intervals=8)
     assert not result.converged
     # A guess for another rod: half as long, the frames reversed.
     wild = eqx.tree_at(lambda guess: guess.frames, guess, guess.frames[::-1])
     wild = eqx.tree_at(lambda guess: guess.nodes, wild, -5 * wild.nodes)
     with pytest.warns(rj.NotConvergedWarning):
-        result = solve_continuum(scene, wild)
+        result = solve_continuum(scene, wild, intervals=8)
     assert not result.converged
 
 

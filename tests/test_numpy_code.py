@@ -303,6 +303,21 @@ def test_what_takes_longer_than_compiling_is_compiled(impatient, monkeypatch):
     assert executables(counted) == 1
 
 
+def test_numbers_of_a_weak_type_are_no_reason_to_compile(impatient):
+    """As `eqx.tree_at(lambda scene: scene.rod.GJ, scene, 0.3)` puts them into a scene, which the result has."""
+
+    @compiled
+    def handed_on(x):
+        return {"same": x, "twice": 2 * x, "none": None}
+
+    for number in (1.5, jnp.array(1.5), np.float64(1.5)):
+        result = handed_on(number)
+        assert result["same"] == 1.5
+        assert result["twice"] == 3.0
+        assert not any(jax.typeof(leaf).weak_type for leaf in jax.tree.leaves(result))
+    assert executables(handed_on) == 0
+
+
 def test_numpy_first_is_yes_or_no():
     with pytest.raises(TypeError, match="enabled must be True or False, got 'off'"):
         rj.numpy_first("off")

@@ -78,6 +78,8 @@ GROWTH = 5.0
 MIN_INTERVALS, MAX_INTERVALS = 4, 128
 # Where the numbers that choose it are not known, as inside jit.
 DEFAULT_INTERVALS = 16
+# Shorter intervals make the search steadier: where it fails, so many times as many are tried, by doubling.
+MORE_INTERVALS = 4
 
 
 @one_answer
@@ -143,14 +145,13 @@ def solve_continuum(
     # The root does not depend on where the search for it begins.
     fixed_scene, guess = jax.lax.stop_gradient((scene, guess))
     guess = _near(fixed_scene, guess)
-    if needs_frames(scene):
-        if intervals is None:
-            intervals = _chosen_intervals(growth_of_frames, fixed_scene, guess)
-        result = solve_frames(scene, guess, rtol, intervals, segments)
-    else:
-        if intervals is None:
-            intervals = _chosen_intervals(_growth, fixed_scene, guess)
-        result = _solve(scene, guess, rtol, intervals, segments)
+    solved, growth = (solve_frames, growth_of_frames) if needs_frames(scene) else (_solve, _growth)
+    count = _chosen_intervals(growth, fixed_scene, guess) if intervals is None else intervals
+    result = solved(scene, guess, rtol, count, segments)
+    most = min(MORE_INTERVALS * count, MAX_INTERVALS) if intervals is None else count
+    while count < most and is_known(result.converged) and not bool(result.converged):
+        count *= 2
+        result = solved(scene, guess, rtol, count, segments)
     warn_of_outcome(result)
     return result
 

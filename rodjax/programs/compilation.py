@@ -49,11 +49,14 @@ class _Programs:
         self.last_call = 0
 
     def trace(self, args: tuple, options: dict[str, Any]) -> Any:
-        """By a function of its own, with which JAX forgets what it traced."""
+        """By a function of its own, with which JAX forgets what it traced.
+
+        Of strong types: a number that a user has put into a scene may be of a weak one, and come back in the result.
+        """
 
         @functools.wraps(self.function)
         def anew(*args, **options):
-            return self.function(*args, **options)
+            return jax.tree.map(_strong, self.function(*args, **options))
 
         # The same mesh of devices as where JAX transposes, that the two may share what they trace.
         with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()), _without_collector():
@@ -112,6 +115,11 @@ class _Programs:
         if run._cache_size() != known:
             _make_room()
         return result
+
+
+def _strong(value: Any) -> Any:
+    kind = jax.typeof(value)
+    return jax.lax.convert_element_type(value, kind.dtype) if kind.weak_type else value
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rodjax.model.rod import Law, Rod
+from rodjax.programs.parts import traced_once
 
 # Steps of Newton's method under a law for the axial strain, and for the other strains under a moment: a law that is
 # quadratic in them takes one.
@@ -145,18 +146,11 @@ class Sections(eqx.Module):
         if self.law is None:
             return tension / self.EA
 
-        def improved(strain, tension, curvature, twist):
-            def pull(strain):
-                return jax.grad(lambda strain: jnp.sum(self.density(curvature, twist, strain)))(strain)
-
-            first, stiffness = jax.jvp(pull, (strain,), (jnp.ones_like(strain),))
-            return strain + (tension - first) / stiffness
-
         fixed = jax.lax.stop_gradient((tension, curvature, twist))
         strain = jax.lax.stop_gradient(tension / self.EA)
         for _ in range(AXIAL_STEPS):
-            strain = jax.lax.stop_gradient(improved(strain, *fixed))
-        return improved(strain, tension, curvature, twist)
+            strain = jax.lax.stop_gradient(_better_axial_strain(self, strain, *fixed))
+        return _better_axial_strain(self, strain, tension, curvature, twist)
 
     def strains_under(
         self, moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
@@ -166,24 +160,48 @@ class Sections(eqx.Module):
         if self.law is None:
             return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
 
-        def improved(strains: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-            def enthalpy(strains):
-                axial = self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
-                return jnp.sum(self.density((strains[0], strains[1]), strains[2], axial) - tension * (1 + axial))
-
-            first, by_all = jax.linearize(jax.grad(enthalpy), strains)
-            directions = jnp.eye(3, dtype=strains.dtype).reshape(3, 3, *[1] * tension.ndim)
-            directions *= jnp.ones_like(strains)[None]
-            second = jax.vmap(by_all)(directions)
-            lacking = jnp.moveaxis(moment - first, 0, -1)[..., None]
-            moved = jnp.linalg.solve(jnp.moveaxis(second, (0, 1), (-1, -2)), lacking)
-            return strains + jnp.moveaxis(moved[..., 0], -1, 0)
-
         for _ in range(LAW_STEPS):
-            strains = improved(strains)
+            strains = _better_strains(self, strains, moment, tension)
         return strains, self.axial_strain_under(tension, (strains[0], strains[1]), strains[2])
 
     @property
     def stiffest(self) -> Float[Array, ""]:
         """The largest stiffness against bending or torsion."""
         return jnp.maximum(jnp.max(self.EI), jnp.max(self.GJ))
+
+
+@traced_once
+def _better_axial_strain(
+    sections: Sections,
+    strain: Float[Array, "*k"],
+    tension: Float[Array, "*k"],
+    curvature: tuple[Array, Array],
+    twist: Float[Array, "*k"],
+) -> Float[Array, "*k"]:
+    """A step of `Sections.axial_strain_under`."""
+
+    def pull(strain: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        return jax.grad(lambda strain: jnp.sum(sections.density(curvature, twist, strain)))(strain)
+
+    first, stiffness = jax.jvp(pull, (strain,), (jnp.ones_like(strain),))
+    return strain + (tension - first) / stiffness
+
+
+@traced_once
+def _better_strains(
+    sections: Sections, strains: Float[Array, "3 *k"], moment: Float[Array, "3 *k"], tension: Float[Array, "*k"]
+) -> Float[Array, "3 *k"]:
+    """A step of `Sections.strains_under`."""
+
+    def enthalpy(strains: Float[Array, "3 *k"]) -> Float[Array, ""]:
+        bending, twist = (strains[0], strains[1]), strains[2]
+        axial = sections.axial_strain_under(tension, bending, twist)
+        return jnp.sum(sections.density(bending, twist, axial) - tension * (1 + axial))
+
+    first, by_all = jax.linearize(jax.grad(enthalpy), strains)
+    directions = jnp.eye(3, dtype=strains.dtype).reshape(3, 3, *[1] * tension.ndim)
+    directions *= jnp.ones_like(strains)[None]
+    second = jax.vmap(by_all)(directions)
+    lacking = jnp.moveaxis(moment - first, 0, -1)[..., None]
+    moved = jnp.linalg.solve(jnp.moveaxis(second, (0, 1), (-1, -2)), lacking)
+    return strains + jnp.moveaxis(moved[..., 0], -1, 0)

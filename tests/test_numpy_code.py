@@ -17,6 +17,7 @@ from rodjax.programs.answers import ANSWERS, one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
 from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
+from rodjax.programs.numpy_rules import ELEMENTWISE
 
 X = np.random.default_rng(0).normal(size=(4, 5))
 POSITIVE = X[:, :4] @ X[:, :4].T + np.eye(4)
@@ -47,6 +48,22 @@ def decayed(rate):
 OPERATIONS = {
     "arithmetic": lambda x: (x + 2 * x**3 - x / 3) ** -2 + jnp.sign(x) * abs(x) ** 0.5 - (-x),
     "functions": lambda x: [getattr(jnp, f)(x) for f in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "tanh")],
+    "other functions": lambda x: [
+        *[getattr(jnp, f)(x) for f in ("arcsinh", "sinh", "cosh", "cbrt", "exp2", "expm1", "square")],
+        *[getattr(jnp, f)(jnp.tanh(x)) for f in ("arcsin", "arccos", "arctanh", "log1p")],
+        jnp.arccosh(1 + x**2),
+        lax.rsqrt(1 + x**2),
+        jax.nn.sigmoid(x),
+        lax.reduce_precision(x, 11, 52),
+        (x > 0) ^ (x <= 1),
+    ],
+    "special functions": lambda x: [
+        *[getattr(jax.scipy.special, f)(x) for f in ("erf", "erfc", "i0e", "i1e")],
+        jax.scipy.special.erfinv(jnp.tanh(x)),
+        *[getattr(jax.scipy.special, f)(1 + x**2) for f in ("gammaln", "digamma")],
+        *[getattr(jax.scipy.special, f)(1 + x**2, 2 + x) for f in ("gammainc", "gammaincc")],
+        jax.scipy.special.betainc(1 + x**2, 2.0, 0.3),
+    ],
     "two arrays": lambda x: [f(x, x[::-1]) for f in (jnp.arctan2, jnp.maximum, jnp.minimum, jnp.fmod, jnp.nextafter)],
     "whole numbers": lambda x: [
         (7 * x).astype(jnp.int32) // 3,
@@ -180,6 +197,7 @@ OPERATIONS = {
         jax.grad(lambda x: jnp.sum(jnp.linalg.solve(POSITIVE, x) ** 2))(x),
         jax.vjp(lambda x: lax.scan(lambda c, row: (jnp.sin(c) + row, c), x[0], x), x)[1]((x[0], x)),
         jax.jit(lambda x: jax.jvp(jax.nn.relu, (x,), (x,)))(x),
+        jax.grad(lambda x: jnp.sum(jax.checkpoint(jax.nn.silu)(x)))(x),
     ],
     "kept apart": lambda x: lax.optimization_barrier((x, 2 * x)),
     "other packages": lambda x: [
@@ -203,6 +221,22 @@ def test_operations_give_what_jax_gives(name):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         # Other roundings of the same operations; products of positive matrices of condition 100.
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+def test_each_operation_on_numbers_is_among_them():
+    """A rule that no test runs may be written wrong, as that of the logistic function was."""
+    seen: set[str] = set()
+
+    def look(program):
+        for equation in program.eqns:
+            seen.add(equation.primitive.name)
+            for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda value: hasattr(value, "eqns")):
+                look(inner) if hasattr(inner, "eqns") else None
+
+    for function in OPERATIONS.values():
+        look(jax.jit(function).trace(X).jaxpr)
+    # What other versions of JAX call "copy" and compare in a sort with.
+    assert set(ELEMENTWISE) - seen <= {"copy_p", "lt_to", "le_to"}
 
 
 def test_a_singular_triangle_spoils_no_other():

@@ -403,6 +403,12 @@ def lu(x: np.ndarray) -> Values:
     return _each_matrix(one, x)
 
 
+def special(name: str) -> Callable[..., np.ndarray]:
+    import scipy.special  # a tenth of a second, for few programs
+
+    return getattr(scipy.special, name)
+
+
 def _getrf(matrix: np.ndarray) -> Values:
     import scipy.linalg  # a tenth of a second, for few programs
 

@@ -23,8 +23,9 @@ def _infix(sign: str) -> Rule:
     return lambda body, equation, a, b: f"{a} {sign} {b}"
 
 
-def _prefix(text: str) -> Rule:
-    return lambda body, equation, a: text.replace("x", a)
+def _text(text: str) -> Rule:
+    """With the name of what the operation is given in the place of {}."""
+    return lambda body, equation, a: text.format(a)
 
 
 def _operation(name: str, *params: str) -> Rule:
@@ -376,6 +377,20 @@ def _same(body: Any, equation: Any, *given: str) -> Any:
     return list(given) if equation.primitive.multiple_results else given[0]
 
 
+# Special functions, and what SciPy calls them.
+SPECIAL = {
+    "erf": "erf",
+    "erfc": "erfc",
+    "erf_inv": "erfinv",
+    "lgamma": "gammaln",
+    "digamma": "psi",
+    "igamma": "gammainc",
+    "igammac": "gammaincc",
+    "regularized_incomplete_beta": "betainc",
+    "bessel_i0e": "i0e",
+    "bessel_i1e": "i1e",
+}
+
 ELEMENTWISE: dict[str, Rule] = {
     **{name: _infix(sign) for name, sign in (("add", "+"), ("add_any", "+"), ("sub", "-"), ("mul", "*"))},
     **{name: _infix(sign) for name, sign in (("and", "&"), ("or", "|"), ("xor", "^"))},
@@ -397,10 +412,11 @@ ELEMENTWISE: dict[str, Rule] = {
     "pow": _call("np.power"),
     "is_finite": _call("np.isfinite"),
     "div": _divide,
-    "neg": _prefix("-x"),
-    "not": _prefix("~x"),
-    "rsqrt": _prefix("1 / np.sqrt(x)"),
-    "logistic": _prefix("1 / (1 + np.exp(-x))"),
+    "neg": _text("-{}"),
+    "not": _text("~{}"),
+    "rsqrt": _text("1 / np.sqrt({})"),
+    "logistic": _text("1 / (1 + np.exp(-{}))"),
+    **{name: _call(f"op.special({of_scipy!r})") for name, of_scipy in SPECIAL.items()},
     "integer_pow": _integer_power,
     "convert_element_type": _convert,
     "select_n": _select,
@@ -424,6 +440,7 @@ INNER: dict[str, Rule] = {
     "custom_vjp_call": _inner("call_jaxpr"),
     "custom_vmap_call": _inner("call"),
     "checkpoint": _inner("jaxpr"),
+    "remat2": _inner("jaxpr"),
     "call_hi_primitive": _high_level,
     "while": _while,
     "scan": _scan,

@@ -275,6 +275,20 @@ def test_a_thin_pipe_between_nodes_carries_a_heavy_cable():
     assert len(result.s) - 1 <= 64
 
 
+def test_an_edge_beside_a_node_does_not_press_the_rod_in():
+    """A cable that hangs over the edge of a table, 16 elements of 0.0625: along an obstacle the rod counts as thinner
+    near nodes by up to 1e-2 of its radius, and where one crosses it by 9e-5.
+    """
+    for edge in (0.309, 0.315, 0.36):
+        table = rj.Box((edge - 0.3, 0, -0.3), (0.6, 1, 0.6))
+        scene = Scene(cable(), Clamp((0, 0, RADIUS), LEVEL), Free(), GRAVITY, obstacles=[table])
+        result = rj.solve(scene, segments=16)
+        assert result.converged
+        # Contacts are within elements, 0.04 to 0.14 of them beside a node.
+        beyond = result.position_at(np.linspace(0.2, 0.5, 3001))
+        assert -float(jnp.min(table.distance(beyond) - RADIUS)) < DEEPEST * RADIUS
+
+
 def test_the_estimate_knows_the_kink_of_moments_between_nodes():
     """A pipe that lifts a clamped beam between two nodes: what its moment there has beyond that at both nodes."""
     pipe = rj.Capsule((0.5, -1, -0.022), (0.5, 1, -0.022), 0.02)  # lifts by 0.003

@@ -42,6 +42,9 @@ SAG = 1 / 384
 # rod that is pulled tight around a pipe has the curvature of that but for some `SAME_CURVATURE` [1/L].
 PARTING = 1 / 8
 SAME_CURVATURE = 0.1
+# So many times as sharp as that, the rod crosses the obstacle there, as an edge or a thin pipe, and does not lie along
+# it: no more than `AT_NODES` then.
+CROSSES = 100.0
 # Places of an element among which the nearest one is, and steps of the search from there at most; what moves by less
 # than `NEAR` has been found, as Newton's steps square their errors.
 SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -60,7 +63,7 @@ MOST_NUMBERS = 1000
 class Elements(NamedTuple):
     """What the centerline within n elements depends on: position and tangent of the first and the last node of each,
     `axes` about which the tangents turn; `free`: 0 at nodes whose place is given, else 1; `at_nodes`: by which part of
-    its radius the rod counts as thinner at the nodes.
+    its radius the rod counts as thinner at the nodes where it lies along an obstacle.
     """
 
     positions: Float[Array, "3 2 n"]
@@ -163,7 +166,7 @@ class Elements(NamedTuple):
 class Places(NamedTuple):
     """Where n elements come nearest to each of q obstacles: the part t of the element, point, gap and its gradient by
     the point; of the gap the derivatives by t, and how the first of them changes with the point; `stays`: where t does
-    not move with the rod.
+    not move with the rod; `at_nodes`: by which part of its radius the rod counts as thinner at the nodes.
     """
 
     t: Float[Array, "q n"]
@@ -174,6 +177,7 @@ class Places(NamedTuple):
     growth: Float[Array, "q n"]
     of_slope: Float[Array, "q 3 n"]
     stays: Bool[Array, "q n"]
+    at_nodes: Float[Array, "q n"]
 
     @staticmethod
     def of(
@@ -235,11 +239,14 @@ def _seen(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value, t:
         of_points = jax.vmap(jax.value_and_grad(obstacle.at), in_axes=-1, out_axes=(0, -1))
         found.append(jax.jvp(of_points, (point,), (rate,)))
     (distances, normals), (_, of_slope) = jax.tree.map(lambda *parts: jnp.stack(parts), *found)
-    seen_radius, radius_slope, radius_growth = _seen_radius(radius, elements, t)
-    slope = jnp.sum(normals * along, axis=1) - radius_slope
-    growth = jnp.sum(of_slope * along + normals * curving, axis=1) - radius_growth
+    slope, growth = jnp.sum(normals * along, axis=1), jnp.sum(of_slope * along + normals * curving, axis=1)
+    own = _own_radius(radius, elements, t)
+    at_nodes = jnp.broadcast_to(elements.at_nodes[None], t.shape)
+    at_nodes = jnp.where(growth - own[2] > CROSSES * 8 * at_nodes * own[0], AT_NODES, at_nodes)
+    seen_radius, radius_slope, radius_growth = _seen_radius(own, at_nodes, t)
+    slope, growth = slope - radius_slope, growth - radius_growth
     stays = ((t <= 0) & (slope >= 0)) | ((t >= 1) & (slope <= 0)) | (growth <= 0)
-    return Places(t, points, distances - seen_radius, normals, slope, growth, of_slope, stays)
+    return Places(t, points, distances - seen_radius, normals, slope, growth, of_slope, stays, at_nodes)
 
 
 @eqx.filter_custom_jvp
@@ -249,30 +256,31 @@ def _nearest(elements: Elements, obstacles: tuple[Obstacle, ...], radius: Value)
     """
     samples, spacing = jnp.asarray(SAMPLES, elements.s.dtype), SAMPLES[1] - SAMPLES[0]
     everywhere = jnp.broadcast_to(samples[:, None], (len(samples), len(elements.s) - 1))
-    points, (seen_radius, _, _) = jax.vmap(elements.at)(everywhere), _seen_radius(radius, elements, everywhere)
-    seen = jnp.stack([jax.vmap(jax.vmap(obstacle.at, in_axes=-1))(points) for obstacle in obstacles])
-    seen -= seen_radius[None]
-    first = samples[jnp.argmin(seen, axis=1)]
+    points, own = jax.vmap(elements.at)(everywhere), _own_radius(radius, elements, everywhere)
+    distances = jnp.stack([jax.vmap(jax.vmap(obstacle.at, in_axes=-1))(points) for obstacle in obstacles])
+    seen_radius, _, _ = _seen_radius(own, elements.at_nodes[None], everywhere)
+    first = samples[jnp.argmin(distances - seen_radius[None], axis=1)]
 
     def goes_on(state: tuple[Array, ...]) -> Bool[Array, ""]:
         *_, change, steps = state
         return (steps < STEPS) & jnp.any(change > NEAR)
 
     def nearer(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        t, low, high, _, _, steps = state
+        t, low, high, _, _, _, steps = state
         there = _seen(elements, obstacles, radius, t)
         low, high = jnp.where(there.slope < 0, t, low), jnp.where(there.slope > 0, t, high)
         further = t - there.slope / jnp.where(there.growth > 0, there.growth, 1.0)
         is_between = (there.growth > 0) & (low <= further) & (further <= high)
         t_next = jnp.where(is_between, further, (low + high) / 2)
-        return t_next, low, high, there.gaps, jnp.abs(t_next - t), steps + 1
+        return t_next, low, high, there.gaps, there.at_nodes, jnp.abs(t_next - t), steps + 1
 
     low, high = jnp.maximum(first - spacing, 0.0), jnp.minimum(first + spacing, 1.0)
-    begin = first, low, high, seen[:, 0], jnp.ones_like(first), jnp.zeros((), int)
-    t, _, _, reached, _, _ = jax.lax.while_loop(goes_on, nearer, begin)
+    begin = first, low, high, distances[:, 0], jnp.zeros_like(first), jnp.ones_like(first), jnp.zeros((), int)
+    t, _, _, reached, at_nodes, _, _ = jax.lax.while_loop(goes_on, nearer, begin)
     # Nearest at an end, to which halving comes near only.
-    t = jnp.where(seen[:, 0] <= reached, 0.0, t)
-    return jnp.where(seen[:, -1] <= jnp.minimum(reached, seen[:, 0]), 1.0, t)
+    at_start, at_end = (distances[:, k] - own[0][None, k] * (1 - THINNER - at_nodes) for k in (0, -1))
+    t = jnp.where(at_start <= reached, 0.0, t)
+    return jnp.where(at_end <= jnp.minimum(reached, at_start), 1.0, t)
 
 
 @_nearest.def_jvp
@@ -285,15 +293,14 @@ def _(given: tuple[Any, ...], changes: tuple[Any, ...]) -> tuple[Array, Array]:
     return t, jnp.where(there.stays, 0.0, -change.slope / jnp.where(there.stays, 1.0, there.growth))
 
 
-def _seen_radius(
+def _own_radius(
     radius: Value, elements: Elements, t: Float[Array, "q n"]
 ) -> tuple[Float[Array, "q n"], Float[Array, "q n"], Float[Array, "q n"]]:
-    """As which the rod counts at the parts t of the elements, and the first and second derivative of that by t."""
-    s, at_nodes, aside = elements.s, elements.at_nodes[None], 2 * t - 1
-    counts = 1 - THINNER - at_nodes * aside**2, -4 * at_nodes * aside, jnp.broadcast_to(-8 * at_nodes, t.shape)
+    """That of the rod at the parts t of the elements, and its first and second derivative by t."""
     if not isinstance(radius, Along):
-        value, slope, growth = (radius * part for part in counts)
-        return value, slope, growth
+        nothing = jnp.zeros_like(t)
+        return jnp.broadcast_to(radius, t.shape), nothing, nothing
+    s = elements.s
     begin, end = (jnp.broadcast_to(side[None], t.shape) for side in (s[:-1], s[1:]))
 
     def own(t: Float[Array, "q n"]) -> Float[Array, "q n"]:
@@ -303,8 +310,15 @@ def _seen_radius(
         return jax.jvp(own, (t,), (jnp.ones_like(t),))
 
     (value, slope), (_, growth) = jax.jvp(with_rate, (t,), (jnp.ones_like(t),))
-    return (
-        counts[0] * value,
-        counts[1] * value + counts[0] * slope,
-        counts[2] * value + 2 * counts[1] * slope + counts[0] * growth,
-    )
+    return value, slope, growth
+
+
+def _seen_radius(
+    own: tuple[Float[Array, "q n"], Float[Array, "q n"], Float[Array, "q n"]],
+    at_nodes: Float[Array, "q n"],
+    t: Float[Array, "q n"],
+) -> tuple[Float[Array, "q n"], Float[Array, "q n"], Float[Array, "q n"]]:
+    """As which the rod counts at the parts t of the elements, and the first and second derivative of that by t."""
+    (value, slope, growth), aside = own, 2 * t - 1
+    counts, rate, second = 1 - THINNER - at_nodes * aside**2, -4 * at_nodes * aside, -8 * at_nodes
+    return counts * value, rate * value + counts * slope, second * value + 2 * rate * slope + counts * growth

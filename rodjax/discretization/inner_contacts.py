@@ -11,8 +11,9 @@ place where
     g = distance(x) - (1 - THINNER - at_nodes (2 t - 1)^2) radius
 
 is least, so that it follows an edge or a thin pipe along the element; beside a support that holds the rod within the
-obstacle it is in the middle. First derivatives of g are those at a fixed place; the second ones count that the place
-moves. A force p n there is virtual work on both nodes: forces and couples.
+obstacle it is in the middle. Where such an edge or pipe crosses the element, `at_nodes` is the least. First derivatives
+of g are those at a fixed place; the second ones count that the place moves. A force p n there is virtual work on both
+nodes: forces and couples.
 """
 
 from typing import Any, NamedTuple

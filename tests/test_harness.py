@@ -14,6 +14,7 @@ from planar_frames import PlanarRod, solve_frame
 import rodjax
 from rodjax import Body, Clamp, Free, Harness, Joint, Newton, Pin, Plane, Rod, Scene, Slider, Spring, plot
 from rodjax.paths import harness_path
+from rodjax.solving import result_warnings
 from rodjax.solving.first_poses import first_poses
 
 GRAVITY = (0.0, 3.0, -9.81)
@@ -280,6 +281,19 @@ def test_of_a_batch_each_harness_that_did_not_converge_is_told():
         batch = rodjax.solve_batch(harnesses, segments=4, guess=first, solver=Newton(max_iterations=4), threads=2)
     assert batch.converged.tolist() == [True, False, False]
     assert len(told) == 2
+
+
+def test_the_cable_whose_mesh_is_too_coarse_is_named(monkeypatch):
+    """The one that bends most along an element, beside the other where the bound lies between both."""
+    found = rodjax.solve(pulled(3.0), segments=4)
+    turns = {name: float(jnp.max(found[name].curvature)) * 0.125 for name in found}
+    assert turns["a"] != turns["b"]
+    most = max(turns, key=lambda name: turns[name])
+    monkeypatch.setitem(result_warnings.MOST_TURN, "hermite", sum(turns.values()) / 2)
+    with pytest.warns(rodjax.MeshWarning) as told:
+        rodjax.solve(pulled(3.0), segments=4)
+    assert len(told) == 1
+    assert str(told[0].message).startswith(f"the mesh of 4 segments is too coarse for cable {most!r}: the rod turns by")
 
 
 def test_steps_of_a_path_that_fail_are_halved():

@@ -49,8 +49,6 @@ class AnswerCode:
     def of(traced: Any) -> "AnswerCode":
         """Of what `jax.jit(...).trace(...)` gives. Raises `NotInNumpyError`."""
         program = traced.jaxpr
-        if any(kind.weak_type for kind in program.out_avals):
-            raise NotInNumpyError("a result of a weak type")
         writer = _Writer()
         try:
             writer.function(program, "main")

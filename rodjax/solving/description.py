@@ -166,11 +166,8 @@ def outcome_told(equilibrium: Equilibrium) -> str:
 
 
 def places_told(equilibrium: Equilibrium) -> list[str]:
-    """Of one that found no equilibrium: the obstacles that it came through or lies in, the clips that it leaves, and
-    how much too short it is.
-    """
-    found = _passages(equilibrium) + _last_clips(equilibrium) + _stuck_within(equilibrium)
-    return found + too_short(equilibrium)
+    """Of one that found no equilibrium: the obstacles that it came through or lies in, and the clips that it leaves."""
+    return _passages(equilibrium) + _last_clips(equilibrium) + _stuck_within(equilibrium)
 
 
 def _last_clips(equilibrium: Equilibrium) -> list[str]:

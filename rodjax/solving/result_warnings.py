@@ -53,7 +53,7 @@ def warn_if_coarse(equilibrium: Equilibrium, names: Sequence[str] | None = None)
     if is_coarse.any():
         many = f" in {np.sum(is_coarse)} of {is_coarse.size} scenes" if is_coarse.ndim else ""
         if names is not None:
-            many = f" of {' and '.join(names[int(k)] for k in np.flatnonzero(is_coarse))}"
+            many = f" for {' and '.join(names[int(k)] for k in np.flatnonzero(is_coarse))}"
         most = np.max(turn[is_coarse])
         most = 2 * np.arctan(most / 2) if by_tangent else most
         most = f"{most:.1f} rad" if most < 2 * math.pi else "more than a whole turn"  # no figure on such a mesh

@@ -11,6 +11,7 @@ from route_rates import assert_rates_are_those_of_solves
 
 import rodjax as rj
 from rodjax.programs.tasks import Workers
+from rodjax.routing.problem import spare_lengths
 from rodjax.routing.rounds import Rounds
 from rodjax.routing.route import _Fleet, _problem
 from rodjax.routing.search import Numbers, Search, Settings
@@ -90,6 +91,21 @@ def test_rates_are_those_of_solves():
     limits = rj.Limits(bend_radius=9.0, clearance=0.01)
     problem, _ = _problem(corner(), VARIABLES, limits, None, [AWAY], None, 16, TIGHT)
     assert_rates_are_those_of_solves(problem, 4, np.array([0.6, 0.5, 0.6]))
+
+
+def test_a_design_without_a_mesh_is_not_drawn():
+    """A clip at 0.1 to 0.2 m passes a force that follows the rod at 0.15 m, which needs an element of its own beside
+    it: a twentieth of one of 16 at least.
+    """
+    rod, *ends = corner().rod, corner().start, corner().end
+    force = rj.PointForce(0.15, (0.0, 0.0, 0.1), follower=True)
+    scene = rj.Scene(rod, *ends, clips=[rj.Clip(0.1, (0.09, 0, 0.02))], point_forces=[force])
+    moved = [rj.Between("clips.0.at", 0.1, 0.2)]
+    problem, _ = _problem(scene, moved, rj.Limits(bend_radius=9.0), None, (), None, 16, TIGHT)
+    least = 0.05 * 0.3 / 16 / 0.1
+    spare = np.asarray(spare_lengths(problem, 0.5 + least * jnp.array([[-0.9], [-1.1], [1.1]])))
+    assert spare[0] == -np.inf
+    assert np.all(np.isfinite(spare[1:]))
 
 
 def test_a_start_without_an_equilibrium_is_drawn_again(monkeypatch):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rodjax.discretization.cells import segments_for_jumps
 from rodjax.geometry.vectors import dot, root
 from rodjax.model.along import Along
 from rodjax.model.harness import Harness, scenes_of
@@ -114,14 +115,19 @@ def _most_strain(limits: Limits | None, scene: Scene, clips: int) -> Float[Array
     return force.astype(most.dtype) / jnp.max(stiffness)
 
 
-def is_ordered(scene: Scene | Harness) -> Bool[Array, ""]:
-    """Whether clips follow one another along each rod, each further on by a hundredth of a part of it."""
-    are_ordered = []
+def is_meshed(problem: Problem, scene: Scene | Harness) -> Bool[Array, ""]:
+    """Whether clips follow one another along each rod, each further on by a hundredth of a part of it, and none is so
+    near to a jump that the mesh cannot tell them apart.
+    """
+    good = []
     for rod in scenes_of(scene).values():
         length = rod.rod.length
         s = jnp.stack([jnp.zeros_like(length), *(clip.at for clip in rod.clips), length])
-        are_ordered.append(jnp.all(jnp.diff(s) > 0.01 * length / len(s)))
-    return jnp.all(jnp.stack(are_ordered))
+        good.append(jnp.all(jnp.diff(s) > 0.01 * length / len(s)))
+        needed = segments_for_jumps(rod)
+        if needed is not None:
+            good.append(needed[0] <= problem.segments)
+    return jnp.all(jnp.stack(good))
 
 
 def _spare(problem: Problem, scene: Scene | Harness) -> Float[Array, "spans"]:
@@ -130,12 +136,12 @@ def _spare(problem: Problem, scene: Scene | Harness) -> Float[Array, "spans"]:
 
 @compiled
 def spare_lengths(problem: Problem, designs: Float[Array, "k n"]) -> Float[Array, "k"]:
-    """The least of the spans of each design, minus infinity where clips do not follow one another."""
+    """The least of the spans of each design, minus infinity where there is no mesh for it."""
 
     def one(u: Float[Array, "n"]) -> Float[Array, ""]:
         scene = problem.scene_at(u)
         least = jnp.min(_spare(problem, scene), initial=jnp.inf)
-        return jnp.where(is_ordered(scene), least, -jnp.inf)
+        return jnp.where(is_meshed(problem, scene), least, -jnp.inf)
 
     return jax.vmap(one)(designs)
 
@@ -174,7 +180,7 @@ def _evaluated(problem: Problem, design: Float[Array, "n"], result: Solution) ->
     _, by, (objective, slacks, spare, kept) = jacobian(outputs, problem.scene_at, design, result)
     rates = by.T
     numbers = jnp.concatenate([objective[None], slacks])
-    is_valid = result.converged & is_ordered(problem.scene_at(design))
+    is_valid = result.converged & is_meshed(problem, problem.scene_at(design))
     is_valid &= jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.isfinite(rates[: len(numbers)]))
     return Evaluation(design, objective, slacks, spare, kept, rates, result, is_valid)
 
@@ -183,11 +189,11 @@ def _evaluated(problem: Problem, design: Float[Array, "n"], result: Solution) ->
 def arranged(
     problem: Problem, designs: Float[Array, "k n"], guesses: Solution, order: Int[Array, "k"]
 ) -> tuple[Float[Array, "k n"], Any, Solution]:
-    """Designs and guesses in this order, and the scenes; where clips do not follow one another, that of the guess."""
+    """Designs and guesses in this order, and the scenes; where there is no mesh for one, that of the guess."""
 
     def scene(design: Float[Array, "n"], guess: Solution) -> Any:
         scene = problem.scene_at(design)
-        is_possible = is_ordered(scene)
+        is_possible = is_meshed(problem, scene)
         return jax.tree.map(lambda a, b: jnp.where(is_possible, a, b), scene, solved_in(guess))
 
     designs, guesses = jax.tree.map(lambda leaf: leaf[order], (designs, guesses))
@@ -222,7 +228,8 @@ def valued(
     def one(design: Float[Array, "n"], result: Solution):
         scene = problem.scene_at(design)
         objective, slacks, _, _ = _values(problem, scene, result)
-        is_valid = result.converged & is_ordered(scene) & jnp.all(jnp.isfinite(slacks)) & jnp.isfinite(objective)
+        is_valid = result.converged & is_meshed(problem, scene)
+        is_valid &= jnp.all(jnp.isfinite(slacks)) & jnp.isfinite(objective)
         return objective, slacks, is_valid
 
     return jax.lax.map(lambda entry: one(*entry), (designs, results))

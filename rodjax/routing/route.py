@@ -230,7 +230,8 @@ def route(
     Where the length, positions or arclengths vary, the rod between two held places is kept as long as the straight way
     between them, or as little shorter as it is where it is pulled by as much as the limits of force at ends and clips
     allow. A trial that would pull the rod more taut is stepped back from without a solve, as is one where clips would
-    not follow one another; so is one without an equilibrium.
+    not follow one another, or one would come nearer to a jump of the rod or of a load than the mesh can tell; so is one
+    without an equilibrium.
 
     The same arguments give the same route to the last bit, as executables (`rodjax.numpy_first`). Where no start keeps
     to the limits, the result is that of the least violation, `feasible` is False, and `str` says what is missing.

@@ -15,9 +15,12 @@ LANES = 16
 def in_lanes(function: Callable[..., T], each: tuple[Any, ...], rods: int = 1) -> T:
     """`function` of each entry of the stacks in `each`, of so many `rods`; some again where they do not come out even.
 
-    (`jax.lax.map` would compile a second program for what is left over.)
+    (`jax.lax.map` would compile a second program for what is left over.) One alone needs no lanes: what its solve does
+    not need is then left out, not computed and thrown away.
     """
     count = jax.tree.leaves(each)[0].shape[0]
+    if count == 1:
+        return jax.tree.map(lambda x: x[None], function(*jax.tree.map(lambda x: x[0], each)))
     lanes = min(max(1, LANES // rods), count)
     turns = -(-count // lanes)
     if turns == 1:

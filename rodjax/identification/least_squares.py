@@ -22,6 +22,9 @@ LEAST_STEP = 1e-12
 # A step that moves no estimate by more than this part of its standard error, or of its size, is the last.
 LAST_STEP = 1e-3
 LEAST_CHANGE = 1e-10
+# So is one that finds nothing better, moves unknowns by no more than this, and is not shortened by damping: of data
+# without scatter the squares are all rounding there.
+LEAST_TRIED = 1e-7
 # A reduction of the sum of squares by this part of it is lost in rounding.
 ROUNDING = 1e-11
 
@@ -168,10 +171,12 @@ def least_squares(
         freedom = jnp.maximum(numbers - free.astype(numbers.dtype), 1.0)
         is_last = (squared <= LAST_STEP**2 * there.squares / freedom) | (largest < LEAST_CHANGE)
         is_lost = ~is_better & (predicted <= ROUNDING * here.squares)
+        is_undamped = _dot(change, change) <= squared * state.region.step_size
+        is_still = ~is_better & is_undamped & (largest < LEAST_TRIED)
         kept = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), there, here)
         found = kept.normal.damped(1 / size, is_free).solution()
         following = jax.tree.map(jnp.subtract, kept.at, found)
-        is_done = ~is_first & ((is_better & is_last) | is_lost)
+        is_done = ~is_first & ((is_better & is_last) | is_lost | is_still)
         return _State(kept, following, region, state.steps + 1, is_done)
 
     def is_running(state: _State) -> Bool[Array, ""]:

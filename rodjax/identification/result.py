@@ -20,6 +20,9 @@ from rodjax.identification.statistics import Blocks, Combination, clustered, hel
 from rodjax.identification.unknowns import Unknown
 from rodjax.solving.status import Status
 
+# Deviations so many times as large as the standard deviations are not of the measuring.
+FAR = 30.0
+
 
 class NotIdentifiableError(ValueError):
     """The data do not determine a combination of the unknowns. `fit`: what came out nevertheless."""
@@ -28,9 +31,21 @@ class NotIdentifiableError(ValueError):
         words = "; ".join(combination.words for combination in fit.undetermined)
         super().__init__(
             f"unknowns cannot be told from these measurements: {words} leaves all of them as they are, or within their "
-            "scatter; measure what tells them apart, give a prior, or hold one of them"
+            f"scatter; measure what tells them apart, give a prior, or hold one of them{_ran_off(fit)}"
         )
         self.fit = fit
+
+
+def _ran_off(fit: "Fit") -> str:
+    """Where no values of the unknowns come near the measurements, as where a measured force has the wrong sign."""
+    if not fit.setup.has_sd or not fit.degrees_of_freedom or fit.sigma < FAR:
+        return ""
+    told = [f"{label} = {fit.estimate[label]:.3g} {fit.units[label]}".rstrip() for label in fit.labels]
+    where = f", at {', '.join(told)}," if told else ""
+    return (
+        f". The best that was found{where} deviates {fit.sigma:.3g} times as much as the standard deviations say: are "
+        "all signs and units right? Measured forces and moments are those that the support applies to the rod"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,6 +246,9 @@ class Fit:
         `candidates`: what would be measured; the measured numbers in them do not matter, their `sd` does.
         """
         return refits.next_experiment(self.setup, self.structure, self.problem, self.found, candidates, self.dispersion)
+
+    def __str__(self) -> str:
+        return self.report()
 
     def report(self) -> str:
         """The fit in words and tables."""

@@ -258,7 +258,7 @@ _LATER = {
 }
 
 
-def _drawn(equilibrium: Equilibrium) -> str:
+def _drawn(equilibrium: Equilibrium | HarnessEquilibrium) -> str:
     """A picture for a notebook, by what takes a second to import."""
     return importlib.import_module("rodjax.plot").picture_html(equilibrium)
 

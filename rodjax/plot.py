@@ -31,7 +31,7 @@ from rodjax.drawing import (
     surroundings,
     thickness,
 )
-from rodjax.solving.harness_result import HarnessEquilibrium
+from rodjax.solving.harness_result import HarnessEquilibrium, results_of
 from rodjax.solving.result import Equilibrium
 
 STAGES = ["circle segment", "upside-down Omega, no twist"]
@@ -76,14 +76,19 @@ def plot_rod(
     return axes
 
 
-def picture_html(equilibrium: Equilibrium) -> str:
+def picture_html(equilibrium: Equilibrium | HarnessEquilibrium) -> str:
     """A picture of one equilibrium with its loads, as HTML; nothing where it has no numbers."""
-    if not np.all(np.isfinite(np.asarray(equilibrium.nodes))):
+    rods = results_of(equilibrium).values()
+    if not all(np.all(np.isfinite(np.asarray(rod.nodes))) for rod in rods):
         return ""
+    if isinstance(equilibrium, HarnessEquilibrium):
+        name, axes = "harness", plot_harness(equilibrium, loads=True)
+    else:
+        name, axes = "rod", plot_rod(equilibrium, loads=True)
     content = io.BytesIO()
-    figure_of(plot_rod(equilibrium, loads=True)).savefig(content, format="png", dpi=80)
+    figure_of(axes).savefig(content, format="png", dpi=80)
     encoded = base64.b64encode(content.getvalue()).decode()
-    return f'<img alt="the rod, coloured by curvature" src="data:image/png;base64,{encoded}">'
+    return f'<img alt="the {name}, coloured by curvature" src="data:image/png;base64,{encoded}">'
 
 
 def plot_harness(

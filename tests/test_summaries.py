@@ -48,6 +48,55 @@ def test_results_are_printed_with_their_units():
     assert "in magnitude" in many
 
 
+def pulled_harness(part: float) -> rj.Harness:
+    """Two cables that hang from clamps and meet in a body with a mass."""
+    rod, weight = rj.Rod(1.0, 5e-3, 3e-3, 800.0, 0.1, radius=5e-3), (0, 0, -9.81)
+    first = rj.Scene(rod, CLAMP, rj.Joint("y"), weight)
+    second = rj.Scene(rod, rj.Joint("y"), rj.Clamp((1.6 * part, 0, 0), rj.frame((1, 0, 0))), weight)
+    return rj.Harness({"trunk": first, "branch": second}, {"y": rj.Body(mass=0.1)}, contact=False)
+
+
+def test_harnesses_are_printed_with_their_units():
+    harness = pulled_harness(1.0)
+    lines = str(harness).split("\n  ")
+    assert lines[:2] == ["Harness: 2 cables, 1 joint", f"trunk: {harness['trunk'].rod}"]
+    assert lines[2:4] == [
+        "  start: Clamp: position (0, 0, 0) m, tangent (1, 0, 0)",
+        "  end: Joint: name y, third axis (0, 0, 1), offset (0, 0, 0) m",
+    ]
+    assert lines[-1] == "joint y: Body: mass 0.1 kg"
+    found = rj.solve(harness, segments=8)
+    told = str(found)
+    assert told.startswith("Equilibrium of 2 cables, 1 joint\n  status: converged: ")
+    assert f"joint y: position ({float(found.joints['y'].position[0]):.4g}, " in told
+    x, y, z = (f"{float(force) + 0.0:.4g}" for force in found["branch"].end_force)
+    assert told.split("\n")[-1].startswith("  branch: 8 segments, curvature ")
+    assert told.endswith(f"end force ({x}, {y}, {z}) N")
+    html = found._repr_html_()
+    assert html.count("<tr>") == told.count("\n")
+    assert html.endswith('">')
+    assert html.count("<img") == 1
+    many = str(jax.tree.map(lambda leaf: np.stack([leaf, np.asarray(leaf) + (leaf.dtype.kind == "f")]), found))
+    assert many.startswith("Equilibrium of 2 harnesses, 2 cables, 1 joint\n")
+    assert f"joint y: position ({float(found.positions[0, 0]):.4g} to {float(found.positions[0, 0]) + 1:.4g}, " in many
+    mode = rj.lowest_mode(found)
+    assert str(mode).startswith(f"Mode of a harness: stiffness {float(mode.stiffness):.4g} N, largest motion of ")
+
+
+def test_branches_and_modes_are_printed_in_words():
+    """A strut buckles at pi^2/4 of EI/L^2."""
+    strut = rj.Rod(1.0, 1.0, 0.8, 1e6)
+    pressed = [rj.Scene(strut, CLAMP, rj.Free(force=(-force, 0, 0))) for force in (0.0, 4.0)]
+    branch = rj.follow(pressed, segments=8, max_points=12)
+    first, *others = str(branch).split("\n  ")
+    assert first.startswith("Branch of 12 points, parameter 0 to ")
+    assert first.endswith(", index 0 to 2: it has as many points as were allowed")
+    (point,) = branch.critical_points
+    assert others == [str(point)]
+    assert str(point).startswith("Another branch crosses at parameter 0.6169, index 0 before and 2 after; Mode: ")
+    assert str(point).endswith(") at node 8 of 8")
+
+
 def test_dir_and_pydoc_are_complete():
     assert set(rj.__all__) <= set(dir(rj))
     assert not [name for name in dir(rj) if name.startswith("_") and name != "__version__"]

@@ -33,6 +33,7 @@ from rodjax.identification.setup import (
 )
 from rodjax.identification.statistics import LARGEST_DEVIATION, inverse, rates
 from rodjax.identification.unknowns import Unknown
+from rodjax.model.summaries import counted, range_text
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.programs.tasks import checked_executor, checked_threads, in_order, rows_of
@@ -67,6 +68,18 @@ class Fits:
     equilibria: Any
     error_estimate: float
     is_log: Bool[np.ndarray, "p"]
+
+    def __str__(self) -> str:
+        """How many converged, and of each unknown the range of its estimates and of their standard errors."""
+        count, converged = len(self.converged), int(np.sum(self.converged))
+        lines = [f"{counted(count, 'fit')}, {converged} converged in {range_text(self.steps)} steps"]
+        for j, label in enumerate(self.labels):
+            unit, found = self.units[label], np.isfinite(self.estimates[:, j]) & self.converged
+            if np.any(found):
+                error = self.standard_errors[found, j]
+                known = f"standard error {range_text(error, unit)}" if np.all(np.isfinite(error)) else "not always free"
+                lines.append(f"{label}: {range_text(self.estimates[found, j], unit)}, {known}")
+        return "\n  ".join(lines)
 
     def intervals(self, level: float = 0.95) -> tuple[Float[np.ndarray, "e p"], Float[np.ndarray, "e p"]]:
         """The ends of the confidence intervals, by Student's distribution; symmetric on the scale of each unknown."""

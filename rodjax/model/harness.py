@@ -22,6 +22,7 @@ from rodjax.model.scene import (
     slides,
     support_between,
 )
+from rodjax.model.summaries import harness_text
 from rodjax.model.supports import Clamp, Free, Hinge, Joint, Movable, Pin, Slider, Spring, Support, rotate
 
 # Names of the bodies at the ends of a scene that are a Hinge, Slider or Spring.
@@ -117,6 +118,9 @@ class Harness(eqx.Module):
         for name, body in zip(self.joint_names, self.bodies, strict=True):
             if body.mass is not None:
                 _gravity(self, name)
+
+    def __str__(self) -> str:
+        return harness_text(self)
 
     def __getitem__(self, name: str) -> Scene:
         return self.scenes[self.names.index(name)]

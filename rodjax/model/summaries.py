@@ -9,6 +9,7 @@ from rodjax.checks import is_known, line
 from rodjax.model.along import Along
 
 if TYPE_CHECKING:
+    from rodjax.model.harness import Harness
     from rodjax.model.rod import Rod
     from rodjax.model.scene import Scene
 
@@ -35,6 +36,8 @@ UNITS = {
     "end": "m",
     "center": "m",
     "size": "m",
+    "offset": "m",
+    "mass": "kg",
 }
 # Values of an array that are shown; of more its shape.
 MOST_VALUES = 4
@@ -60,6 +63,18 @@ def value_text(value: Any, unit: str = "") -> str:
     return f"({', '.join(f'{x + 0.0:.4g}' for x in array.tolist())}){tail}"
 
 
+def range_text(values: Any, unit: str = "") -> str:
+    """The least and the largest of numbers with their unit, or the only one."""
+    values = np.asarray(values)
+    low, high = float(np.min(values)), float(np.max(values))
+    tail = f" {unit}" if unit else ""
+    return f"{low + 0.0:.4g}{tail}" if low == high else f"{low + 0.0:.4g} to {high + 0.0:.4g}{tail}"
+
+
+def counted(count: int, name: str) -> str:
+    return f"{count} {name}{'' if count == 1 else 's'}"
+
+
 def part_text(part: Any, skipped: tuple[str, ...] = ()) -> str:
     """A support, a clip, a load or an obstacle in one line: its class, and the fields that are given."""
     if not isinstance(part, eqx.Module):
@@ -74,6 +89,8 @@ def part_text(part: Any, skipped: tuple[str, ...] = ()) -> str:
             told.append(f"{axis} {value_text(value[:, 2]) if getattr(value, 'ndim', 0) == 2 else 'stacked'}")
         elif value is True:
             told.append(name)
+        elif isinstance(value, str):
+            told.append(f"{name} {value}")
         elif isinstance(value, eqx.Module) and not isinstance(value, Along):
             told.append(part_text(value))
         elif isinstance(value, tuple) and any(isinstance(entry, eqx.Module) for entry in value):
@@ -86,6 +103,20 @@ def part_text(part: Any, skipped: tuple[str, ...] = ()) -> str:
 def rod_text(rod: "Rod") -> str:
     """One line."""
     return part_text(rod, () if rod.rest_centerline is not None else ("rest_centerline",))
+
+
+def harness_text(harness: "Harness") -> str:
+    """A line for each cable, below it lines for what holds and loads it, then a line for each joint."""
+    cables, joints = counted(len(harness.names), "cable"), counted(len(harness.joint_names), "joint")
+    lines = [f"Harness: {cables}, {joints}"]
+    for name, scene in zip(harness.names, harness.scenes, strict=True):
+        rod, *others = scene_text(scene).split("\n  ")[1:]
+        lines += [f"{name}: {rod}", *(f"  {other}" for other in others)]
+    lines += [
+        f"joint {name}: {part_text(body)}" for name, body in zip(harness.joint_names, harness.bodies, strict=True)
+    ]
+    lines += [f"{first} and {second} may touch" for first, second in harness.contact_names]
+    return "\n  ".join(lines)
 
 
 def scene_text(scene: "Scene") -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from rodjax.checks import instance, is_known, number_array, positive, whole_number
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
+from rodjax.model.summaries import counted, range_text, value_text
 from rodjax.paths.branch import BranchTangent, count_of, mode_at
 from rodjax.paths.corners import changes_contacts
 from rodjax.paths.critical import Changing, differentiable_parameter
@@ -42,6 +43,11 @@ FOLD = 1e-5
 SWITCH = 0.1
 
 Kind = Literal["fold", "branch", "contact"]
+KINDS: dict[Kind, str] = {
+    "fold": "The branch turns back",
+    "branch": "Another branch crosses",
+    "contact": "A contact opens or closes",
+}
 
 
 class CriticalPoint(eqx.Module):
@@ -64,6 +70,10 @@ class CriticalPoint(eqx.Module):
     index_before: int = eqx.field(static=True)
     index_after: int = eqx.field(static=True)
 
+    def __str__(self) -> str:
+        where = f"{KINDS[self.kind]} at parameter {value_text(self.parameter)}"
+        return f"{where}, index {self.index_before} before and {self.index_after} after; {self.mode}"
+
 
 class Branch(eqx.Module):
     """A sequence of k equilibria on one branch.
@@ -80,6 +90,12 @@ class Branch(eqx.Module):
     index: Int[Array, "k"]
     critical_points: tuple[CriticalPoint, ...]
     ended: BranchEnd = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        """What was followed and why no further, and a line for each critical point."""
+        told = f"parameter {range_text(self.parameter)}, index {range_text(self.index)}"
+        lines = [f"Branch of {counted(len(self.parameter), 'point')}, {told}: {self.ended.value}"]
+        return "\n  ".join(lines + [str(point) for point in self.critical_points])
 
 
 @one_answer

@@ -5,8 +5,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rodjax.checks import is_known
 from rodjax.discretization.contact_gaps import model_compliance
 from rodjax.discretization.form import Form, Linearization
 from rodjax.discretization.nodal import NodalForm
@@ -14,6 +16,7 @@ from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.harness import Bodies
 from rodjax.model.scene import nondimensional
+from rodjax.model.summaries import range_text
 from rodjax.paths.assembled import (
     AssembledSystem,
     GroupSystem,
@@ -28,6 +31,7 @@ from rodjax.solving.coupling import Coupling, RodInBodies, end_contacts
 from rodjax.solving.harness_forces import ends_of, split_pressures
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result_form import form_and_point
+from rodjax.solving.result_summary import motion_text
 from rodjax.solving.stability import INVERSE_ITERATIONS, below_lowest
 
 
@@ -43,6 +47,14 @@ class HarnessMode(eqx.Module):
 
     stiffness: Float[Array, ""]
     displacements: dict[str, Float[Array, "n+1 3"]]
+
+    def __str__(self) -> str:
+        """The stiffness, and where the motion is largest."""
+        if not is_known(self):
+            return "Mode of a harness: values not known inside jax.jit, vmap or grad"
+        name = max(self.displacements, key=lambda name: float(np.max(np.abs(np.asarray(self.displacements[name])))))
+        where = motion_text(self.displacements[name])
+        return f"Mode of a harness: stiffness {range_text(self.stiffness, 'N')}, largest motion of {name} {where}"
 
 
 class _Group(NamedTuple):

@@ -18,12 +18,14 @@ from rodjax.discretization.sliding import SlidingForm, SlidingPoint
 from rodjax.linalg.saddle_point import factor
 from rodjax.model.along import Along
 from rodjax.model.scene import nondimensional, slides
+from rodjax.model.summaries import range_text
 from rodjax.paths.harness_modes import HarnessMode, harness_mode
 from rodjax.programs.answers import one_answer
 from rodjax.programs.compilation import compiled
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import Equilibrium, slopes
 from rodjax.solving.result_form import free_form_and_point, over_leading_axes
+from rodjax.solving.result_summary import motion_text
 from rodjax.solving.stability import softest
 from rodjax.solving.status import Status
 
@@ -40,6 +42,13 @@ class Mode(eqx.Module):
 
     stiffness: Float[Array, "..."]
     displacement: Float[Array, "... n+1 3"]
+
+    def __str__(self) -> str:
+        """The stiffness, and of a single motion where along the rod it is largest, and which way."""
+        if not is_known(self):
+            return "Mode: values not known inside jax.jit, vmap or grad"
+        told = f"Mode: stiffness {range_text(self.stiffness, 'N')}"
+        return told if np.ndim(self.stiffness) else f"{told}, largest motion {motion_text(self.displacement)}"
 
 
 @one_answer

@@ -12,7 +12,8 @@ from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.solving.description import Described, describe
-from rodjax.solving.result import Equilibrium
+from rodjax.solving.result import Equilibrium, pictures
+from rodjax.solving.result_summary import harness_told, title_of_harness, told_html, told_text
 from rodjax.solving.rod_contact_results import RodContacts, rod_contacts
 from rodjax.solving.status import Status
 
@@ -69,6 +70,16 @@ class HarnessEquilibrium(Described):
     wide_wells: Bool[Array, "... c"]
     harness: Harness
     members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        """How the solve ended, where the joints are, and of each cable a line of values with their units."""
+        return told_text(title_of_harness(self), harness_told(self))
+
+    def _repr_html_(self) -> str:
+        """The same as a table, and of a single one a picture, which notebooks show."""
+        has_picture = self.energy.ndim == 0 and is_known(self)
+        drawn = [drawn(self) for drawn in pictures] if has_picture else ()
+        return told_html(title_of_harness(self), harness_told(self), drawn)
 
     @property
     def names(self) -> tuple[str, ...]:

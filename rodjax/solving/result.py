@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +26,7 @@ from rodjax.programs.compilation import compiled
 from rodjax.solving import applied_forces
 from rodjax.solving.result_errors import estimated_errors, moment_error_of
 from rodjax.solving.result_form import form_and_point, free_form_and_point, over_leading_axes
-from rodjax.solving.result_summary import stack_told, values_told
+from rodjax.solving.result_summary import title_of, told_html, told_text, values_told
 from rodjax.solving.solver_state import Found, SolverState
 from rodjax.solving.stability import examined
 from rodjax.solving.status import Status, is_converged, with_strain
@@ -35,8 +34,8 @@ from rodjax.solving.status import Status, is_converged, with_strain
 # Beyond this |axial strain| a cable or hose is damaged, and stiffnesses that are constant are no longer those it has.
 DEFAULT_STRAIN_LIMIT = 0.05
 
-# What makes pictures for notebooks, as HTML, of those that are there; drawing is none of this module's imports.
-pictures: "list[Callable[[Equilibrium], str]]" = []
+# What makes pictures for notebooks, as HTML, of a rod or harness; drawing is none of this module's imports.
+pictures: list[Callable[[Any], str]] = []
 
 
 class Equilibrium(eqx.Module):
@@ -131,18 +130,12 @@ class Equilibrium(eqx.Module):
 
     def __str__(self) -> str:
         """How the solve ended, and the largest and last values along the rod with their units."""
-        return "\n".join(
-            [f"Equilibrium of {stack_told(self)}", *(f"  {name}: {told}" for name, told in values_told(self))]
-        )
+        return told_text(title_of(self), values_told(self))
 
     def _repr_html_(self) -> str:
         """The same as a table, and of a single one a picture, which notebooks show."""
-        rows = "".join(
-            f"<tr><td style='text-align:left'>{escape(name)}</td><td style='text-align:left'>{escape(told)}</td></tr>"
-            for name, told in values_told(self)
-        )
-        table = f"<table><caption>Equilibrium of {escape(stack_told(self))}</caption>{rows}</table>"
-        return table if self.s.ndim > 1 or not is_known(self) else table + "".join(drawn(self) for drawn in pictures)
+        has_picture = self.s.ndim == 1 and is_known(self)
+        return told_html(title_of(self), values_told(self), [drawn(self) for drawn in pictures] if has_picture else ())
 
     @property
     def clip_forces(self) -> Float[Array, "... clips 3"]:

@@ -65,6 +65,8 @@ def test_harnesses_are_printed_with_their_units():
         "  end: Joint: name y, third axis (0, 0, 1), offset (0, 0, 0) m",
     ]
     assert lines[-1] == "joint y: Body: mass 0.1 kg"
+    hung = dict.fromkeys("abc", rj.Scene(harness["trunk"].rod, CLAMP, rj.Free(), (0, 0, -9.81)))
+    assert str(rj.Harness(hung, contact=True)).endswith("\n  may touch: a and b; a and c; b and c")
     found = rj.solve(harness, segments=8)
     told = str(found)
     assert told.startswith("Equilibrium of 2 cables, 1 joint\n  status: converged: ")

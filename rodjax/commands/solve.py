@@ -13,7 +13,7 @@ import numpy as np
 import rodjax
 from rodjax.commands.errors import CommandError
 from rodjax.commands.outputs import check_output, save_figure
-from rodjax.commands.solve_text import counted, harness_table, header, path_table, rod_table
+from rodjax.commands.solve_text import harness_table, header, path_table, rod_table
 from rodjax.io.cad import SUFFIX as CAD_SUFFIX
 from rodjax.io.cad import write_dxf
 from rodjax.io.files import SUFFIX, save
@@ -22,6 +22,7 @@ from rodjax.io.scene_file import read_scene_file
 from rodjax.io.tables import SUFFIX as TABLE_SUFFIX
 from rodjax.io.tables import write_table
 from rodjax.model.scene import Scene, has_no_place
+from rodjax.model.summaries import counted
 from rodjax.notes import note
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.result_warnings import MeshWarning, NotConvergedWarning, OverstretchedWarning

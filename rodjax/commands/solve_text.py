@@ -82,10 +82,6 @@ def path_table(path: Equilibrium) -> list[str]:
     return rows
 
 
-def counted(count: int, name: str) -> str:
-    return f"{count} {name}" if count == 1 else f"{count} {name}s"
-
-
 def harness_table(result: rodjax.HarnessEquilibrium) -> list[str]:
     """One row for each cable and each joint."""
     wide = max(map(len, (*result, *result.joints, "cable")))

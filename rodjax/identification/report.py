@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rodjax.identification.setup import name_of
+from rodjax.model.summaries import counted
 from rodjax.model.supports import Clamp
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.result import DEFAULT_STRAIN_LIMIT
@@ -41,13 +42,9 @@ def _headline(fit: "Fit") -> str:
     outcome = f"converged in {fit.steps} steps" if fit.converged else f"NOT converged in {fit.steps} steps"
     unknowns = len(fit.setup.shared) + len(fit.setup.own)
     return (
-        f"{_counted(count, 'experiment')} in {_counted(fit.clusters, 'cluster')}, {fit.numbers} numbers measured, "
-        f"{_counted(unknowns, 'unknown')}: {outcome}"
+        f"{counted(count, 'experiment')} in {counted(fit.clusters, 'cluster')}, {fit.numbers} numbers measured, "
+        f"{counted(unknowns, 'unknown')}: {outcome}"
     )
-
-
-def _counted(count: int, name: str) -> str:
-    return f"{count} {name}{'' if count == 1 else 's'}"
 
 
 def _shared_table(fit: "Fit") -> str:

@@ -115,7 +115,8 @@ def harness_text(harness: "Harness") -> str:
     lines += [
         f"joint {name}: {part_text(body)}" for name, body in zip(harness.joint_names, harness.bodies, strict=True)
     ]
-    lines += [f"{first} and {second} may touch" for first, second in harness.contact_names]
+    pairs = [f"{first} and {second}" for first, second in harness.contact_names]
+    lines += [f"may touch: {'; '.join(pairs)}"] if pairs else []
     return "\n  ".join(lines)
 
 

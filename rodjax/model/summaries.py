@@ -65,9 +65,11 @@ def value_text(value: Any, unit: str = "") -> str:
 
 def range_text(values: Any, unit: str = "") -> str:
     """The least and the largest of numbers with their unit, or the only one."""
+    tail = f" {unit}" if unit else ""
+    if not is_known(values):
+        return f"traced{tail}"
     values = np.asarray(values)
     low, high = float(np.min(values)), float(np.max(values))
-    tail = f" {unit}" if unit else ""
     return f"{low + 0.0:.4g}{tail}" if low == high else f"{low + 0.0:.4g} to {high + 0.0:.4g}{tail}"
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
+from rodjax.model.summaries import range_text
 from rodjax.solving.description import Described, describe
 from rodjax.solving.result import Equilibrium, pictures
 from rodjax.solving.result_summary import harness_told, title_of_harness, told_html, told_text
@@ -163,7 +164,7 @@ class HarnessEquilibrium(Described):
             touching = np.linalg.norm(found.forces, axis=-1) > 0
             if np.any(touching):
                 s, other_s = found.s[touching], found.other_s[touching]
-                where = f"{_range(first, s)} and {_range(second, other_s)}"
+                where = f"{first} at s = {range_text(s, 'm')} and {second} at s = {range_text(other_s, 'm')}"
                 force = np.linalg.norm(found.forces.sum(0))
                 told.append(f"{first} and {second} touch, {where}, and push one another with {force:.4g} N")
         return told if told else ["no rods touch one another"]
@@ -182,11 +183,6 @@ def results_of(result: Solution, prefix: str = "{}: ") -> dict[str, Equilibrium]
     if isinstance(result, HarnessEquilibrium):
         return {prefix.format(name): rod for name, rod in result.items()}
     return {"": result}
-
-
-def _range(name: str, s: np.ndarray) -> str:
-    where = f"{s[0]:.4g} m" if len(s) == 1 else f"{s.min():.4g} to {s.max():.4g} m"
-    return f"{name} at s = {where}"
 
 
 def _taken(stacked: Equilibrium, place: int, axis: int) -> Equilibrium:

@@ -4,7 +4,8 @@
 
 Prints how many converge, iterations, and which of the rest are too short for their side; of the pegs also milliseconds
 of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
-scenes as the cables become heavier, beside paths. Cables under loads without a potential, beside a floor and a wall.
+scenes as the cables become heavier, beside paths. Cables through a clip, pressed aside by a cylinder. Cables under
+loads without a potential, beside a floor and a wall.
 Of friction the pull of a taut cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a
 floor, and back, beside its closed form; of ropes over a cylinder, which nothing else holds, how many are found at rest.
 """
@@ -128,6 +129,46 @@ def cold(count: int, seed: int = 0, segments: int = 48, has_guess: bool = True, 
         f"{converged.sum()} of {count} converged, iterations median {np.median(of_those):g}, 90 % "
         f"{np.percentile(of_those, 90):g}; {short.sum()} too short; others: {others}"
     )
+
+
+def pressed_scene(rng: np.random.Generator, clip: dict[str, bool], segments: int) -> rj.Scene | None:
+    """A cable through a clip, pressed aside by the end of a cylinder; `None` where a support would be within it."""
+
+    def turned(angle: float) -> tuple[float, float, float]:
+        """The direction of x, turned by up to this angle [rad] to any side."""
+        angle, side = rng.uniform(0, angle), rng.uniform(0, 2 * np.pi)
+        return np.cos(angle), np.sin(angle) * np.cos(side), np.sin(angle) * np.sin(side)
+
+    EI, span, at = rng.uniform(0.5, 2), rng.uniform(0.75, 0.92), rng.uniform(0.3, 0.6)
+    rod = rj.Rod(1.0, EI, rng.uniform(0.4, 1) * EI, 1e4, rng.uniform(0.2, 1.5), radius=2 * RADIUS)
+    ends = rj.Clamp((0, 0, 0), rj.frame(turned(0.6))), rj.Clamp((span, 0, 0), rj.frame(turned(0.6)))
+    place, along = (at * span + 0.03 * rng.normal(), *(0.08 * rng.normal(size=2))), turned(0.5)
+    holds = {"tangent": along} if "tangent" in clip else {"frame": rj.frame(along)} if "frame" in clip else {}
+    clips = [rj.Clip(at, place, **holds, sliding=clip.get("sliding", False))]
+    free = rj.solve(rj.Scene(rod, *ends, (0, 0, -9.81), clips=clips), segments=segments)
+    (point,) = np.asarray(free.position_at(rng.uniform(0.1, 0.9)))
+    depth, angle, radius = rng.uniform(0.005, 0.04), rng.uniform(0, 2 * np.pi), rng.uniform(0.01, 0.08)
+    aside = np.array([0, np.cos(angle), np.sin(angle)])
+    begin = point - aside * (radius + 2 * RADIUS - depth)
+    cylinder = rj.Cylinder(begin, begin + np.cross(aside, (1, 0, 0)), radius)
+    if np.min(cylinder.distance(jnp.asarray([(0, 0, 0), (span, 0, 0), place]))) < 2.6 * RADIUS:
+        return None
+    return rj.Scene(rod, *ends, (0, 0, -9.81), clips=clips, obstacles=[cylinder])
+
+
+def pressed(count: int, seed: int = 3, segments: int = 16) -> None:
+    for clip in ("tangent", "sliding", "sliding tangent", "sliding frame"):
+        rng, found = np.random.default_rng(seed), []
+        for _ in range(count):
+            scene = pressed_scene(rng, dict.fromkeys(clip.split(), True), segments)
+            if scene is not None:
+                result = rj.solve(scene, segments=segments)
+                found.append((bool(result.converged), int(result.iterations)))
+        converged, iterations = np.array(found).T
+        print(
+            f"pressed aside, clip: {clip}, seed {seed}, {segments} elements: {converged.sum()} of {len(found)} "
+            f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}"
+        )
 
 
 def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:
@@ -299,6 +340,7 @@ if __name__ == "__main__":
     cold(scenes, radius=3e-4)
     cold(scenes, EI=(1.0, 2.0))
     cold(scenes, EI=(1.0, 2.0), rest_curvature=(1.0, 0.0))
+    pressed(scenes)
     turned(scenes)
     turned(scenes, size=4.0)
     branches(scenes)

@@ -469,6 +469,45 @@ def test_no_step_along_a_cylinder_is_shortened(touching):
     assert int(there.iterations) <= 6  # 5 seen
 
 
+def test_clips_that_hold_tangents_slide_beside_cylinders():
+    """Which contacts are closed is sought together with the arclengths of clips. From contacts sought at given ones
+    these searches took steps of a thousandth, up to the limit of 100.
+    """
+    # EI, mass, tangent at the start; x and tangent of the end.
+    ends = [
+        (1.1, 0.8, (0.92, -0.33, 0.22), 0.86, (0.98, 0.18, 0.05)),
+        (1.5, 1.5, (0.96, 0.09, 0.26), 0.83, (0.92, 0.13, 0.37)),
+        (1.0, 0.5, (0.98, -0.1, -0.14), 0.86, (0.87, -0.21, 0.44)),
+    ]
+    clips = [
+        Clip(0.56, (0.48, -0.09, 0.12), tangent=(0.88, -0.21, 0.42), sliding=True),
+        Clip(0.46, (0.39, 0.14, -0.11), tangent=(0.97, -0.25, -0.04), sliding=True),
+        Clip(0.6, (0.5, -0.04, 0.0), tangent=(0.99, 0.09, 0.08), sliding=True),
+    ]
+    cylinders = [
+        rj.Cylinder((0.696, -0.114, 0.164), (0.0, -1.0, 0.1), 0.064),
+        rj.Cylinder((0.329, 0.209, -0.071), (0.0, -0.5, 0.87), 0.076),
+        rj.Cylinder((0.642, -0.039, 0.01), (0.0, -0.72, -0.7), 0.071),
+    ]
+    for (EI, mass, first, x, last), clip, cylinder in zip(ends, clips, cylinders, strict=True):
+        bent = Rod(1.0, EI, 0.7 * EI, 1e4, mass_per_length=mass, radius=0.01)
+        start, end = Clamp((0, 0, 0), frame(first)), Clamp((x, 0, 0), frame(last))
+        scene = Scene(bent, start, end, (0, 0, -9.81), clips=[clip], obstacles=[cylinder])
+        result = rj.solve(scene, segments=16)
+        assert result.converged
+        assert result.stable
+        assert float(jnp.sum(result.contact_forces**2)) > 1.0
+        # Seen: 7, 14, 13.
+        assert int(result.iterations) <= 20
+        # No contact lies in an element beside the clip of the first and the last one.
+        if EI < 1.5:
+            (force,) = result.clip_forces
+            assert clip.tangent is not None
+            along = force @ clip.tangent
+            # The tolerance, in units of EI/L^2, and as much again to spare.
+            assert abs(float(along)) < 2e-8 * EI
+
+
 def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):
     """A gap or a pressure is zero at each node that no support holds; the box is not touched. Of what pushes in the
     middle of an element both of its nodes have half.

@@ -236,16 +236,20 @@ class NodalForm(PositionForm):
     def sought(
         self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
-        assert isinstance(system, ChainSystem)
-        assert here.gaps is not None
-        nodal = point.nodal
         if not has_contacts(self.scene):
             return super().sought(here, point, system, push)
-        moments, c = self.without_contacts(here, nodal.contact_forces)
-        contacts = contact_model(self, point, here.gaps, here.reference_displacements)
-        system = first_closed(system, contacts)
-        found = minimized(system, push + moments, c, contacts)
+        found = minimized(*self.model_of_step(here, point, system, push))
         return found.is_minimum, found.x, found.y
+
+    def model_of_step(
+        self, here: Linearization, point: Any, system: AnySystem, push: Float[Array, "b m"]
+    ) -> tuple[ChainSystem, Float[Array, "b m"], Float[Array, "k"], Unilateral]:
+        """As `minimized` takes it."""
+        assert isinstance(system, ChainSystem)
+        assert here.gaps is not None
+        moments, c = self.without_contacts(here, point.nodal.contact_forces)
+        contacts = contact_model(self, point, here.gaps, here.reference_displacements)
+        return first_closed(system, contacts), push + moments, c, contacts
 
     def without_contacts(
         self, here: Linearization, forces: Float[Array, "r n+1"]

@@ -9,7 +9,10 @@ negative eigenvalues of the complement add to those at given arclengths.
 A step is judged by the energy, less what its slope by s is beyond -R . t at the point where the step begins: so what
 is found is free of axial forces to the last digit, on any mesh. Where a clip holds the tangent, this is
 all but the error of the mesh: the moment jumps there, and what slides would take its work (Bigoni et al. 2015,
-"Eshelby-like forces acting on elastic structures").
+"Eshelby-like forces acting on elastic structures"). R has the share that a contact within an element beside the clip
+has at its node: without it rods slid out of their clips on meshes too coarse for such contacts.
+
+Beside obstacles the contacts of a step are sought together with the arclengths (`linalg.unilateral_border`).
 """
 
 import dataclasses
@@ -27,7 +30,8 @@ from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding_point import SlidingChange, SlidingLinearization, SlidingPoint
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
-from rodjax.linalg.saddle_point import AnySystem, factor, factor_and_solve
+from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
+from rodjax.linalg.unilateral_border import minimized_with_border
 from rodjax.model.along import Along
 from rodjax.model.scene import Scene, has_contacts
 from rodjax.model.supports import Free, Support
@@ -40,8 +44,6 @@ NEAR_LOADS = 0.9
 PLACE_ROUNDINGS = 64
 # A rod that is not yet in equilibrium in its clips, up to this residual [EI/L^2], comes to it first.
 SETTLED = 0.1
-# A step along the rod [L] by which axial forces lead away from a largest energy.
-LEAST_SLIDE = 1e-7
 
 
 class SlidingForm(MovingMeshForm):
@@ -188,8 +190,8 @@ class SlidingForm(MovingMeshForm):
 
     # --- derivatives -------------------------------------------------------------------------------------------------
 
-    def _rows(self, inner: Any, arclengths: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
-        """The gradient and the constraint residual at an inner point, L, and -R . t."""
+    def _rows(self, inner: Any, arclengths: Float[Array, "j"]) -> tuple[Array, Array, Array, Array, Array | None]:
+        """The gradient and the constraint residual at an inner point, L, -R . t, and the gaps of contacts."""
         form = self.at(arclengths)
         gradient, constraint_residual = form.residual_vectors(inner)
         force = form.layout.components(inner.end_force)
@@ -198,10 +200,15 @@ class SlidingForm(MovingMeshForm):
             + form.load_energy(inner)
             + jnp.sum(force * form.force_components(constraint_residual))
         )
-        return gradient, constraint_residual, energy, -form.axial_forces(inner)
+        gaps = None
+        if has_contacts(self.scene):
+            assert isinstance(form, NodalForm)
+            gaps = form.gaps(inner)
+            energy -= jnp.sum(inner.nodal.pressures * gaps)
+        return gradient, constraint_residual, energy, -form.axial_forces(inner), gaps
 
     def residual_vectors(self, point: SlidingPoint) -> tuple[Float[Array, "b m"], Float[Array, "k"]]:
-        gradient, constraint_residual, _, axial = self._rows(point.inner, point.arclengths)
+        gradient, constraint_residual, _, axial, _ = self._rows(point.inner, point.arclengths)
         return gradient, jnp.concatenate([axial, constraint_residual])
 
     def linearized(self, point: SlidingPoint) -> SlidingLinearization:
@@ -211,10 +218,10 @@ class SlidingForm(MovingMeshForm):
         """From the linearisation of the form at fixed arclengths."""
         form, inner, arclengths = self.at(point.arclengths), point.inner, point.arclengths
 
-        def by_arclength(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array]:
+        def by_arclength(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array, Array | None]:
             return jax.jvp(lambda arclengths: self._rows(inner, arclengths), (arclengths,), (direction,))[1]
 
-        gradient, constraint_residual, energy, corner = jax.vmap(by_arclength)(
+        gradient, constraint_residual, energy, corner, gap_rates = jax.vmap(by_arclength)(
             jnp.eye(len(arclengths), dtype=arclengths.dtype)
         )
 
@@ -228,6 +235,10 @@ class SlidingForm(MovingMeshForm):
         system = BorderedSystem(here.system, Vectors(gradient, constraint_residual), Vectors(*rows), corner.T)
         rounding = PLACE_ROUNDINGS * jnp.finfo(pulls.dtype).eps * _axial_stiffness(self.made)
         largest = jnp.max(jnp.abs(pulls))
+        if gap_rates is not None:
+            # Slips along obstacles are of the nodes, whose positions are unknowns of their own.
+            slips = len(here.system.contacts.is_closed) - gap_rates.shape[1]
+            gap_rates = jnp.pad(gap_rates, ((0, 0), (0, slips), (0, 0)))
         return SlidingLinearization(
             here.bases,
             here.gradient,
@@ -240,6 +251,7 @@ class SlidingForm(MovingMeshForm):
             arclengths=arclengths,
             slides=point.slides | (here.residual <= SETTLED),
             excess=energy - pulls,
+            gap_rates=gap_rates,
         )
 
     def regular(self, system: AnySystem) -> AnySystem:
@@ -278,13 +290,13 @@ class SlidingForm(MovingMeshForm):
     ) -> tuple[Bool[Array, ""], Float[Array, "b m"], Float[Array, "k"]]:
         system, constraint_residual = self.sliding(here, system)
         j = len(point.arclengths)
-        if has_contacts(self.scene):
-            # Which contacts are closed is sought at given arclengths; those go along with the ones that were.
-            is_minimum, x, y = self.at(point.arclengths).sought(here.at_arclengths, point.inner, system.inner, push)
-            factors = factor(system)
-            assert isinstance(factors, BorderedFactors)
-            x, y = factors.joined(x, y, -constraint_residual[:j])
-            return is_minimum & _goes_down(factors, y), x, y
+        if here.gap_rates is not None:
+            form = self.at(point.arclengths)
+            assert isinstance(form, NodalForm)
+            of_step = form.model_of_step(here.at_arclengths, point.inner, system.inner, push)
+            rates = jnp.where(here.slides, here.gap_rates, 0.0)
+            found = minimized_with_border(system, -constraint_residual[:j], rates, *of_step)
+            return found.is_minimum, found.x, found.y
         factors, x, y = factor_and_solve(system, push - here.gradient, -constraint_residual, is_regularized=True)
         return self.has_minimum(factors, y), x, y
 
@@ -300,7 +312,7 @@ class SlidingForm(MovingMeshForm):
     def has_minimum(self, factors: Any, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
         """Whether a step leads to a minimum, from the factors of its system and its multipliers."""
         assert isinstance(factors, BorderedFactors)
-        return factors.inner.is_minimum & _goes_down(factors, multipliers)
+        return factors.inner.is_minimum & factors.goes_down(multipliers[: len(factors.complement)])
 
     def under_force(
         self,
@@ -315,6 +327,12 @@ class SlidingForm(MovingMeshForm):
         constraint_residual, constraint_rate, more, along = found
         by_arclength = jax.vmap(form.force_components)(columns.y)
         slope = here.constraint_residual[: len(point.arclengths)] + by_arclength @ form.layout.components(change)
+        if here.gap_rates is not None:
+            assert isinstance(form, NodalForm)
+            # With the new pressures in place of the old ones, which -R . t has.
+            rates = jnp.tensordot(others.arclengths, here.gap_rates, 1)
+            along += form.contact_rate(here.at_arclengths, point.inner, others.others, rates)
+            along += jnp.sum(point.inner.nodal.contact_forces * rates)
         return (
             constraint_residual,
             constraint_rate + others.arclengths @ by_arclength,
@@ -326,16 +344,6 @@ class SlidingForm(MovingMeshForm):
 def at_its_arclengths(form: Form, point: Any) -> tuple[Form, Any]:
     """Of a rod that slides, form and point at the arclengths where its clips are."""
     return (form.at(point.arclengths), point.inner) if isinstance(form, SlidingForm) else (form, point)
-
-
-def _goes_down(factors: BorderedFactors, multipliers: Float[Array, "k"]) -> Bool[Array, ""]:
-    """Whether a step leads to less energy by the arclengths: what pulls along the rod leads away from a largest one,
-    and no shift is needed.
-    """
-    if not factors.descends:
-        return factors.is_steady
-    j = len(factors.complement)
-    return factors.is_steady | (jnp.max(jnp.abs(multipliers[:j])) > LEAST_SLIDE)
 
 
 def _axial_stiffness(scene: Scene) -> Float[Array, ""]:

@@ -62,11 +62,14 @@ class SlidingChange(NamedTuple):
 
 
 class SlidingLinearization(Linearization):
-    """A linearisation with the arclengths, whether a step changes them, and dW/ds + R . t (`excess`)."""
+    """A linearisation with the arclengths, whether a step changes them, and dW/ds + R . t (`excess`); `gap_rates`: of
+    all rows of contacts, by the arclengths, `None` without contacts.
+    """
 
     arclengths: Float[Array, "j"] = eqx.field(kw_only=True)
     slides: Bool[Array, ""] = eqx.field(kw_only=True)
     excess: Float[Array, "j"] = eqx.field(kw_only=True)
+    gap_rates: Float[Array, "j r n+1"] | None = eqx.field(kw_only=True)
 
     @property
     def at_arclengths(self) -> Linearization:

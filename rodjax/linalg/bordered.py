@@ -15,6 +15,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+# Where solutions go down, an unknown of the border as large as this leads away from a largest value.
+LEAST_DESCENT = 1e-7
+
 
 class Vectors(NamedTuple):
     """j vectors of the unknowns (x, y), or of the right sides, of M."""
@@ -120,6 +123,12 @@ class BorderedFactors(eqx.Module):
     def is_steady(self) -> Bool[Array, ""]:
         """Whether S is positive."""
         return (self.below == 0) & jnp.all(jnp.isfinite(self.complement))
+
+    def goes_down(self, z: Float[Array, "j"]) -> Bool[Array, ""]:
+        """Whether a solution with these unknowns of the border leads to less: what they come from leads away from a
+        largest value, and no shift is needed.
+        """
+        return self.is_steady | (jnp.max(jnp.abs(z)) > LEAST_DESCENT) if self.descends else self.is_steady
 
     def solve(self, f: Float[Array, "b m"], c: Float[Array, "j+k"]) -> tuple[Float[Array, "b m"], Float[Array, "j+k"]]:
         j = len(self.complement)

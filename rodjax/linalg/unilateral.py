@@ -298,7 +298,7 @@ def sought(
     return jax.lax.while_loop(lambda state: ~state.is_done & (state.count < MOST_FACTORS), improved, begin)
 
 
-class _OfChain(eqx.Module):
+class OfChain(eqx.Module):
     """The model of `minimized`, whose motions are x and y."""
 
     system: ChainSystem  # with no contact closed
@@ -387,7 +387,7 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     """
     contact_compliance = system.contacts.contact_compliance
     open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
-    model = _OfChain(open_system, f, c, contacts)
+    model = OfChain(open_system, f, c, contacts)
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c)
     end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y = end.motion

@@ -254,12 +254,13 @@ def sliding_along(here: SlidingLinearization, coupled: Coupling) -> Coupling:
     by_ends = jnp.where(slides, coupled.by_multipliers[:j].T, 0.0)
     second = jnp.pad(coupled.second, ((0, j), (0, j)))
     second = second.at[:12, 12:].set(by_ends).at[12:, 12:].set(jnp.where(slides, system.corner, identity))
-    # Rows of closed contacts are their gaps, with a minus.
+    # Which contacts are closed is sought.
     first, size = len(chain.compliance), chain.contacts.is_closed.size
     contacts = slice(first, first + size)
     of_gaps = None
     if coupled.of_gaps is not None:
-        by_arclengths = -columns[1][contacts].reshape(*chain.contacts.is_closed.shape, j)
+        assert here.gap_rates is not None
+        by_arclengths = jnp.where(slides, jnp.moveaxis(here.gap_rates, 0, -1), 0.0)
         of_gaps = jnp.concatenate([coupled.of_gaps, by_arclengths], axis=2)
     of_constraints = jnp.concatenate([coupled.of_constraints[j:], columns[1].at[contacts].set(0.0)], axis=1)
     return Coupling(

@@ -1,0 +1,114 @@
+"""The minimum of the model of a rod (`unilateral`) with a few unknowns more, such as arclengths of sliding clips.
+
+The gaps change by these too. A solution is one factorisation of the rod, with the contacts closed that are so at the
+last iterate, and as many columns as there are more unknowns (`bordered`). Without symmetry of rows and columns the
+model along a line is that of the symmetric part.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rodjax.linalg.bordered import BorderedSystem, Vectors
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.chain_factors import factor_chain
+from rodjax.linalg.unilateral import (
+    ModelMinimum,
+    OfChain,
+    Unilateral,
+    closed_softly,
+    sought,
+    with_pressures,
+    with_slips,
+    work,
+)
+
+Motion = tuple[Array, Array, Array]
+
+
+class _OfBorder(eqx.Module):
+    """The model of `minimized_with_border`, whose motions are x, y and z; `chain`: for given z = 0."""
+
+    border: BorderedSystem
+    g: Float[Array, "j"]
+    gap_rates: Float[Array, "j r n+1"]
+    chain: OfChain
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.chain.is_symmetric
+
+    def _columns(self, is_closed: Bool[Array, "r n+1"]) -> Vectors:
+        """What z does to the other rows; the rows of closed contacts are their gaps, with a minus."""
+
+        def of_y(column: Float[Array, "k"], rates: Float[Array, "r n+1"]) -> Float[Array, "k"]:
+            first, _, nodes, elements = self.chain.system.split(column)
+            parts = first, jnp.where(is_closed, -rates, 0.0), nodes, elements
+            return jnp.concatenate([part.reshape(-1) for part in parts])
+
+        return Vectors(self.border.columns.x, jax.vmap(of_y)(self.border.columns.y, self.gap_rates))
+
+    def solved(
+        self,
+        is_closed: Bool[Array, "r n+1"],
+        trial: Float[Array, "r n+1"],
+        contact_compliance: Float[Array, ""],
+        memory: None,
+    ) -> tuple[Bool[Array, ""], Motion, None]:
+        contacts, columns = self.chain.contacts, self._columns(is_closed)
+        here = closed_softly(self.chain.system, is_closed, contact_compliance)
+        f, c = with_pressures(here, contacts, self.chain.f, self.chain.c)
+        here, c = with_slips(here, contacts, c, trial)
+        chain = factor_chain(here)
+        sides = (jnp.concatenate([part, last[None]]) for part, last in zip(columns, (f, c), strict=True))
+        x, y = jax.vmap(chain.solve_softly)(*sides)
+        factors = self.border.factored(chain, Vectors(x[:-1], y[:-1]))
+        x, y = factors.joined(x[-1], y[-1], self.g)
+        z, y = self.border.split(y)
+        return chain.is_minimum & factors.goes_down(z), (x, y, z), None
+
+    def opening(self, motion: Motion) -> Float[Array, "r n+1"]:
+        x, y, z = motion
+        return self.chain.opening((x, y)) + jnp.tensordot(z, self.gap_rates, 1)
+
+    def along(self, motion: Motion, change: Motion, memory: None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        ahead, here, system = self._times(change), self._times(motion), self.chain.system
+
+        def works(motion: Motion, by: Motion) -> Float[Array, ""]:
+            return work(system, motion[:2], by[:2]) + jnp.sum(motion[2] * by[2])
+
+        x, y, z = change
+        slope = (works(motion, ahead) + works(change, here)) / 2
+        slope -= jnp.sum(self.chain.f * x) + jnp.sum(system.split(self.chain.c)[2] * system.split(y)[2])
+        return slope - jnp.sum(self.g * z), works(change, ahead)
+
+    def _times(self, motion: Motion) -> Motion:
+        x, y, z = motion
+        moments, rows = self.chain.system.times(x, y)
+        of_x, of_y = self._columns(jnp.zeros(self.chain.contacts.gaps.shape, bool)).times(z)
+        return moments + of_x, rows + of_y, self.border.rows.dots(x, y) + self.border.corner @ z
+
+
+def minimized_with_border(
+    border: BorderedSystem,
+    g: Float[Array, "j"],
+    gap_rates: Float[Array, "j r n+1"],
+    system: ChainSystem,
+    f: Float[Array, "b m"],
+    c: Float[Array, "k"],
+    contacts: Unilateral,
+) -> ModelMinimum:
+    """As `minimized`, which has the last four; g: the right side of the unknowns more. In the result these are before
+    the other multipliers.
+    """
+    contact_compliance = system.contacts.contact_compliance
+    open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))
+    model = _OfBorder(border, g, gap_rates, OfChain(open_system, f, c, contacts))
+    nowhere = jnp.zeros_like(f), jnp.zeros_like(c), jnp.zeros_like(g)
+    end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
+    x, y, z = end.motion
+    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
+    first, _, u, force = open_system.split(y)
+    y = jnp.concatenate([z, *(part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force))])
+    return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)

@@ -35,6 +35,7 @@ from rodjax.linalg.unilateral_border import minimized_with_border
 from rodjax.model.along import Along
 from rodjax.model.scene import Scene, has_contacts
 from rodjax.model.supports import Free, Support
+from rodjax.programs.stacks import of_each
 
 # The most of the way to the next support that a step takes a clip along the rod; and to the next load, which it may
 # pass, as it then has a node of its own no more.
@@ -221,7 +222,7 @@ class SlidingForm(MovingMeshForm):
         def by_arclength(direction: Float[Array, "j"]) -> tuple[Array, Array, Array, Array, Array | None]:
             return jax.jvp(lambda arclengths: self._rows(inner, arclengths), (arclengths,), (direction,))[1]
 
-        gradient, constraint_residual, energy, corner, gap_rates = jax.vmap(by_arclength)(
+        gradient, constraint_residual, energy, corner, gap_rates = of_each(by_arclength)(
             jnp.eye(len(arclengths), dtype=arclengths.dtype)
         )
 
@@ -231,7 +232,7 @@ class SlidingForm(MovingMeshForm):
 
         nothing = jnp.zeros_like(here.gradient), jnp.zeros_like(here.constraint_residual)
         pulls, pulled = jax.vjp(axial, *nothing)
-        rows = jax.vmap(pulled)(jnp.eye(len(arclengths), dtype=arclengths.dtype))
+        rows = of_each(pulled)(jnp.eye(len(arclengths), dtype=arclengths.dtype))
         system = BorderedSystem(here.system, Vectors(gradient, constraint_residual), Vectors(*rows), corner.T)
         rounding = PLACE_ROUNDINGS * jnp.finfo(pulls.dtype).eps * _axial_stiffness(self.made)
         largest = jnp.max(jnp.abs(pulls))
@@ -325,7 +326,7 @@ class SlidingForm(MovingMeshForm):
         form, columns = self.at(point.arclengths), here.system.columns
         found = form.under_force(point.inner, here.at_arclengths, rotation, change, others.others)
         constraint_residual, constraint_rate, more, along = found
-        by_arclength = jax.vmap(form.force_components)(columns.y)
+        by_arclength = of_each(form.force_components)(columns.y)
         slope = here.constraint_residual[: len(point.arclengths)] + by_arclength @ form.layout.components(change)
         if here.gap_rates is not None:
             assert isinstance(form, NodalForm)

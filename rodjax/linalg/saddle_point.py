@@ -25,6 +25,7 @@ from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.chain_factors import ChainFactors, factor_chain
 from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.programs.parts import traced_once
+from rodjax.programs.stacks import of_each
 
 # Of the mean diagonal, the least eigenvalue of a block that others wait for: what they lose is about 1e-16 over the
 # square of this, and what they differ by is about 10 times this.
@@ -157,7 +158,7 @@ def _factor_and_solve_all(
     """The same for r right sides."""
     if isinstance(system, ChainSystem):
         chain = factor_chain(system)
-        return chain, Vectors(*jax.vmap(chain.solve)(f, c))
+        return chain, Vectors(*of_each(chain.solve)(f, c))
     k = system.border.shape[1]
     factors, x = _factor(system, jnp.concatenate([system.border, jnp.swapaxes(f, 0, 1)], axis=1), is_regularized)
     return factors, Vectors(*jax.vmap(factors._bordered, in_axes=(1, 0))(x[:, k:], c))

@@ -391,7 +391,15 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c)
     end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y = end.motion
-    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
-    first, _, u, force = open_system.split(y)
-    y = jnp.concatenate([part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force)])
+    y = with_exerted(system, contacts, model.opening(end.motion), y)
     return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)
+
+
+def with_exerted(
+    system: ChainSystem, contacts: Unilateral, opening: Float[Array, "r n+1"], y: Float[Array, "j"]
+) -> Float[Array, "j"]:
+    """Multipliers with the changes of what contacts exert after this opening."""
+    trial = contacts.pressures - (contacts.gaps + opening) / system.contacts.contact_compliance
+    first, _, u, force = system.split(y)
+    parts = first, contacts.allowed(trial) - contacts.pressures, u, force
+    return jnp.concatenate([part.reshape(-1) for part in parts])

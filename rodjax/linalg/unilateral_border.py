@@ -19,10 +19,12 @@ from rodjax.linalg.unilateral import (
     Unilateral,
     closed_softly,
     sought,
+    with_exerted,
     with_pressures,
     with_slips,
     work,
 )
+from rodjax.programs.stacks import of_each
 
 Motion = tuple[Array, Array, Array]
 
@@ -47,7 +49,7 @@ class _OfBorder(eqx.Module):
             parts = first, jnp.where(is_closed, -rates, 0.0), nodes, elements
             return jnp.concatenate([part.reshape(-1) for part in parts])
 
-        return Vectors(self.border.columns.x, jax.vmap(of_y)(self.border.columns.y, self.gap_rates))
+        return Vectors(self.border.columns.x, of_each(of_y)(self.border.columns.y, self.gap_rates))
 
     def solved(
         self,
@@ -108,7 +110,5 @@ def minimized_with_border(
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c), jnp.zeros_like(g)
     end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y, z = end.motion
-    exerted = contacts.allowed(contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance)
-    first, _, u, force = open_system.split(y)
-    y = jnp.concatenate([z, *(part.reshape(-1) for part in (first, exerted - contacts.pressures, u, force))])
+    y = jnp.concatenate([z, with_exerted(system, contacts, model.opening(end.motion), y)])
     return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)

@@ -20,6 +20,7 @@ from rodjax.discretization.motion import Metric, Motion
 from rodjax.geometry.vectors import components
 from rodjax.linalg.saddle_point import AnySystem
 from rodjax.model.supports import Clamp
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, Rods
 from rodjax.solving.condensation import LEAST_STIFFNESS
 from rodjax.solving.coupling import ENDS, Coupling, RodInBodies, coupling, held
@@ -88,7 +89,7 @@ class GroupSystem(eqx.Module):
         return self._with_shifts(NEUTRAL * jnp.minimum(self.lengths / self.energies, 1.0))
 
     def _with_shifts(self, shifts: Float[Array, "k"]) -> "GroupSystem":
-        system = jax.vmap(lambda system, shift: system.shifted(shift))(self.system, shifts[:, None] * self.mass)
+        system = of_each(lambda system, shift: system.shifted(shift))(self.system, shifts[:, None] * self.mass)
         second = self.couplings.second + shifts[:, None, None] * self.of_ends
         return dataclasses.replace(self, system=system, couplings=self.couplings._replace(second=second))
 
@@ -122,8 +123,8 @@ class AssembledFactors(NamedTuple):
     def solve(self, residual: HarnessMotion) -> HarnessMotion:
         loads, first = residual.bodies, []
         for group, factors, right in zip(self.groups, self.factors, residual.rods, strict=True):
-            right = jax.tree.map(lambda x, group=group: jax.vmap(jnp.divide)(x, group.energies), right)
-            here = Motion(*jax.vmap(_solved)(factors, right.rotation, right.multipliers))
+            right = jax.tree.map(lambda x, group=group: of_each(jnp.divide)(x, group.energies), right)
+            here = Motion(*of_each(_solved)(factors, right.rotation, right.multipliers))
             first.append(here)
             of_ends = jnp.einsum("kbmi,kbm->ki", group.couplings.of_gradient, here.rotation)
             of_ends += jnp.einsum("kci,kc->ki", group.couplings.of_constraints, here.multipliers)
@@ -187,7 +188,7 @@ class AssembledSystem(eqx.Module):
         bodies, rods = self.springs @ motion.bodies, []
         for group, x in zip(self.groups, motion.rods, strict=True):
             couple, of_ends = group.couplings, group.along @ motion.bodies
-            rotation, multipliers = jax.vmap(lambda system, x, y: system.times(x, y))(
+            rotation, multipliers = of_each(lambda system, x, y: system.times(x, y))(
                 group.system, x.rotation, x.multipliers
             )
             rotation += jnp.einsum("kbmi,ki->kbm", couple.of_gradient, of_ends)
@@ -223,7 +224,7 @@ class AssembledSystem(eqx.Module):
                 left -= jnp.einsum("bmi,bmj->ij", couple.of_gradient, rotations)
                 return factors, Motion(rotations, multipliers), left
 
-            factors, by_motions, left = jax.vmap(of_rod)(group.system, group.couplings)
+            factors, by_motions, left = of_each(of_rod)(group.system, group.couplings)
             stiffness += jnp.einsum("k,kip,kij,kjq->pq", group.energies, group.along, left, group.along)
             negative += jnp.sum(factors.negative)
             all_factors.append(factors)
@@ -237,6 +238,6 @@ def generic_motion(rods: tuple[LinearizedRod, ...], points: tuple[Any, ...], sys
     """A motion along no other."""
     motions = []
     for each, point in zip(rods, points, strict=True):
-        rotation = jax.vmap(lambda here, point: components(here.bases, generic_field(point.tangents)))(each.here, point)
+        rotation = of_each(lambda here, point: components(here.bases, generic_field(point.tangents)))(each.here, point)
         motions.append(Motion(rotation, jnp.zeros_like(each.here.constraint_residual)))
     return HarnessMotion(tuple(motions), jnp.ones(len(system.springs), system.springs.dtype))

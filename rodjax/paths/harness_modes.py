@@ -26,6 +26,7 @@ from rodjax.paths.assembled import (
     unit_of_stiffness,
 )
 from rodjax.programs.compilation import compiled
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, Poses, Rods
 from rodjax.solving.coupling import Coupling, RodInBodies, end_contacts
 from rodjax.solving.harness_forces import ends_of, split_pressures
@@ -92,8 +93,8 @@ def _groups(result: HarnessEquilibrium) -> tuple[Assembly, list[_Group]]:
     bodies, poses = Bodies.of(harness), Poses(result.positions, result.frames)
     all_rods, points = [], []
     for numbers, group in zip(result.members, result.groups, strict=True):
-        forms, of_group = jax.vmap(form_and_point)(group)
-        units = jax.vmap(lambda scene: nondimensional(scene)[1])(group.scene)
+        forms, of_group = of_each(form_and_point)(group)
+        units = of_each(lambda scene: nondimensional(scene)[1])(group.scene)
         all_rods.append(Rods(forms, group.state.shape, units, *ends_of(harness, numbers)))
         points.append(of_group)
     assembly, found = Assembly.of(tuple(all_rods), bodies), []
@@ -101,7 +102,7 @@ def _groups(result: HarnessEquilibrium) -> tuple[Assembly, list[_Group]]:
     for rods, point, of_ends in zip(all_rods, points, pressures, strict=True):
         each = assembly.rods(rods, poses)
         of_ends = None if of_ends is None else of_ends / rods.units.force[:, None, None]
-        found.append(_Group(each, point, jax.vmap(_of_rod)(each, point, of_ends)))
+        found.append(_Group(each, point, of_each(_of_rod)(each, point, of_ends)))
     return assembly, found
 
 
@@ -167,7 +168,7 @@ def _mode(
     displacements: dict[str, Array] = {}
     for numbers, group, of_group, x in zip(result.members, groups, system.groups, motion.rods, strict=True):
         bases, of_ends = group.linearized.here.bases, of_group.along @ motion.bodies
-        moved = jax.vmap(_displaced)(group.rods, group.point, bases, x.rotation, x.multipliers, of_ends)
+        moved = of_each(_displaced)(group.rods, group.point, bases, x.rotation, x.multipliers, of_ends)
         displacements |= {result.names[number]: moved[k] for k, number in enumerate(numbers)}
     largest = jnp.sqrt(jnp.max(jnp.stack([jnp.max(jnp.sum(moved**2, axis=1)) for moved in displacements.values()])))
     stiffness = stiffness * unit_of_stiffness(assembly)

@@ -27,6 +27,7 @@ from rodjax.paths.assembled import (
 )
 from rodjax.paths.place import Place, work
 from rodjax.paths.rod_place import MAX_ROTATION, SPRING, TOLERANCE, Direction, Regularized, regularized
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, Poses, Rods
 from rodjax.solving.coupling import RodInBodies
 from rodjax.solving.harness_forces import ends_of
@@ -56,7 +57,7 @@ class Under(NamedTuple):
     def rods(self) -> list[RodInBodies]:
         """With their ends where the bodies are."""
         return [
-            jax.vmap(lambda rod: rod._replace(form=rod.form_at()))(self.assembly.rods(group, self.poses))
+            of_each(lambda rod: rod._replace(form=rod.form_at()))(self.assembly.rods(group, self.poses))
             for group in self.assembly.groups
         ]
 
@@ -114,9 +115,9 @@ class HarnessPlace(Place):
     def is_balanced(self) -> Bool[Array, ""]:
         least, is_closed = jnp.asarray(TOLERANCE, self.springs[0].dtype), jnp.array(True)
         for group, points, each in zip(self.under.rods(), self.point.rods, self.rods, strict=True):
-            floors = jax.vmap(lambda form, point: form.rounding_floor(point))(group.form, points)
+            floors = of_each(lambda form, point: form.rounding_floor(point))(group.form, points)
             least = jnp.maximum(least, STAGNATION * jnp.max(floors))
-            closed = jax.vmap(lambda form, residual: form.is_closed(residual, 0.0))
+            closed = of_each(lambda form, residual: form.is_closed(residual, 0.0))
             is_closed &= jnp.all(closed(group.form, each.here.constraint_residual))
         return (self.magnitude <= least) & is_closed
 
@@ -155,7 +156,7 @@ class HarnessPlace(Place):
                     turn = form.turn(point, here.bases, axis)
                     return Motion(turn, form.multipliers_turned(point, axis, nothing))
 
-                rods.append(jax.vmap(turned)(group, points, each))
+                rods.append(of_each(turned)(group, points, each))
             along = motions.T @ of_bodies
             return HarnessMotion(tuple(rods), along), of_bodies - motions @ along
 
@@ -187,7 +188,7 @@ class HarnessPlace(Place):
         of_rods, bodies = direction
         rods = []
         for each, one in zip(self.rods, of_rods, strict=True):
-            rods.append(Motion(jax.vmap(components)(each.here.bases, one.turns), one.multipliers))
+            rods.append(Motion(of_each(components)(each.here.bases, one.turns), one.multipliers))
         return HarnessMotion(tuple(rods), bodies)
 
     def work_share(self, motion: HarnessMotion) -> Float[Array, ""]:
@@ -228,7 +229,7 @@ class HarnessProblem(eqx.Module):
     @property
     def point(self) -> HarnessPoint:
         result = self.equilibrium
-        points = tuple(jax.vmap(lambda rod: form_and_point(rod)[1])(group) for group in result.groups)
+        points = tuple(of_each(lambda rod: form_and_point(rod)[1])(group) for group in result.groups)
         return HarnessPoint(points, Poses(result.positions, result.frames))
 
     @property
@@ -252,7 +253,7 @@ class HarnessProblem(eqx.Module):
                 scaled, units = nondimensional(scene)
                 return form_of(scaled, shape), units
 
-            forms, units = jax.vmap(scaled_form)(scenes, group.state.shape)
+            forms, units = of_each(scaled_form)(scenes, group.state.shape)
             groups.append(Rods(forms, group.state.shape, units, *ends_of(harness, numbers)))
         return Under(Assembly.of(tuple(groups), bodies), Poses(*bodies.followed(before, *poses)))
 
@@ -268,20 +269,20 @@ class HarnessProblem(eqx.Module):
                 change = form.layout.forces(form.force_components(x.multipliers))
                 return form.holding(form.retract(point, bases, x.rotation, change, form.others(x.multipliers)))
 
-            rods.append(jax.vmap(of_rod)(assembly.rods(group, under.poses), point, own, x, padded[group.body]))
+            rods.append(of_each(of_rod)(assembly.rods(group, under.poses), point, own, x, padded[group.body]))
         poses = under.poses.retract(of_bodies, assembly.length)
         before = Bodies.of(self.equilibrium.harness)
         return HarnessPoint(tuple(rods), Poses(*before.followed(assembly.bodies, *poses)))
 
     def _held(self, under: Under, points: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(
-            jax.vmap(lambda rod, point: rod.form.holding(point))(rods, point)
+            of_each(lambda rod, point: rod.form.holding(point))(rods, point)
             for rods, point in zip(under.rods(), points, strict=True)
         )
 
     def _bases(self, under: Under, points: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(
-            jax.vmap(lambda rod, point: rod.form.bases_at(point))(rods, point)
+            of_each(lambda rod, point: rod.form.bases_at(point))(rods, point)
             for rods, point in zip(under.rods(), points, strict=True)
         )
 
@@ -295,7 +296,7 @@ class HarnessProblem(eqx.Module):
         """The equations at the point carried to a parameter."""
         under = self._under(parameter, point.poses)
         points = self._held(under, point.rods)
-        rods = tuple(jax.vmap(LinearizedRod.of)(*pair) for pair in zip(under.rods(), points, strict=True))
+        rods = tuple(of_each(LinearizedRod.of)(*pair) for pair in zip(under.rods(), points, strict=True))
         springs = under.assembly.body_derivatives(under.poses)
         return HarnessPlace.of(under, HarnessPoint(points, point.poses), rods, springs, None)
 
@@ -324,7 +325,7 @@ class HarnessProblem(eqx.Module):
             return short_sum(form.bases_at(point) * rotation[None], axis=1)
 
         directions = [
-            Direction(jax.vmap(turns)(group, x.rotation), x.multipliers)
+            Direction(of_each(turns)(group, x.rotation), x.multipliers)
             for group, x in zip(self.equilibrium.groups, motion.rods, strict=True)
         ]
         return (tuple(directions), motion.bodies), None
@@ -365,7 +366,7 @@ def no_motion(result: HarnessEquilibrium) -> HarnessMotion:
     def residual_vectors(result: HarnessEquilibrium) -> HarnessMotion:
         rods = []
         for group in result.groups:
-            rods.append(Motion(*jax.vmap(lambda rod: _vectors(*form_and_point(rod)))(group)))
+            rods.append(Motion(*of_each(lambda rod: _vectors(*form_and_point(rod)))(group)))
         return HarnessMotion(tuple(rods), jnp.zeros(len(Bodies.of(result.harness).columns), result.positions.dtype))
 
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(residual_vectors, result))

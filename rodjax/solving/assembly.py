@@ -20,6 +20,7 @@ from rodjax.discretization.shape import Shape
 from rodjax.model.harness import Bodies, rotated
 from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import under_contact
+from rodjax.programs.stacks import of_each
 from rodjax.solving.coupling import RodInBodies
 from rodjax.solving.loading import bearing
 from rodjax.solving.rod_contact import (
@@ -128,7 +129,7 @@ class Assembly(eqx.Module):
             return eqx.tree_at(lambda form: form.scene, form, bearing(form.scene, part))
 
         groups = (
-            group if group.form.has_potential else dataclasses.replace(group, form=jax.vmap(borne)(group.form))
+            group if group.form.has_potential else dataclasses.replace(group, form=of_each(borne)(group.form))
             for group in self.groups
         )
         return dataclasses.replace(self, groups=tuple(groups))
@@ -153,9 +154,9 @@ class Assembly(eqx.Module):
         for number, group in enumerate(self.groups):
             rods = self.rods(group, poses)
             if motions is None:
-                found.append(jax.vmap(lambda rod: rod.form_at())(rods))
+                found.append(of_each(lambda rod: rod.form_at())(rods))
             else:
-                found.append(jax.vmap(lambda rod, moved: rod.form_at(moved))(rods, motions[number]))
+                found.append(of_each(lambda rod, moved: rod.form_at(moved))(rods, motions[number]))
         return tuple(found)
 
     def contacts(self, state: "State") -> tuple[Contacts, ...]:

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,6 +13,7 @@ from rodjax.discretization.sliding import SETTLED, SlidingForm
 from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.geometry.vectors import components
 from rodjax.model.scene import scene_axes
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, State
 from rodjax.solving.coupling import Coupling, EndContacts, RodInBodies, end_contacts, linearized_with_ends
 from rodjax.solving.newton import STAGNATION, Newton
@@ -84,7 +84,7 @@ def balance_at(
         residual = jnp.maximum(residual, jnp.max(here.linearization.residual))
         is_settled &= jnp.all(_is_settled(here.linearization))
         floor = jnp.maximum(floor, jnp.max(here.floor))
-        closed = jax.vmap(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
+        closed = of_each(lambda form, constraint_residual: form.is_closed(constraint_residual, solver.tolerance))
         is_closed &= jnp.all(closed(group.form, here.linearization.constraint_residual))
     for contacts in touching:
         residual = jnp.maximum(residual, contacts.residual)

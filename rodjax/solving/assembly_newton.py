@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rodjax.discretization.form import Form
 from rodjax.discretization.nearest_places import GROWS
 from rodjax.discretization.rod_pairs import GROWS_OF_PAIRS
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, State
 from rodjax.solving.assembly_balance import (
     Balance,
@@ -72,7 +73,7 @@ def _found(assembly: Assembly, begin: State, solver: Newton, find: Find) -> Stat
 def _of_each(assembly: Assembly, points: tuple[Any, ...], changed: Callable[[Form, Any], Any]) -> tuple[Any, ...]:
     """Of each group the points, changed where a search changes them at its beginning or end alone."""
     return tuple(
-        jax.vmap(changed)(group.form, of_group) if group.form.refines else of_group
+        of_each(changed)(group.form, of_group) if group.form.refines else of_group
         for group, of_group in zip(assembly.groups, points, strict=True)
     )
 
@@ -84,7 +85,7 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     all_here = []
     for group, points, pressures in zip(assembly.groups, state.points, state.at_ends, strict=True):
         rods = assembly.rods(group, state.poses)
-        all_here.append(Here(rods, *jax.vmap(linearized_rod)(rods, points, pressures)))
+        all_here.append(Here(rods, *of_each(linearized_rod)(rods, points, pressures)))
     balance = balance_at(assembly, all_here, touching, state, solver)
     all_here = sliding_once_settled(all_here, state, balance)
     rods = eliminated_rods(all_here, state, balance, find)
@@ -100,12 +101,12 @@ def _turn(assembly: Assembly, state: State, solver: Newton, find: Find) -> State
     status = _status(state, balance, trial, steps, is_sought, solver)
     for group, here in zip(assembly.groups, all_here, strict=True):
         is_given_up = (status == Status.MAX_ITERATIONS) | (status == Status.LINE_SEARCH_FAILED)
-        slid_out = jax.vmap(lambda form, point, ends: form.has_slid_out(point, ends), (0, 0, None))
+        slid_out = of_each(lambda form, point, ends: form.has_slid_out(point, ends), (0, 0, None))
         has_slid_out = slid_out(group.form, here.points, is_given_up)
         if has_slid_out is not None:
             is_open = is_given_up | (status == Status.RUNNING)
             status = jnp.where(jnp.any(has_slid_out) & is_open, Status.SLID_OUT, status)
-        is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(group.form, here.points)
+        is_blocked = of_each(lambda form, point: form.is_blocked(point))(group.form, here.points)
         if is_blocked is not None:
             status = jnp.where(jnp.any(is_blocked) & (status == Status.RUNNING), Status.MAX_ITERATIONS, status)
     is_given_up = (status == Status.MAX_ITERATIONS) | (status == Status.LINE_SEARCH_FAILED)
@@ -178,7 +179,7 @@ def _refined(
         if not group.form.refines:
             points.append(here.points)
             continue
-        found, differ = jax.vmap(lambda form, point: form.refined(point, ends))(group.form, here.points)
+        found, differ = of_each(lambda form, point: form.refined(point, ends))(group.form, here.points)
         is_new = (a != b for a, b in zip(*map(jax.tree.leaves, (found, here.points)), strict=True))
         differs = functools.reduce(jnp.logical_or, map(jnp.any, is_new))
         changes |= (begins & differs) | (ends & jnp.any(differ))

@@ -16,6 +16,7 @@ from rodjax.discretization.sliding import SlidingForm
 from rodjax.linalg.chain import ChainSystem
 from rodjax.mechanics.energy import dead_load_energy
 from rodjax.model.scene import held_position
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, State
 from rodjax.solving.assembly_balance import Balance, Here
 from rodjax.solving.condensation import BodyMotions, EliminatedRods
@@ -124,14 +125,14 @@ def steps_from(
             flat = of_ends.reshape(-1, 12)
             rotation = found.rotation - jnp.einsum("kbmi,ki->kbm", found.rotations, flat)
             multipliers = found.multipliers - jnp.einsum("kci,ki->kc", found.multipliers_by_motions, flat)
-        change = jax.vmap(lambda form, y: form.layout.forces(form.force_components(y)))(group.form, multipliers)
-        others = jax.vmap(lambda form, y: form.others(y))(group.form, multipliers)
+        change = of_each(lambda form, y: form.layout.forces(form.force_components(y)))(group.form, multipliers)
+        others = of_each(lambda form, y: form.others(y))(group.form, multipliers)
         at_ends_change = None if here.at_ends is None else next(at_ends_changes)
         bases = here.linearization.bases
         steps.append(RodStep(here.points, bases, rotation, change, others, here.at_ends, at_ends_change))
         ends.append(of_ends)
         largest = jnp.maximum(largest, jnp.max(jnp.sum(rotation**2, axis=1)))
-        longest = jax.vmap(lambda form, *parts: form.longest_step(*parts))(group.form, here.points, others)
+        longest = of_each(lambda form, *parts: form.longest_step(*parts))(group.form, here.points, others)
         limits += [] if longest is None else [jnp.min(longest)]
     part = jnp.minimum(1.0, solver.max_rotation / jnp.sqrt(largest))
     for limit in limits:
@@ -139,7 +140,7 @@ def steps_from(
     steps = [
         step._replace(
             force_change=part * step.force_change,
-            others=jax.vmap(lambda form, others: form.scaled(others, 1.0, part))(group.form, step.others),
+            others=of_each(lambda form, others: form.scaled(others, 1.0, part))(group.form, step.others),
             at_ends_change=None if step.at_ends_change is None else part * step.at_ends_change,
         )
         for group, step in zip(assembly.groups, steps, strict=True)
@@ -169,7 +170,7 @@ def searched(
         lacking, points = jnp.zeros_like(energy), []
         for group, here, step, of_ends in zip(assembly.groups, all_here, steps.rods, steps.ends, strict=True):
             shares = assembly.shares(group)
-            value, constraint_residual, point = jax.vmap(
+            value, constraint_residual, point = of_each(
                 lambda step, rod, of_ends: step.value(rod, part * of_ends, part)
             )(step, here.rods, of_ends)
             energy += jnp.sum(shares * value)
@@ -199,7 +200,7 @@ def searched(
         is_better = (tries > 0) & (is_unjudged | (merit <= bound))
         for group, here, point in zip(assembly.groups, all_here, points, strict=True):
             if here.at_ends is not None:
-                stays = jax.vmap(
+                stays = of_each(
                     lambda form, here, there, is_better: form.accepts(here, there, is_better), (0, 0, 0, None)
                 )
                 is_better &= jnp.all(stays(group.form, here.points, point, is_better))
@@ -269,4 +270,4 @@ def _rates(here: Here, step: RodStep, of_ends: Float[Array, "k 2 6"]) -> tuple[A
         )
         return values, (along + step.contact_rate(form, here, coupling, of_ends), rates)
 
-    return jax.vmap(of_rod)(step, here.rods, here.linearization, here.coupling, of_ends)
+    return of_each(of_rod)(step, here.rods, here.linearization, here.coupling, of_ends)

@@ -23,6 +23,7 @@ from rodjax.discretization.sliding import SlidingForm
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import factor
 from rodjax.linalg.small_matrices import solved_where_regular
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, State
 from rodjax.solving.assembly_balance import Balance, Here, changed_in_contact
 from rodjax.solving.contact_elimination import RodsInContact, moved_by
@@ -115,7 +116,7 @@ def _eliminated(
     systems = here.rods.form, here.linearization, here.coupling
     if find == "equilibrium":
         shift = jnp.full_like(last, least)
-        found = jax.vmap(eliminated)(*systems, shift, nothing)
+        found = of_each(eliminated)(*systems, shift, nothing)
         return found, shift, jnp.array(False)
     shift = _first_shift(last, state, balance)
 
@@ -127,9 +128,9 @@ def _eliminated(
         larger = jnp.maximum(SHIFT_GROWTH * shift, least_shift(last))
         shift = jnp.where((tries > 0) & ~found.is_minimum, larger, shift)
         push = pushes(shift)[:, None, None] * here.aside
-        return shift, tries + 1, jax.vmap(eliminated)(*systems, shift, push)
+        return shift, tries + 1, of_each(eliminated)(*systems, shift, push)
 
-    kinds = jax.eval_shape(jax.vmap(eliminated), *systems, shift, nothing)
+    kinds = jax.eval_shape(of_each(eliminated), *systems, shift, nothing)
     blank = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
     shift, _, found = jax.lax.while_loop(
         lambda trial: (trial[1] == 0) | (~jnp.all(trial[2].is_minimum) & (trial[1] < MAX_FACTORS)),
@@ -251,7 +252,7 @@ def with_contacts(
         pushing = _pushing(last, state, balance) if find == "minimum" else jnp.zeros_like(last)
         is_pushed |= jnp.any(pushing > 0)
         pushes = (PUSH / here.aside.shape[2] * pushing)[:, None, None] * here.aside
-        forms = jax.vmap(lambda rod: rod.form_at())(here.rods)
+        forms = of_each(lambda rod: rod.form_at())(here.rods)
         parts = forms, here.points, here.linearization, here.coupling, here.at_ends, pushes
         touched = RodsInContact.of(*parts, moved[len(groups)], assembly.shares(group))
         if together is not None and number in of_pairs:
@@ -283,6 +284,6 @@ def with_contacts(
 def _columns(assembly: Assembly, number: int, here: Here, forms: NodalForm, chosen: Any) -> Columns:
     group, system = assembly.groups[number], here.linearization.system
     assert isinstance(system, ChainSystem)
-    free = jax.vmap(free_points)(forms, here.linearization)
+    free = of_each(free_points)(forms, here.linearization)
     scales = group.units.length / assembly.length, assembly.shares(group)
     return columns_of(number, assembly.pairs, chosen, system, here.coupling, free, scales)

@@ -22,6 +22,7 @@ from rodjax.discretization.sliding_point import SlidingLinearization
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.chain_factors import factor_chain
 from rodjax.linalg.unilateral import Unilateral, closed_softly, with_pressures, with_slips, work
+from rodjax.programs.stacks import of_each
 from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns
 from rodjax.solving.rod_contact import Columns
 
@@ -73,7 +74,7 @@ class RodsInContact(eqx.Module):
             first = first.at[:12].add(jnp.einsum("oei,oe->ei", at_ends.rates, at_ends.pressures).reshape(12))
             return system, coupling, contacts, push + moments, c, first
 
-        system, coupling, contacts, f, c, first = jax.vmap(of_rod)(forms, points, here, coupling, at_ends, pushes)
+        system, coupling, contacts, f, c, first = of_each(of_rod)(forms, points, here, coupling, at_ends, pushes)
         return RodsInContact(system, coupling, contacts, f, c, at_ends, first, by_q, shares)
 
     def touched(self, columns: Columns, pressures: Float[Array, "c"]) -> "RodsInContact":
@@ -121,7 +122,7 @@ class RodsInContact(eqx.Module):
         def of_rod(system: ChainSystem, coupling: Coupling, x: Array, y: Array, q: Array) -> Array:
             return system.contacts.rates(x, system.split(y)[2]) + _of_gaps(system, coupling) @ q
 
-        rates = jax.vmap(of_rod)(self.system, self.coupling, *motion, moved)
+        rates = of_each(of_rod)(self.system, self.coupling, *motion, moved)
         return self.row(rates, jnp.einsum("koei,kei->koe", self.at_ends.rates, moved[:, :12].reshape(-1, 2, 6)))
 
 
@@ -217,7 +218,7 @@ def eliminated(
     count = len(shift)
     # Of a rod without obstacles there is none.
     soft = of_rods[:, 0, 0] if of_rods.size else rods.system.contacts.contact_compliance
-    return jax.vmap(of_rod)(rods, closed_rods, closed_ends, trials, jnp.broadcast_to(soft, (count,)), shift)
+    return of_each(of_rod)(rods, closed_rods, closed_ends, trials, jnp.broadcast_to(soft, (count,)), shift)
 
 
 def along_rod(

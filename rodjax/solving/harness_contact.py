@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, sought
+from rodjax.programs.stacks import of_each
 from rodjax.solving.contact_elimination import Eliminated, RodsInContact, along_rod, eliminated
 from rodjax.solving.newton import MAX_FACTORS, SHIFT_GROWTH
 from rodjax.solving.rod_contact import Between, BetweenStep
@@ -77,7 +78,7 @@ class BodyContacts(eqx.Module):
     def turned(self, trial: Array, other: Array) -> Bool[Array, ""]:
         turned = jnp.array(False)
         for (_, contacts, here), (_, _, there) in zip(self._of_rough(trial), self._of_rough(other), strict=True):
-            turned |= jnp.any(jax.vmap(lambda each, *trials: each.turned(*trials))(contacts, here, there))
+            turned |= jnp.any(of_each(lambda each, *trials: each.turned(*trials))(contacts, here, there))
         return turned
 
 
@@ -232,7 +233,7 @@ class ContactModel(eqx.Module):
         """The rods with the columns of closed contacts between them."""
         found = []
         for rods in self.groups:
-            columns = None if rods.columns is None else jax.vmap(lambda columns: columns.where(is_closed))(rods.columns)
+            columns = None if rods.columns is None else of_each(lambda columns: columns.where(is_closed))(rods.columns)
             found.append(dataclasses.replace(rods, columns=columns))
         return found
 
@@ -318,7 +319,7 @@ class ContactModel(eqx.Module):
         slope = q @ stiffness @ dq - (self.force + memory.push) @ dq
         curvature = dq @ stiffness @ dq
         for rods, here, ahead, shift in zip(self.groups, of_rods, changes, memory.shifts, strict=True):
-            slopes, curvatures = jax.vmap(along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
+            slopes, curvatures = of_each(along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
             slope += jnp.sum(rods.shares * slopes)
             curvature += jnp.sum(rods.shares * curvatures)
         if self.between is not None:

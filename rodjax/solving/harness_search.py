@@ -16,6 +16,7 @@ from rodjax.discretization.sliding_point import SlidingPoint
 from rodjax.model.harness import Bodies, Harness, clamped
 from rodjax.model.scene import Scene, has_contacts, nondimensional, slid, slides, under_contact
 from rodjax.programs.compilation import compiled
+from rodjax.programs.stacks import of_each
 from rodjax.solving.assembly import Assembly, Poses, Rods, State
 from rodjax.solving.assembly_newton import find_assembly
 from rodjax.solving.harness_forces import contact_forces, ends_of, energy_of, split_pressures, stacked
@@ -56,7 +57,7 @@ def find_harness(
             of_kind = sliding_search if slides(scene) else Search.of
             return of_kind(scaled, state, first, option)
 
-        searches = jax.vmap(begin)(scenes, states, firsts)
+        searches = of_each(begin)(scenes, states, firsts)
         body, frame, offset = ends_of(harness, numbers)
         groups.append(Rods(searches.form, searches.shape, searches.units, body, frame, offset))
         points.append(searches.point)
@@ -92,7 +93,7 @@ def _slid(
         for number, form in enumerate(forms):
             if isinstance(form, SlidingForm):
                 parts = form, state.points[number], groups[number].units, first[number]
-                found = jax.vmap(functools.partial(_made_anew, options=options[number]))(*parts)
+                found = of_each(functools.partial(_made_anew, options=options[number]))(*parts)
                 made[number] = dataclasses.replace(groups[number], form=found.form, shape=found.shape)
                 points[number] = found.point
         return tuple(made), state._replace(points=tuple(points))
@@ -108,9 +109,9 @@ def _slid(
         goes_on = jnp.array(False)
         for form, points in zip(here.forms(end.poses), end.points, strict=True):
             if isinstance(form, SlidingForm):
-                misplaced = jax.vmap(lambda form, point: form.is_misplaced(point))(form, points)
+                misplaced = of_each(lambda form, point: form.is_misplaced(point))(form, points)
                 goes_on |= is_converged(end.status) & jnp.any(misplaced)
-                is_blocked = jax.vmap(lambda form, point: form.is_blocked(point))(form, points)
+                is_blocked = of_each(lambda form, point: form.is_blocked(point))(form, points)
                 goes_on |= False if is_blocked is None else jnp.any(is_blocked)
         status = jnp.where(goes_on & (count == MOST_MESHES - 1), Status.MAX_ITERATIONS, end.status)
         return groups, end._replace(status=status), count + 1, goes_on
@@ -226,4 +227,4 @@ def _equilibria(
             found = on_one_side(search, form, found, begin.before)
         return build_result(scene, found, jnp.ones((), int), strain_limit)
 
-    return jax.vmap(one)(scenes, rods, *begun, end.points[group], end.residuals[group])
+    return of_each(one)(scenes, rods, *begun, end.points[group], end.residuals[group])

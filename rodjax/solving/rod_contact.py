@@ -33,6 +33,7 @@ from rodjax.discretization.rod_pairs import (
 from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.far_rows import SIGNS
 from rodjax.model.loads import ContactLoads
+from rodjax.programs.stacks import of_each
 from rodjax.solving.coupling import Coupling
 
 # The numbers of the rods of each group.
@@ -241,7 +242,7 @@ def curves_of(forms: NodalForm, points: Any, units: Any, length: Float[Array, ""
             ratio * found.radius,
         )
 
-    return jax.vmap(of_rod)(forms, points, units)
+    return of_each(of_rod)(forms, points, units)
 
 
 def stacked_curves(pairs: tuple[Pairs, ...], curves: dict[int, Curve]) -> Curves:
@@ -257,13 +258,13 @@ def joined_curves(pairs: Pairs, curves: Curves) -> Curve:
     first, second = (
         jax.tree.map(lambda leaf, places=places: leaf[places], curves[groups]) for groups, _, places in pairs.sides
     )
-    return jax.vmap(joined)(first, second)
+    return of_each(joined)(first, second)
 
 
 def growth_between(pairs: Pairs, curves: Curves) -> Float[Array, "p n"]:
     """By which it is told which elements are to have wide wells."""
     elements = curves[pairs.groups[0]].radius.shape[1]
-    return jax.vmap(lambda curve: growth_of_pair(curve, elements))(joined_curves(pairs, curves))
+    return of_each(lambda curve: growth_of_pair(curve, elements))(joined_curves(pairs, curves))
 
 
 def contacts_between(
@@ -276,7 +277,7 @@ def contacts_between(
         found = found_between(curve, elements)
         return curve, found, gaps_between(curve, found)
 
-    both, found, gaps = jax.vmap(of_pair)(joined_curves(pairs, curves), is_wide)
+    both, found, gaps = of_each(of_pair)(joined_curves(pairs, curves), is_wide)
     return Contacts(both, found, gaps, pressures, is_wide, jnp.where(gaps < -LEAST_RELAXED, -gaps / 2, 0.0))
 
 
@@ -295,7 +296,7 @@ def are_crowded(pairs: Pairs, contacts: Contacts) -> Bool[Array, ""]:
 
 def passes(pairs: Pairs, before: Contacts, curves: Curves) -> Bool[Array, ""]:
     """Whether a step leads no rod through another one."""
-    return ~jnp.any(jax.vmap(comes_through)(before.curves, before.found, joined_curves(pairs, curves)))
+    return ~jnp.any(of_each(comes_through)(before.curves, before.found, joined_curves(pairs, curves)))
 
 
 def loads_of(
@@ -312,7 +313,7 @@ def loads_of(
     }
     begins = {}
     for pairs, contacts in zip(all_pairs, all_contacts, strict=True):
-        both = jax.vmap(loads_between)(contacts.curves, contacts.found, contacts.pressures)
+        both = of_each(loads_between)(contacts.curves, contacts.found, contacts.pressures)
         for (groups, of_groups, places), of_rods in zip(pairs.sides, both, strict=True):
             totals[groups] = tuple(
                 total.at[places].add(part) for total, part in zip(totals[groups], of_rods, strict=True)
@@ -337,7 +338,7 @@ def between(all_pairs: tuple[Pairs, ...], all_contacts: tuple[Contacts, ...]) ->
     """Of all pairs those contacts that are nearest to touching."""
     parts, all_chosen = [], []
     for pairs, contacts in zip(all_pairs, all_contacts, strict=True):
-        found = jax.vmap(pair_contacts)(contacts.curves, contacts.found, contacts.pressures)
+        found = of_each(pair_contacts)(contacts.curves, contacts.found, contacts.pressures)
         count, (_, elements) = found.chosen.shape[1], contacts.gaps.shape
         at = (jnp.arange(len(found.chosen))[:, None] * elements + found.chosen).reshape(-1)
         gaps, pressures = (contacts.gaps + contacts.relaxed).reshape(-1)[at], contacts.pressures.reshape(-1)[at]

@@ -22,6 +22,7 @@ from rodjax.model.harness import Harness
 from rodjax.model.loads import ContactLoads
 from rodjax.model.scene import Scene, under_contact
 from rodjax.programs.compilation import compiled
+from rodjax.programs.stacks import of_each
 from rodjax.solving.result import Equilibrium
 from rodjax.solving.rod_contact import (
     Curves,
@@ -67,7 +68,7 @@ def curves_of_results(groups: tuple[Equilibrium, ...], pairs: tuple[Pairs, ...],
             rod.s / length, rod.nodes / length, rod.tangents.T, nowhere, jnp.ones_like(rod.s), middles / length
         )
 
-    return stacked_curves(pairs, {number: jax.vmap(of_rod)(groups[number]) for number in in_contact(pairs)})
+    return stacked_curves(pairs, {number: of_each(of_rod)(groups[number]) for number in in_contact(pairs)})
 
 
 def mean_length(groups: tuple[Equilibrium, ...]) -> Float[Array, ""]:
@@ -113,7 +114,7 @@ def _rod_contacts(
                 places.s * length, (places.beyond - offset) * length, places.gaps * length, places.forces.T
             )
 
-        stacked = jax.vmap(of_pair)(joined_curves(each, curves), pressures, is_wide)
+        stacked = of_each(of_pair)(joined_curves(each, curves), pressures, is_wide)
         named = [[names[number] for group in groups for number in members[group]] for groups in each.groups]
         for k, (first, second) in enumerate(each.places):
             found[named[0][first], named[1][second]] = jax.tree.map(lambda leaf, k=k: leaf[k], stacked)
@@ -180,7 +181,7 @@ class TouchingRods(eqx.Module):
                 # Of a curve of no place, as the weights are.
                 nowhere = jnp.zeros((len(rods), mesh.shape[1], 3), mesh.dtype)
                 along = lengths[rods][:, None] * mesh[rods]
-                weights = jax.vmap(_at)(along, nowhere, nowhere, elements, lengths[rods] * places[side])
+                weights = of_each(_at)(along, nowhere, nowhere, elements, lengths[rods] * places[side])
                 pushes = sign * jnp.where(is_here[None], forces, 0.0).T[..., None]
                 at = rods, slice(None), slice(None), elements
                 on_positions = on_positions.at[at].add(pushes * weights.of_positions[:, 0, :, 0][:, None])
@@ -260,7 +261,7 @@ def touching_rods(
             ends = curve.s[elements], curve.s[-1] - curve.s[elements + 1]
             return found, a / ends[0], (b - curve.s[elements + 1]) / ends[1], normal
 
-        found, a, b, normal = jax.vmap(of_pair)(both, is_wide)
+        found, a, b, normal = of_each(of_pair)(both, is_wide)
         most = each.kinds * MOST_TOUCHING
         pick = jnp.argsort(-pressures.reshape(-1))[:most]
         force = jnp.where(jnp.sum(pressures > 0) > most, jnp.nan, force)

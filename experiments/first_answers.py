@@ -51,6 +51,13 @@ ranges = [
 scatter = [rj.Tolerance("rod.length", 2e-3), rj.Tolerance("rod.EI", 1e-4)]
 short = rj.Objective(length=1, energy=1)
 def limits(d): return rj.Limits(bend_radius=4.0 + d)
+part, joint, more = rj.Rod.circular(0.5, 5e-3, 1e7, poisson_ratio=0.5, density=1200), rj.Joint("y", x), dict(gravity=g)
+def harness(d, obstacles=(), clips=()):
+    trunk = rj.Scene(part, rj.Clamp(z, x), joint, clips=clips, obstacles=obstacles, **more)
+    left = rj.Scene(part, joint, rj.Clamp(np.array([d, 0.2, 0]), x), obstacles=obstacles, **more)
+    right = rj.Scene(part, joint, rj.Pin(np.array([d, -0.2, 0])), obstacles=obstacles, **more)
+    return rj.Harness(dict(trunk=trunk, left=left, right=right))
+sliding = rj.Clip(0.2, (0.19, 0.0, 0.01), sliding=True)
 """
 JOBS = {
     "solve": "rj.solve(scene(d)).nodes",
@@ -67,6 +74,8 @@ JOBS = {
     "follower": "rj.solve(follower(d), segments=32).nodes",
     "contact": "rj.solve(scene(d, obstacles=[floor])).nodes",
     "contact_gradient": "jax.grad(lambda d: rj.solve(traced(d, obstacles=[floor]), segments=32).end_force[0])(d)",
+    "harness": "rj.solve(harness(d), segments=16).energy",
+    "harness_contact": "rj.solve(harness(d, [floor], [sliding]), segments=16).energy",
     "fit": "rj.fit([measured(d)], ['rod.EI', 'rod.length', 'rod.mass_per_length']).report()",
     "route": "str(rj.route(scene(0.8, clips=[clip]), ranges, limits=limits(d), objective=short, starts=4))",
     "tolerances": "rj.tolerances(rj.solve(scene(d, clips=[clip])), scatter, limits=limits(0))",

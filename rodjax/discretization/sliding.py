@@ -30,6 +30,7 @@ from rodjax.discretization.nodal import NodalForm
 from rodjax.discretization.shape import Shape
 from rodjax.discretization.sliding_point import SlidingChange, SlidingLinearization, SlidingPoint
 from rodjax.linalg.bordered import BorderedFactors, BorderedSystem, Vectors
+from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.saddle_point import AnySystem, factor_and_solve
 from rodjax.linalg.unilateral_border import minimized_with_border
 from rodjax.model.along import Along
@@ -237,6 +238,7 @@ class SlidingForm(MovingMeshForm):
         rounding = PLACE_ROUNDINGS * jnp.finfo(pulls.dtype).eps * _axial_stiffness(self.made)
         largest = jnp.max(jnp.abs(pulls))
         if gap_rates is not None:
+            assert isinstance(here.system, ChainSystem)
             # Slips along obstacles are of the nodes, whose positions are unknowns of their own.
             slips = len(here.system.contacts.is_closed) - gap_rates.shape[1]
             gap_rates = jnp.pad(gap_rates, ((0, 0), (0, slips), (0, 0)))

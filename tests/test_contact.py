@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Iterator
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +18,12 @@ from rodjax import Clamp, Clip, Free, Pin, Rod, Scene, frame
 from rodjax.discretization.inner_contacts import Elements, Places
 from rodjax.discretization.nodal_point import NodalChange
 from rodjax.discretization.node_contacts import contacts_at
+from rodjax.model.scene import nondimensional
 from rodjax.model.supports import Support
 from rodjax.solving import equilibrium, options
 from rodjax.solving.options import checked_options
 from rodjax.solving.result_form import form_and_point
+from rodjax.solving.sliding import sliding_at
 
 EI, GJ, RADIUS = 0.02, 0.015, 0.005
 DENSITY, GRAVITY = 0.15, (0.0, 0.0, -10.0)
@@ -469,10 +473,8 @@ def test_no_step_along_a_cylinder_is_shortened(touching):
     assert int(there.iterations) <= 6  # 5 seen
 
 
-def test_clips_that_hold_tangents_slide_beside_cylinders():
-    """Which contacts are closed is sought together with the arclengths of clips. From contacts sought at given ones
-    these searches took steps of a thousandth, up to the limit of 100.
-    """
+def pressed_aside() -> Iterator[Scene]:
+    """Cables through a clip that slides and holds the tangent, beside the end of a cylinder."""
     # EI, mass, tangent at the start; x and tangent of the end.
     ends = [
         (1.1, 0.8, (0.92, -0.33, 0.22), 0.86, (0.98, 0.18, 0.05)),
@@ -492,7 +494,14 @@ def test_clips_that_hold_tangents_slide_beside_cylinders():
     for (EI, mass, first, x, last), clip, cylinder in zip(ends, clips, cylinders, strict=True):
         bent = Rod(1.0, EI, 0.7 * EI, 1e4, mass_per_length=mass, radius=0.01)
         start, end = Clamp((0, 0, 0), frame(first)), Clamp((x, 0, 0), frame(last))
-        scene = Scene(bent, start, end, (0, 0, -9.81), clips=[clip], obstacles=[cylinder])
+        yield Scene(bent, start, end, (0, 0, -9.81), clips=[clip], obstacles=[cylinder])
+
+
+def test_clips_that_hold_tangents_slide_beside_cylinders():
+    """Which contacts are closed is sought together with the arclengths of clips. From contacts sought at given ones
+    these searches took steps of a thousandth, up to the limit of 100.
+    """
+    for scene in pressed_aside():
         result = rj.solve(scene, segments=16)
         assert result.converged
         assert result.stable
@@ -500,12 +509,59 @@ def test_clips_that_hold_tangents_slide_beside_cylinders():
         # Seen: 7, 14, 13.
         assert int(result.iterations) <= 20
         # No contact lies in an element beside the clip of the first and the last one.
+        EI, (clip,), (force,) = float(scene.rod.EI), scene.clips, result.clip_forces
         if EI < 1.5:
-            (force,) = result.clip_forces
             assert clip.tangent is not None
             along = force @ clip.tangent
             # The tolerance, in units of EI/L^2, and as much again to spare.
             assert abs(float(along)) < 2e-8 * EI
+
+
+def test_a_step_is_the_minimum_of_its_model_with_the_arclengths_of_clips():
+    """Forces and moments in balance, no contact that is closed opens, and no other closes, to first order."""
+    scene = next(pressed_aside())
+    result = rj.solve(scene, segments=16)
+    pressed = eqx.tree_at(lambda scene: scene.gravity, scene, -20 * scene.gravity)
+
+    def step_from(result):
+        slid = dataclasses.replace(pressed, clips=result.scene.clips)
+        form, point = sliding_at(nondimensional(slid)[0], result.state.shape, form_and_point(result)[1])
+        here = form.linearized(point)
+        system = form.regular(here.system)
+        is_minimum, rotation, multipliers = form.sought(here, point, system, jnp.zeros_like(here.gradient))
+        change = form.layout.forces(form.force_components(multipliers))
+        others = form.others(multipliers)
+
+        def at(part):
+            parts = jax.tree.map(lambda change: part * change, others)
+            there = form.retract(point, here.bases, part * rotation, part * change, parts)
+            return form.residual_vectors(there), form.at(there.arclengths).gaps(there.inner)
+
+        before, rates = jax.jvp(at, (jnp.array(0.0),), (jnp.array(1.0),))
+        (_, rows), gaps = jax.tree.map(jnp.add, before, rates)
+        pressures = point.inner.nodal.pressures + others.others.pressures
+        # Bases at another point are others: moments are those of the system, with all contacts that push or did.
+        pushing = (pressures > 0) | (point.inner.nodal.pressures > 0)
+        system = dataclasses.replace(here.system, inner=here.system.inner.closed_where(pushing))
+        moments = here.gradient + system.times(rotation, multipliers)[0]
+        return is_minimum, here.gradient, moments, rows, gaps, pressures, others.arclengths
+
+    is_minimum, before, moments, rows, gaps, pressures, slide = by_numpy(step_from)(result)
+    size = np.max(np.abs(before))
+    assert is_minimum
+    # Of twenty times the weight, upwards.
+    assert abs(float(slide[0])) > 1e-3
+    # First the axial force, then what contacts lack, which is below.
+    others = np.concatenate([rows[:1], rows[1 + pressures.size :]])
+    # Neutral motions are made regular by 1e-6 of what they are.
+    np.testing.assert_allclose(others, 0.0, atol=1e-6 * size)
+    np.testing.assert_allclose(moments, 0.0, atol=1e-6 * size)
+    closed = pressures > 0
+    assert np.any(closed)
+    # The compliance of contacts in the model times forces of some 100 EI/L^2.
+    np.testing.assert_allclose(gaps[closed], 0.0, atol=1e-6)
+    assert np.min(gaps) > -1e-6
+    assert np.min(pressures) >= 0
 
 
 def test_forces_and_gaps_of_each_obstacle_are_told(touching, lying):

@@ -13,6 +13,7 @@ import pytest
 import rodjax as rj
 from rodjax.programs import compilation, parts
 from rodjax.programs.parts import traced_once
+from rodjax.programs.stacks import of_each
 
 
 def test_the_cache_is_filled(tmp_path):
@@ -117,3 +118,19 @@ def test_a_solve_and_its_derivative_trace_the_linearisation_once(monkeypatch):
     assert len(traced) == 1
     # Beside 1e-7 of it that the search leaves in the difference.
     assert abs(slope - (force(0.8 + 1e-4) - force(0.8 - 1e-4)) / 2e-4) < 1e-5 * abs(slope)
+
+
+def test_a_stack_of_one_is_no_stack():
+    """Its branches stay branches; larger ones are those of `vmap`."""
+
+    def function(x: dict[str, jax.Array], power: jax.Array) -> tuple[jax.Array, None]:
+        return jax.lax.cond(x["a"][0] > 0, lambda: x["a"] ** power, lambda: x["b"]), None
+
+    three = {"a": jnp.array([[1.0, 2.0], [-1.0, 2.0], [3.0, 1.0]]), "b": jnp.arange(6.0).reshape(3, 2)}
+    one = jax.tree.map(lambda x: x[1:2], three)
+    for stack, name in ((three, "select_n"), (one, "cond")):
+        found, nothing = of_each(function, (0, None))(stack, jnp.array(2.0))
+        np.testing.assert_array_equal(found, jax.vmap(function, (0, None))(stack, jnp.array(2.0))[0])
+        assert nothing is None
+        traced = jax.make_jaxpr(of_each(function, (0, None)))(stack, jnp.array(2.0))
+        assert name in {equation.primitive.name for equation in traced.eqns}

@@ -131,8 +131,10 @@ def cold(count: int, seed: int = 0, segments: int = 48, has_guess: bool = True, 
     )
 
 
-def pressed_scene(rng: np.random.Generator, clip: dict[str, bool], segments: int) -> rj.Scene | None:
-    """A cable through a clip, pressed aside by the end of a cylinder; `None` where a support would be within it."""
+def pressed_scene(rng: np.random.Generator, clip: str, segments: int) -> rj.Scene | None:
+    """A cable pressed aside by the end of a cylinder; `None` where a support would lie within that. `clip`: whether it
+    slides, and what it holds beside the position: "sliding tangent".
+    """
 
     def turned(angle: float) -> tuple[float, float, float]:
         """The direction of x, turned by up to this angle [rad] to any side."""
@@ -144,7 +146,7 @@ def pressed_scene(rng: np.random.Generator, clip: dict[str, bool], segments: int
     ends = rj.Clamp((0, 0, 0), rj.frame(turned(0.6))), rj.Clamp((span, 0, 0), rj.frame(turned(0.6)))
     place, along = (at * span + 0.03 * rng.normal(), *(0.08 * rng.normal(size=2))), turned(0.5)
     holds = {"tangent": along} if "tangent" in clip else {"frame": rj.frame(along)} if "frame" in clip else {}
-    clips = [rj.Clip(at, place, **holds, sliding=clip.get("sliding", False))]
+    clips = [rj.Clip(at, place, **holds, sliding="sliding" in clip)]
     free = rj.solve(rj.Scene(rod, *ends, (0, 0, -9.81), clips=clips), segments=segments)
     (point,) = np.asarray(free.position_at(rng.uniform(0.1, 0.9)))
     depth, angle, radius = rng.uniform(0.005, 0.04), rng.uniform(0, 2 * np.pi), rng.uniform(0.01, 0.08)
@@ -160,7 +162,7 @@ def pressed(count: int, seed: int = 3, segments: int = 16) -> None:
     for clip in ("tangent", "sliding", "sliding tangent", "sliding frame"):
         rng, found = np.random.default_rng(seed), []
         for _ in range(count):
-            scene = pressed_scene(rng, dict.fromkeys(clip.split(), True), segments)
+            scene = pressed_scene(rng, clip, segments)
             if scene is not None:
                 result = rj.solve(scene, segments=segments)
                 found.append((bool(result.converged), int(result.iterations)))

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-# Where solutions go down, an unknown of the border as large as this leads away from a largest value.
+# Where solutions go down, a larger unknown of the border leads away from a maximum.
 LEAST_DESCENT = 1e-7
 
 
@@ -125,8 +125,8 @@ class BorderedFactors(eqx.Module):
         return (self.below == 0) & jnp.all(jnp.isfinite(self.complement))
 
     def goes_down(self, z: Float[Array, "j"]) -> Bool[Array, ""]:
-        """Whether a solution with these unknowns of the border leads to less: what they come from leads away from a
-        largest value, and no shift is needed.
+        """Whether a step with these unknowns of the border goes down: S is positive, or the step leads away from a
+        maximum, for which no shift is needed.
         """
         return self.is_steady | (jnp.max(jnp.abs(z)) > LEAST_DESCENT) if self.descends else self.is_steady
 

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.linalg.chain import ChainSystem
-from rodjax.linalg.chain_factors import factor_chain
+from rodjax.linalg.chain_factors import ChainFactors, factor_chain
 from rodjax.linalg.chain_rows import ContactRows
 
 # The most factorisations; those before softer contacts are tried, of MOST_COMPLIANT [L^3/EI] and then harder by
@@ -317,11 +317,17 @@ class OfChain(eqx.Module):
         contact_compliance: Float[Array, ""],
         memory: None,
     ) -> tuple[Bool[Array, ""], tuple[Array, Array], None]:
+        factors, f, c = self.factored(is_closed, trial, contact_compliance)
+        return factors.is_minimum, factors.solve_softly(f, c), None
+
+    def factored(
+        self, is_closed: Bool[Array, "r n+1"], trial: Float[Array, "r n+1"], contact_compliance: Float[Array, ""]
+    ) -> tuple[ChainFactors, Float[Array, "b m"], Float[Array, "j"]]:
+        """With these contacts closed, and the right sides."""
         here = closed_softly(self.system, is_closed, contact_compliance)
         f, c = with_pressures(here, self.contacts, self.f, self.c)
         here, c = with_slips(here, self.contacts, c, trial)
-        factors = factor_chain(here)
-        return factors.is_minimum, factors.solve_softly(f, c), None
+        return factor_chain(here), f, c
 
     def opening(self, motion: tuple[Array, Array]) -> Float[Array, "r n+1"]:
         x, y = motion

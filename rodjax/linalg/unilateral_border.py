@@ -1,8 +1,8 @@
-"""The minimum of the model of a rod (`unilateral`) with a few unknowns more, such as arclengths of sliding clips.
+"""The minimum of the model of a rod (`unilateral`) with a few further unknowns, such as arclengths of sliding clips.
 
-The gaps change by these too. A solution is one factorisation of the rod, with the contacts closed that are so at the
-last iterate, and as many columns as there are more unknowns (`bordered`). Without symmetry of rows and columns the
-model along a line is that of the symmetric part.
+The gaps depend on these too. A solution is one factorisation of the rod, with the contacts closed that are so at the
+last iterate, and a column for each further unknown (`bordered`). Where rows and columns differ, the model along a line
+is that of the symmetric part.
 """
 
 import equinox as eqx
@@ -12,25 +12,14 @@ from jaxtyping import Array, Bool, Float
 
 from rodjax.linalg.bordered import BorderedSystem, Vectors
 from rodjax.linalg.chain import ChainSystem
-from rodjax.linalg.chain_factors import factor_chain
-from rodjax.linalg.unilateral import (
-    ModelMinimum,
-    OfChain,
-    Unilateral,
-    closed_softly,
-    sought,
-    with_exerted,
-    with_pressures,
-    with_slips,
-    work,
-)
+from rodjax.linalg.unilateral import ModelMinimum, OfChain, Unilateral, sought, with_exerted, work
 from rodjax.programs.stacks import of_each
 
 Motion = tuple[Array, Array, Array]
 
 
 class _OfBorder(eqx.Module):
-    """The model of `minimized_with_border`, whose motions are x, y and z; `chain`: for given z = 0."""
+    """The model of `minimized_with_border`, whose motions are x, y and z; `chain`: the model with z = 0."""
 
     border: BorderedSystem
     g: Float[Array, "j"]
@@ -58,11 +47,8 @@ class _OfBorder(eqx.Module):
         contact_compliance: Float[Array, ""],
         memory: None,
     ) -> tuple[Bool[Array, ""], Motion, None]:
-        contacts, columns = self.chain.contacts, self._columns(is_closed)
-        here = closed_softly(self.chain.system, is_closed, contact_compliance)
-        f, c = with_pressures(here, contacts, self.chain.f, self.chain.c)
-        here, c = with_slips(here, contacts, c, trial)
-        chain = factor_chain(here)
+        chain, f, c = self.chain.factored(is_closed, trial, contact_compliance)
+        columns = self._columns(is_closed)
         sides = (jnp.concatenate([part, last[None]]) for part, last in zip(columns, (f, c), strict=True))
         x, y = jax.vmap(chain.solve_softly)(*sides)
         factors = self.border.factored(chain, Vectors(x[:-1], y[:-1]))
@@ -101,8 +87,8 @@ def minimized_with_border(
     c: Float[Array, "k"],
     contacts: Unilateral,
 ) -> ModelMinimum:
-    """As `minimized`, which has the last four; g: the right side of the unknowns more. In the result these are before
-    the other multipliers.
+    """As `minimized`, which has the last four arguments. `g`: the right side of the further unknowns z; `gap_rates`:
+    the derivatives of the gaps by z. In the result z stands before the other multipliers.
     """
     contact_compliance = system.contacts.contact_compliance
     open_system = system.closed_where(jnp.zeros(contacts.gaps.shape, bool))

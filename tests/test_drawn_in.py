@@ -76,6 +76,17 @@ def test_a_string_across_the_middle_of_a_box_is_led_to_one_side():
     np.testing.assert_allclose(strings[1], strings[0], atol=1e-9)
 
 
+def test_a_string_under_a_pipe_on_a_floor_is_led_over_both():
+    """The floor alone leads it up into the pipe, whose lower half leads it down again."""
+    floor, pipe = rj.Plane((0, 0, -0.1), (0, 0, 1)), rj.Cylinder((0.3, -1, -0.08), (0.3, 1, -0.08), 0.03)
+    string, is_needed = drawn(parabola(0.6, -0.2), 0.8, (floor, pipe))
+    assert is_needed
+    for obstacle in (floor, pipe):
+        np.testing.assert_array_less(RADIUS, np.asarray(obstacle.distance(string[1:-1])))
+    # Over the pipe, whose highest place is at -0.05.
+    assert np.min(np.interp(0.3, string[:, 0], string[:, 2])) > -0.05 + RADIUS
+
+
 def test_what_lies_within_is_led_out_with_the_tangents_of_supports():
     first, last = jnp.array([0.6, 0.0, 0.8]), jnp.array([1.0, 0.0, 0.0])
     string, is_needed = drawn(parabola(0.6, 0.02), 0.9, tangents=(first, last))
@@ -104,6 +115,20 @@ def test_a_shape_that_fits_is_left_as_it_is():
         for obstacles in ((), (far,))
     ]
     np.testing.assert_allclose(results[0].nodes, results[1].nodes, atol=1e-9)
+
+
+def test_a_cable_comes_to_rest_over_pipes_on_a_floor():
+    """Its first shape sags below both. Led out of one and of the other by turns, it was pressed to nothing between."""
+    floor = rj.Plane((0, 0, -0.1), (0, 0, 1))
+    pipes = [rj.Cylinder((x, -1, -0.09), (x + 0.1, 1, -0.09), radius) for x, radius in ((0.22, 0.03), (0.58, 0.02))]
+    start, end = (rj.Clamp((x, 0, z), rj.frame((1, 0, 0))) for x, z in ((0.0, 0.0), (0.78, 0.05)))
+    rod = rj.Rod.circular(1.0, RADIUS, 1e7, poisson_ratio=0.5, density=1200.0)
+    scene = rj.Scene(rod, start, end, (0, 0, -9.81), obstacles=[floor, *pipes])
+    result = rj.solve(scene, segments=32)
+    assert result.converged
+    assert int(result.iterations) <= 30  # 20 seen
+    for obstacle in (floor, *pipes):
+        assert np.min(obstacle.distance(result.nodes)) > RADIUS - 1e-9
 
 
 def test_a_thin_rod_comes_out_of_a_floor_in_whole_steps():

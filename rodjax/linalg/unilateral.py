@@ -7,10 +7,10 @@ With u the motion of the nodes, a contact of the pressure p0 and the gap g has i
 with the contact compliance c, and the energy c p(u)^2/2, so that the model is convex where its stiffness is positive,
 and piecewise quadratic. Each step of a semismooth Newton method is one factorisation, with the contacts closed that are
 so at the last iterate. The first ones are taken whole, as that most often ends soonest; later ones are followed by a
-line search on the model itself, so that the method cannot cycle; under loads without a potential, where the model has
-no value, all are whole without friction, and with it the slope of a model of the same symmetric part is looked for
-along the line. It ends where a whole step closes and opens no contact. Where many contacts close or open, it would
-advance by one or two at a time: then much softer contacts are sought first, and from these harder ones.
+line search on the model itself, so that the method cannot cycle. Under loads without a potential, and where rods slide
+through clips, the stiffness is not symmetric: the line search is one of the model of its symmetric part, and steps that
+lead up there are taken whole. It ends where a whole step closes and opens no contact. Where many contacts close or
+open, it would advance by one or two at a time: then much softer contacts are sought first, and from these harder ones.
 
 Coulomb friction with bounds that are given stays within that: with s the slip, tangential, the force on the node is
 
@@ -180,11 +180,6 @@ class ModelMinimum(eqx.Module):
 class Model(Protocol):
     """A quadratic model but for its contacts; motions and `memory` are any pytrees."""
 
-    @property
-    def is_symmetric(self) -> bool:
-        """Without symmetry there is no model that could be least."""
-        ...
-
     def solved(
         self, is_closed: Array, trial: Array, contact_compliance: Array, memory: Any
     ) -> tuple[Bool[Array, ""], Any, Any]:
@@ -198,8 +193,8 @@ class Model(Protocol):
         ...
 
     def along(self, motion: Any, change: Any, memory: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Slope and curvature of the model without contacts from a motion along a change: the rows of multipliers hold
-        at both.
+        """Slope and curvature of the model without contacts from a motion along a change, where its stiffness is the
+        symmetric part: the rows of multipliers hold at both.
         """
         ...
 
@@ -233,6 +228,13 @@ class Sought(eqx.Module):
     since: Int[Array, ""]  # factorisations with this level
     count: Int[Array, ""]
 
+    def exerted(self, contacts: Contacts, opening: Array, contact_compliance: Array) -> Array:
+        """What contacts of this compliance would exert there; those of the last iterate, where they were not found:
+        gaps that are open to it would be forces out of all proportion.
+        """
+        found = contacts.pressures - (contacts.gaps + opening) / contact_compliance
+        return jnp.where(self.is_done, found, self.trial)
+
 
 def sought(
     model: Model, contacts: Contacts, is_closed: Array, contact_compliance: Array, nowhere: Any, memory: Any = None
@@ -242,7 +244,6 @@ def sought(
     def improved(state: Sought) -> Sought:
         here = jnp.maximum(contact_compliance, state.level)
         is_minimum, motion, memory = model.solved(state.is_closed, state.trial, here, state.memory)
-        is_early = (state.since < WHOLE_STEPS) | (not model.is_symmetric)
         change = jax.tree.map(jnp.subtract, motion, state.motion)
         # The model along the way from the last iterate to this one.
         slope, curvature = model.along(state.motion, change, memory)
@@ -263,12 +264,14 @@ def sought(
             return low, high, jnp.where((newton > low) & (newton < high), newton, (low + high) / 2)
 
         zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)
-        gained = contacts.energy(pressures - falls, here) - contacts.energy(pressures, here)
-        is_whole = is_early | (slope + curvature / 2 + gained <= 0)
+        whole = pressures - falls
+        gained = contacts.energy(whole, here) - contacts.energy(pressures, here)
+        is_same = jnp.all(contacts.is_closed(whole) == state.is_closed) & ~contacts.turned(whole, state.trial)
+        goes_down, goes_up = slope + curvature / 2 + gained <= 0, rise(zero)[0] >= 0
+        is_whole = (state.since < WHOLE_STEPS) | is_same | goes_down | goes_up
         part = jnp.where(is_whole, one, jax.lax.fori_loop(0, LINE_STEPS, closer, (zero, one, one))[2])
         trial = pressures - part * falls
         is_closed = contacts.is_closed(trial)
-        is_same = jnp.all(is_closed == state.is_closed) & ~contacts.turned(trial, state.trial) & is_whole
         # Where the contacts are not found at once, softer ones are, and harder ones from these.
         hardest = jnp.min(contact_compliance)
         is_late = (state.count + 1 == FIRST_FACTORS) & ~is_same
@@ -305,10 +308,6 @@ class OfChain(eqx.Module):
     f: Float[Array, "b m"]
     c: Float[Array, "j"]
     contacts: Unilateral
-
-    @property
-    def is_symmetric(self) -> bool:
-        return self.system.loads is None or self.contacts.bounds is not None
 
     def solved(
         self,
@@ -397,15 +396,14 @@ def minimized(system: ChainSystem, f: Float[Array, "b m"], c: Float[Array, "j"],
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c)
     end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y = end.motion
-    y = with_exerted(system, contacts, model.opening(end.motion), y)
+    y = with_exerted(system, contacts, end.exerted(contacts, model.opening(end.motion), contact_compliance), y)
     return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)
 
 
 def with_exerted(
-    system: ChainSystem, contacts: Unilateral, opening: Float[Array, "r n+1"], y: Float[Array, "j"]
+    system: ChainSystem, contacts: Unilateral, trial: Float[Array, "r n+1"], y: Float[Array, "j"]
 ) -> Float[Array, "j"]:
-    """Multipliers with the changes of what contacts exert after this opening."""
-    trial = contacts.pressures - (contacts.gaps + opening) / system.contacts.contact_compliance
+    """Multipliers with the changes of what contacts exert."""
     first, _, u, force = system.split(y)
     parts = first, contacts.allowed(trial) - contacts.pressures, u, force
     return jnp.concatenate([part.reshape(-1) for part in parts])

@@ -1,8 +1,7 @@
 """The minimum of the model of a rod (`unilateral`) with a few further unknowns, such as arclengths of sliding clips.
 
 The gaps depend on these too. A solution is one factorisation of the rod, with the contacts closed that are so at the
-last iterate, and a column for each further unknown (`bordered`). Where rows and columns differ, the model along a line
-is that of the symmetric part.
+last iterate, and a column for each further unknown (`bordered`).
 """
 
 import equinox as eqx
@@ -25,10 +24,6 @@ class _OfBorder(eqx.Module):
     g: Float[Array, "j"]
     gap_rates: Float[Array, "j r n+1"]
     chain: OfChain
-
-    @property
-    def is_symmetric(self) -> bool:
-        return self.chain.is_symmetric
 
     def _columns(self, is_closed: Bool[Array, "r n+1"]) -> Vectors:
         """What z does to the other rows; the rows of closed contacts are their gaps, with a minus."""
@@ -96,5 +91,6 @@ def minimized_with_border(
     nowhere = jnp.zeros_like(f), jnp.zeros_like(c), jnp.zeros_like(g)
     end = sought(model, contacts, system.contacts.is_closed, contact_compliance, nowhere)
     x, y, z = end.motion
-    y = jnp.concatenate([z, with_exerted(system, contacts, model.opening(end.motion), y)])
+    trial = end.exerted(contacts, model.opening(end.motion), contact_compliance)
+    y = jnp.concatenate([z, with_exerted(system, contacts, trial, y)])
     return ModelMinimum(x, y, end.is_minimum & end.is_done, end.count)

@@ -39,6 +39,8 @@ OPPOSITE = -0.1
 DIRECTIONS = 8
 MOST_STEPS = 24
 ALIKE = 1e-6
+# A place within an obstacle is pushed out so often, where that leads into another one: pushed once more, it is caught.
+MOST_PUSHES = 4
 
 
 def _distance(obstacles: tuple[Obstacle, ...]) -> Callable[[Float[Array, "3"]], Float[Array, ""]]:
@@ -168,19 +170,19 @@ def _led_to_one_side(
     first_side: Float[Array, "3"] | None = None,
 ) -> Float[Array, "q 3"]:
     """Out of obstacles that it crosses in their middle, whose distance would lead one half of it forwards and the other
-    backwards: in the direction across, of several, in which all of it is out soonest. Directions are counted from
-    where the string sags, or from `first_side` of a string that is free at its end: that leads it out also where it
-    ends within.
+    backwards, and out of several that would lead it from one into the other: in the direction across, of several, in
+    which all of it is out soonest. Directions are counted from where the string sags, or from `first_side` of a string
+    that is free at its end: that leads it out also where it ends within.
     """
     places, distance = string[1:-1], _distance(obstacles)
-    distances, normals = jax.vmap(jax.value_and_grad(distance))(places)
-    is_within = distances < radius
+    is_within = jax.vmap(distance)(places) < radius
+    normals, is_caught = _ways_out(places, distance, radius)
     # The places of each way through obstacles have a number of their own, those outside of all 0.
     begins = is_within & ~jnp.concatenate([jnp.zeros(1, bool), is_within[:-1]])
     number, count, k = jnp.where(is_within, jnp.cumsum(begins), 0), len(places), jnp.arange(len(places))
     # In the middle itself there may be no normal: of places on both sides of another.
     is_opposite = jnp.sum(normals[2:] * normals[:-2], axis=1) < OPPOSITE
-    parts = jnp.pad(is_within[2:] & is_within[1:-1] & is_within[:-2] & is_opposite, 1)
+    parts = jnp.pad(is_within[2:] & is_within[1:-1] & is_within[:-2] & is_opposite, 1) | is_caught
     if first_side is not None:
         parts = parts.at[-1].set(is_within[-1])
     is_parted = jax.ops.segment_max(parts.astype(int), number, count)[number] > 0
@@ -203,6 +205,22 @@ def _led_to_one_side(
     best = jnp.argmax(farthest <= (1 + ALIKE) * jnp.min(farthest, axis=0, keepdims=True), axis=0)  # the first of those
     out = ways[best, k][:, None] * across[best, k]
     return string.at[1:-1].add(jnp.where((is_parted & is_within)[:, None], out, 0.0))
+
+
+def _ways_out(
+    places: Float[Array, "p 3"], distance: Callable[[Array], Array], radius: Float[Array, ""]
+) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
+    """The directions in which distances lead places out of obstacles at last, and whether they do not."""
+
+    def further(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        places, last, _ = state
+        distances, normals = jax.vmap(jax.value_and_grad(distance))(places)
+        out = jnp.where(distances < radius, radius - distances, 0.0)[:, None]
+        return places + out * normals, jnp.where(out > 0, normals, last), out[:, 0] > NEARER * radius
+
+    begin = places, jnp.zeros_like(places), jnp.zeros(len(places), bool)
+    _, normals, is_caught = jax.lax.fori_loop(0, MOST_PUSHES, further, begin)
+    return normals, is_caught
 
 
 def _unit(vectors: Float[Array, "p 3"]) -> Float[Array, "p 3"]:

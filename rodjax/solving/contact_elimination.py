@@ -231,7 +231,7 @@ def along_rod(
     def times(x: Array, y: Array, q: Array) -> tuple[Array, Array, Array]:
         moments, rows = system.times(x, y)
         by_bodies = (
-            coupling.second @ q + coupling.of_constraints.T @ y + jnp.einsum("bmi,bm->i", coupling.of_gradient, x)
+            coupling.second @ q + coupling.by_multipliers.T @ y + jnp.einsum("bmi,bm->i", coupling.by_rotations, x)
         )
         by_bodies = by_bodies.at[12:].add(shift * q[12:])
         return moments + coupling.of_gradient @ q, rows + coupling.of_constraints @ q, by_bodies

@@ -115,10 +115,6 @@ class ContactModel(eqx.Module):
     between: Between | None = None
     has_symmetry: bool = eqx.field(static=True, default=True)
 
-    @property
-    def is_symmetric(self) -> bool:
-        return self.has_symmetry or any(rods.contacts.bounds is not None for rods in self.groups)
-
     def begin(self, shifts: tuple[Float[Array, "k"], ...], damping: Float[Array, ""]) -> Memory:
         size = len(self.force)
         none = tuple(jnp.zeros(len(shift), int) for shift in shifts)
@@ -316,7 +312,7 @@ class ContactModel(eqx.Module):
     def along(self, motion: Any, change: Any, memory: Memory) -> tuple[Float[Array, ""], Float[Array, ""]]:
         stiffness = self.stiffness + memory.reversal
         (of_rods, q, _), (changes, dq, _) = motion, change
-        slope = q @ stiffness @ dq - (self.force + memory.push) @ dq
+        slope = (q @ stiffness @ dq + dq @ stiffness @ q) / 2 - (self.force + memory.push) @ dq
         curvature = dq @ stiffness @ dq
         for rods, here, ahead, shift in zip(self.groups, of_rods, changes, memory.shifts, strict=True):
             slopes, curvatures = of_each(along_rod)(rods, shift, (*here, rods.moved(q)), (*ahead, rods.moved(dq)))
@@ -382,7 +378,7 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
     contacts = BodyContacts(gaps, pressures, weights, tuple(rough))
     end = sought(model, contacts, is_closed, contact_compliance, model.nowhere(), model.begin(shifts, damping))
     of_rods, q, multipliers = end.motion
-    found = contacts.pressures - (contacts.gaps + model.opening(end.motion)) / contact_compliance
+    found = end.exerted(contacts, model.opening(end.motion), contact_compliance)
     if between is not None:
         # Of closed ones the multipliers: by the gaps they would be off by rounding over a small compliance.
         of_pairs = found[-len(between.gaps) :]

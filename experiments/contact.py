@@ -4,8 +4,8 @@
 
 Prints how many converge, iterations, and which of the rest are too short for their side; of the pegs also milliseconds
 of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
-scenes as the cables become heavier, beside paths. Cables through a clip, pressed aside by a cylinder. Cables under
-loads without a potential, beside a floor and a wall.
+scenes as the cables become heavier, beside paths. Cables through a clip, pressed aside by a cylinder. Cables over pipes
+that lie on a floor, and harnesses. Cables under loads without a potential, beside a floor and a wall.
 Of friction the pull of a taut cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a
 floor, and back, beside its closed form; of ropes over a cylinder, which nothing else holds, how many are found at rest.
 """
@@ -100,7 +100,7 @@ def needed_length(scene: rj.Scene, points: np.ndarray) -> float:
     """What the rod needs at least on the side to which the search leads it out: of a taut string."""
     assert isinstance(scene.start, rj.Swivel)
     assert isinstance(scene.end, rj.Swivel)
-    tangents, radius = (scene.start.tangent, scene.end.tangent), jnp.asarray(scene.rod.radius)
+    tangents, radius = jnp.stack([scene.start.tangent, scene.end.tangent]), jnp.asarray(scene.rod.radius)
     begin, _ = drawn_in(jnp.asarray(points), tangents, scene.obstacles, radius, scene.rod.length)
     return float(taut(begin, scene.obstacles, radius)[0])
 
@@ -170,6 +170,90 @@ def pressed(count: int, seed: int = 3, segments: int = 16) -> None:
         print(
             f"pressed aside, clip: {clip}, seed {seed}, {segments} elements: {converged.sum()} of {len(found)} "
             f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}"
+        )
+
+
+def over_pipes_scene(rng: np.random.Generator, clip: str) -> rj.Scene | None:
+    """A cable over two pipes that lie on a floor or are let into it; `clip`: as of `pressed_scene`, or "none"; `None`
+    where it would not reach.
+    """
+    uniform, along = rng.uniform, rj.frame((1, 0, 0))
+    radius, length = uniform(4e-3, 8e-3), uniform(0.8, 1.2)
+    rod = rj.Rod.circular(length, radius, 10 ** uniform(6.5, 8), poisson_ratio=0.5, density=1200)
+    span, floor, at = length * uniform(0.6, 0.98), -uniform(0.02, 0.15) - radius, uniform(0.3, 0.7)
+    place = at * span * uniform(0.9, 1.1), uniform(-0.03, 0.03), max(floor + 2.5 * radius, uniform(-0.05, 0.05))
+    tangent = np.array([1.0, *uniform(-0.2, 0.2, 2)])
+    obstacles: list[rj.Obstacle] = [rj.Plane((0, 0, floor), (0, 0, 1))]
+    for begin, end in ((0, place[0]), (place[0], span)):
+        thick, half = uniform(0.005, 0.03), (end - begin) / 2
+        # So that neither an end nor the clip lies within.
+        x = begin + half + max(half - thick - 3 * radius, 0) * uniform(-1, 1)
+        axis = [(x, y, floor + thick * uniform(0.5, 1.3)) for y in (-0.5, 0.5)]
+        obstacles.append(rj.Cylinder(*axis, thick))
+    holds = {"tangent": tangent} if "tangent" in clip else {"frame": rj.frame(tangent)} if "frame" in clip else {}
+    clips = [] if clip == "none" else [rj.Clip(at, place, **holds, sliding="sliding" in clip)]
+    end = rj.Clamp((span, uniform(-0.1, 0.1), uniform(-0.01, 0.1)), along)
+    try:
+        return rj.Scene(rod, rj.Clamp((0, 0, 0), along), end, (0, 0, -9.81), clips=clips, obstacles=obstacles)
+    except ValueError:
+        return None
+
+
+def over_pipes(count: int, seed: int = 1, segments: int = 32) -> None:
+    for clip in ("none", "position", "tangent", "sliding tangent"):
+        rng, found = np.random.default_rng(seed), []
+        for _ in range(count):
+            scene = over_pipes_scene(rng, clip)
+            if scene is not None:
+                result = rj.solve(scene, segments=segments, strain_limit=None)
+                found.append((bool(result.converged), int(result.iterations)))
+        converged, iterations = np.array(found).T
+        print(
+            f"over pipes on a floor, clip: {clip}, seed {seed}, {segments} elements: {converged.sum()} of {len(found)} "
+            f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}",
+            flush=True,
+        )
+
+
+def branched_harness(rng: np.random.Generator, sliding: bool) -> rj.Harness:
+    """A trunk through a clip and its two branches, much longer than their ways, over a floor and a slanting pipe."""
+    uniform, along, joint = rng.uniform, rj.frame((1, 0, 0)), rj.Joint("y", rj.frame((1, 0, 0)))
+    radius, E = uniform(4e-3, 8e-3), 10 ** uniform(6.5, 8)
+    trunk, branch = (
+        rj.Rod.circular(uniform(*lengths), part * radius, E, poisson_ratio=0.5, density=1200)
+        for lengths, part in (((0.5, 0.8), 1.0), ((0.45, 0.7), 0.8))
+    )
+    floor, x, at = uniform(-0.12, -0.03), uniform(0.25, 0.45), uniform(0.1, 0.4)
+    begin, end, thick = (x, -0.5, uniform(-0.08, -0.03)), (x, 0.5, uniform(-0.08, -0.03)), uniform(0.01, 0.025)
+    place = float(trunk.length) * at * uniform(0.75, 0.98), uniform(-0.02, 0.02), uniform(-0.01, 0.03)
+    around = {
+        "gravity": (0, 0, -9.81),
+        "obstacles": [rj.Plane((0, 0, floor), (0, 0, 1)), rj.Cylinder(begin, end, thick)],
+    }
+    span = uniform(0.75, 1.0)
+    left, right = ((span, side * uniform(0.1, 0.25), uniform(-0.02, 0.05)) for side in (1, -1))
+    scenes = {
+        "trunk": rj.Scene(
+            trunk, rj.Clamp((0, 0, 0), along), joint, clips=[rj.Clip(at, place, sliding=sliding)], **around
+        ),
+        "left": rj.Scene(branch, joint, rj.Clamp(left, along), **around),
+        "right": rj.Scene(branch, joint, rj.Pin(right), **around),
+    }
+    return rj.Harness(scenes)
+
+
+def branched(count: int, seed: int = 2, segments: int = 40) -> None:
+    for sliding in (False, True):
+        rng, found = np.random.default_rng(seed), []
+        for _ in range(count):
+            result = rj.solve(branched_harness(rng, sliding), segments=segments, strain_limit=None)
+            found.append((bool(result.converged), int(result.iterations)))
+        converged, iterations = np.array(found).T
+        print(
+            f"harnesses over a pipe on a floor, {'sliding ' if sliding else ''}clip, seed {seed}, {segments} elements: "
+            f"{converged.sum()} of {count} converged, iterations median {np.median(iterations):g}, 90 % "
+            f"{np.percentile(iterations, 90):g}",
+            flush=True,
         )
 
 
@@ -343,6 +427,8 @@ if __name__ == "__main__":
     cold(scenes, EI=(1.0, 2.0))
     cold(scenes, EI=(1.0, 2.0), rest_curvature=(1.0, 0.0))
     pressed(scenes)
+    over_pipes(scenes)
+    branched(scenes // 4)
     turned(scenes)
     turned(scenes, size=4.0)
     branches(scenes)

@@ -163,9 +163,8 @@ def test_a_cut_rod_slides_through_a_clip_over_a_pipe_on_a_floor():
     clip, end = rodjax.Clip(0.274, (0.246, 0.003, -0.007), sliding=True), Clamp((0.713, 0.02, 0), ALONG)
     around = {"obstacles": [floor, pipe]}
     first = Scene(plain(0.5), START, Joint("cut"), GRAVITY, clips=[clip], **around)
-    parts = rodjax.solve(
-        Harness({"a": first, "b": Scene(plain(0.5), Joint("cut"), end, GRAVITY, **around)}), segments=16
-    )
+    second = Scene(plain(0.5), Joint("cut"), end, GRAVITY, **around)
+    parts = rodjax.solve(Harness({"a": first, "b": second}), segments=16)
     assert parts.converged
     assert parts.stable
     assert int(parts.iterations) <= 24  # 16 seen

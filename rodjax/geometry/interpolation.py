@@ -7,15 +7,19 @@ from jaxtyping import Array, Float
 
 
 def resampled(points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
-    """Points at equal steps of the curve through equally spaced `points`: cubic, by central differences."""
-    m = len(points) - 1
-    if m == segments:
+    """Points at equal steps of the curve through equally spaced `points`, as of `through`."""
+    if len(points) - 1 == segments:
         return points
+    return through(points, jnp.linspace(0.0, 1.0, segments + 1, dtype=points.dtype))
+
+
+def through(points: Float[Array, "m 3"], u: Float[Array, "k"]) -> Float[Array, "k 3"]:
+    """The curve through equally spaced `points` at parts u of it: cubic, by central differences."""
     ends = (2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1])
     extended = jnp.concatenate([ends[0], points, ends[1]])
     slopes = (extended[2:] - extended[:-2]) / 2
-    knots = jnp.arange(m + 1, dtype=points.dtype)
-    return cubic(knots, points, slopes, jnp.linspace(0.0, m, segments + 1, dtype=points.dtype))
+    knots = jnp.arange(len(points), dtype=points.dtype)
+    return cubic(knots, points, slopes, knots[-1] * u)
 
 
 def cubic(

@@ -86,14 +86,14 @@ def taut(
 
 def drawn_in(
     points: Float[Array, "m 3"],
-    tangents: tuple[Float[Array, "3"] | None, Float[Array, "3"] | None],
+    tangents: Float[Array, "2 3"],
     obstacles: tuple[Obstacle, ...],
     radius: Float[Array, ""],
     length: Float[Array, ""],
 ) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
     """A string that begins as `points` and is led out of the obstacles and drawn in until it is taut or no longer than
     `length`; and whether that was needed. It stays on its side of what is thicker than its steps, and has the tangents
-    that supports hold.
+    that supports hold, where these are not zero.
 
     A rod that begins far too long, within an obstacle, or with kinks, its axial stiffness alone pulls, to any side.
     """
@@ -103,12 +103,10 @@ def drawn_in(
     radius = (1 + BESIDE) * radius
 
     def turned(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
-        first, last = tangents
-        if first is not None:
-            string = string.at[1].set(string[0] + length / DRAWN_PIECES * first)
-        if last is not None:
-            string = string.at[-2].set(string[-1] - length / DRAWN_PIECES * last)
-        return string
+        first, last = length / DRAWN_PIECES * tangents
+        is_first, is_last = jnp.any(tangents != 0, axis=1)
+        string = string.at[1].set(jnp.where(is_first, string[0] + first, string[1]))
+        return string.at[-2].set(jnp.where(is_last, string[-1] - last, string[-2]))
 
     def goes_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         _, size, before, count = state
@@ -131,14 +129,15 @@ def drawn_in(
 
 def led_out(
     points: Float[Array, "m 3"],
-    tangent: Float[Array, "3"] | None,
+    tangent: Float[Array, "3"],
     first_side: Float[Array, "3"],
     obstacles: tuple[Obstacle, ...],
     radius: Float[Array, ""],
     length: Float[Array, ""],
 ) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
     """A string held at its first place alone, led out of the obstacles from `points` and cut at `length`; and whether
-    that was needed. It goes straight on beyond what it lies on, and has the tangent that the support holds.
+    that was needed. It goes straight on beyond what it lies on, and has the tangent that the support holds, where that
+    is not zero.
     `first_side`: the direction in which it is led out where others are as near.
     """
     begin = resampled(points, DRAWN_PIECES)
@@ -147,8 +146,7 @@ def led_out(
     radius, step = (1 + BESIDE) * radius, length / DRAWN_PIECES
 
     def straight_on(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
-        if tangent is not None:
-            string = string.at[1].set(string[0] + step * tangent)
+        string = string.at[1].set(jnp.where(jnp.any(tangent != 0), string[0] + step * tangent, string[1]))
         return string.at[-1].set(2 * string[-2] - string[-3])
 
     # With a place beyond its end, which need not be outside.

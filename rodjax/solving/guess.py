@@ -11,12 +11,13 @@ from jaxtyping import Array, Float
 from rodjax.checks import leaf, number_array, shown
 from rodjax.discretization.first_shape import first_shape, hanging_arc
 from rodjax.discretization.joints import generic_field
-from rodjax.geometry.interpolation import resampled
-from rodjax.mechanics.taut import drawn_in, led_out
+from rodjax.geometry.interpolation import resampled, through
+from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, led_out
 from rodjax.model.scene import Scene, has_no_place, nondimensional, scene_axes
-from rodjax.model.supports import Directed, Held
+from rodjax.model.supports import Clip, Directed, Held
 from rodjax.model.triangle_mesh import Mesh
 from rodjax.programs.compilation import compiled
+from rodjax.programs.stacks import of_each
 from rodjax.units import Units
 
 # Cosine between neighbouring edges below which a guess counts as folded, and by how much of an edge it is unfolded.
@@ -30,8 +31,8 @@ UPWARDS = np.array([3e-6, 2e-6, 1e-6])
 class Guess(eqx.Module):
     """An initial shape; it need not match the supports, the length or the mesh.
 
-    Beside obstacles it tells on which side the rod passes them. Without clips it is led out of obstacles first, and
-    between two supports drawn in where it is longer than the rod. A rod with two free ends and no clip, which friction
+    Beside obstacles it tells on which side the rod passes them. It is led out of obstacles first, and between two
+    supports or clips drawn in where it is longer than the rod. A rod with two free ends and no clip, which friction
     may hold, lies where its guess is: from there it slips.
 
     `points`: (m, 3) [m], m >= 2, equally spaced in arclength; `total_twist` [rad]: of the total twists that the end
@@ -59,30 +60,66 @@ class Guess(eqx.Module):
 
 def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -> Float[Array, "n+1 3"]:
     """The nodes of a mesh on a shape, for a nondimensional scene; where obstacles are near, on one that is drawn in or
-    led out, if it is longer than the rod between two supports or lies within an obstacle.
+    led out, if it is longer than the rod between two supports or lies within an obstacle: each span between two places
+    that are held, and what is beyond the last one, by itself.
 
-    Not through clips, not where both ends are free, and not beside a `Mesh`, whose distance is dear.
+    Not where no place is held, and not beside a `Mesh`, whose distance is dear.
     """
     nodes = resampled(points, segments)
-    start, end, radius = scene.start, scene.end, scene.rod.radius
-    has_mesh = any(map(_is_mesh, jax.tree.leaves(scene.obstacles, is_leaf=_is_mesh)))
-    if not scene.obstacles or has_mesh or scene.clips or has_no_place(scene):
+    start, end, radius, obstacles = scene.start, scene.end, scene.rod.radius, scene.obstacles
+    has_mesh = any(map(_is_mesh, jax.tree.leaves(obstacles, is_leaf=_is_mesh)))
+    if not obstacles or has_mesh or has_no_place(scene):
         return nodes
     assert radius is not None, "a rod beside obstacles has a radius"
-    thickest, length = jnp.max(getattr(radius, "values", radius)), scene.rod.length
-    first, last = (support.tangent if isinstance(support, Directed) else None for support in (start, end))
-    if isinstance(start, Held) and isinstance(end, Held):
-        between = points.at[0].set(start.position).at[-1].set(end.position)
-        string, is_needed = drawn_in(between, (first, last), scene.obstacles, thickest, length)
-    else:
+    thickest = jnp.max(getattr(radius, "values", radius))
+    zero = jnp.zeros((), nodes.dtype)
+    held: list[tuple[Array, Held | Clip]] = [(clip.at, clip) for clip in scene.clips]
+    if isinstance(start, Held):
+        held.insert(0, (zero, start))
+    if isinstance(end, Held):
+        held.append((zero + 1, end))
+    at = jnp.stack([at for at, _ in held])
+    position = jnp.stack([support.position for _, support in held])
+    tangent = jnp.stack([_tangent(support) for _, support in held])
+    pieces = jnp.linspace(0.0, 1.0, DRAWN_PIECES + 1, dtype=nodes.dtype)
+    s = jnp.linspace(0.0, 1.0, segments + 1, dtype=nodes.dtype)
+
+    def on_string(string: Array, is_needed: Array, first: Array, last: Array) -> tuple[Array, Array]:
+        """The nodes that lie on it, and which do."""
+        u = (s - first) / (last - first)
+        return through(string, jnp.clip(u, 0.0, 1.0)), is_needed & (u >= 0) & (u <= 1)
+
+    def drawn(at: Array, positions: Array, tangents: Array) -> tuple[Array, Array]:
+        length = at[1] - at[0]
+        span = through(points, at[0] + length * pieces).at[0].set(positions[0]).at[-1].set(positions[1])
+        return on_string(*drawn_in(span, tangents, obstacles, thickest, length), at[0], at[1])
+
+    def led(first: Array, last: Array, position: Array, tangent: Array) -> tuple[Array, Array]:
+        """From a place that is held to a free end, forwards or backwards."""
         upwards = scene_axes(scene) @ UPWARDS - (0.0 if scene.gravity is None else scene.gravity)
-        is_held = isinstance(start, Held)
-        held, tangent = (start, first) if is_held else (end, None if last is None else -last)
-        assert isinstance(held, Held), "a scene holds at least one position"
-        from_held = (points if is_held else points[::-1]).at[0].set(held.position)
-        string, is_needed = led_out(from_held, tangent, upwards, scene.obstacles, thickest, length)
-        string = string if is_held else string[::-1]
-    return jnp.where(is_needed, resampled(string, segments), nodes)
+        beyond, length = through(points, first + (last - first) * pieces).at[0].set(position), last - first
+        string = led_out(beyond, jnp.sign(length) * tangent, upwards, obstacles, thickest, jnp.abs(length))
+        return on_string(*string, first, last)
+
+    found: list[tuple[Array, Array]] = []
+    if len(held) > 1:
+        spans = (jnp.stack([of_places[:-1], of_places[1:]], axis=1) for of_places in (at, position, tangent))
+        found += zip(*of_each(drawn)(*spans), strict=True)
+    if not isinstance(start, Held):
+        found.append(led(at[0], zero, position[0], tangent[0]))
+    if not isinstance(end, Held):
+        found.append(led(at[-1], zero + 1, position[-1], tangent[-1]))
+    for there, is_there in found:
+        nodes = jnp.where(is_there[:, None], there, nodes)
+    return nodes
+
+
+def _tangent(support: Held | Clip) -> Float[Array, "3"]:
+    """Zero where it holds none."""
+    if isinstance(support, Directed):
+        return support.tangent
+    tangent = support.direction if isinstance(support, Clip) else None
+    return jnp.zeros_like(support.position) if tangent is None else tangent
 
 
 def other_guess(scene: Scene, *, planar: bool) -> Guess | None:

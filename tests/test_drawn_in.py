@@ -1,13 +1,18 @@
 """First shapes beside obstacles: strings that are led out of them and drawn in to the length of the rod."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy_programs import by_numpy
+from scenes import box_mesh
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
 from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, taut
 from rodjax.model.scene import nondimensional
+from rodjax.solving import guess
 from rodjax.solving.guess import beside_obstacles
 
 RADIUS = 0.005
@@ -207,6 +212,24 @@ def test_starts_that_are_too_long_or_within_obstacles_come_to_rest(name):
     # At contact points to rounding; the supports are no nearer.
     distances = np.min([np.asarray(obstacle.distance(result.nodes)) for obstacle in obstacles], axis=0)
     assert np.min(distances) > RADIUS - 1e-9
+
+
+def test_a_shape_is_led_out_of_small_meshes(monkeypatch):
+    """As out of the same box; a mesh of many triangles leaves it as it is."""
+    low, high = np.array([0.2, -1.0, -0.4]), np.array([0.4, 1.0, 0.05])
+    box, mesh = rj.Box((low + high) / 2, high - low), box_mesh(low, high)
+    rod, ends = rj.Rod(1.0, 1.0, 0.8, 1e6, 1.0, radius=RADIUS), (rj.Pin((x, 0, 0)) for x in (0.0, 0.6))
+    scene, begin = rj.Scene(rod, *ends), jnp.asarray(parabola(0.6, -0.2))
+
+    def led(obstacle: rj.Obstacle) -> np.ndarray:
+        scaled, _ = nondimensional(dataclasses.replace(scene, obstacles=[obstacle]))
+        return np.asarray(by_numpy(lambda points: beside_obstacles(scaled, points, 64))(begin))
+
+    found = led(mesh)
+    np.testing.assert_allclose(found, led(box), atol=1e-9)
+    np.testing.assert_array_less(RADIUS, np.asarray(box.distance(found[1:-1])))
+    monkeypatch.setattr(guess, "MOST_TRIANGLES", len(mesh.triangles) - 1)
+    np.testing.assert_array_equal(led(mesh), begin)
 
 
 def cantilever(weight: float, obstacles: list[rj.Obstacle], turn=None, *, is_reversed: bool = False) -> rj.Scene:

@@ -26,6 +26,8 @@ ASIDE = 0.05
 ARC_PIECES = 64
 # A free end is led out against gravity; where that has no part across the rod, to this side of the scene's axes.
 UPWARDS = np.array([3e-6, 2e-6, 1e-6])
+# Beside a mesh of more triangles no shape is led out: a round takes 6 us for each triangle, and there may be thousands.
+MOST_TRIANGLES = 500
 
 
 class Guess(eqx.Module):
@@ -63,12 +65,12 @@ def beside_obstacles(scene: Scene, points: Float[Array, "m 3"], segments: int) -
     led out, if it is longer than the rod between two supports or lies within an obstacle: each span between two places
     that are held, and what is beyond the last one, by itself.
 
-    Not where no place is held, and not beside a `Mesh`, whose distance is dear.
+    Not where no place is held, and not beside a `Mesh` of many triangles, whose distance is dear.
     """
     nodes = resampled(points, segments)
     start, end, radius, obstacles = scene.start, scene.end, scene.rod.radius, scene.obstacles
-    has_mesh = any(map(_is_mesh, jax.tree.leaves(obstacles, is_leaf=_is_mesh)))
-    if not obstacles or has_mesh or has_no_place(scene):
+    is_dear = any(map(_is_dear, jax.tree.leaves(obstacles, is_leaf=_is_dear)))
+    if not obstacles or is_dear or has_no_place(scene):
         return nodes
     assert radius is not None, "a rod beside obstacles has a radius"
     thickest = jnp.max(getattr(radius, "values", radius))
@@ -140,8 +142,8 @@ def _other_points(scene: Scene) -> Float[Array, "m 3"]:
     return units.origin[None] + units.length * points
 
 
-def _is_mesh(obstacle: Any) -> bool:
-    return isinstance(obstacle, Mesh)
+def _is_dear(obstacle: Any) -> bool:
+    return isinstance(obstacle, Mesh) and len(obstacle.triangles) > MOST_TRIANGLES
 
 
 def _unfolded(nodes: Float[Array, "n+1 3"], axes: Float[Array, "3 3"]) -> Float[Array, "n+1 3"]:

@@ -188,8 +188,8 @@ def over_pipes_scene(rng: np.random.Generator, clip: str) -> rj.Scene | None:
         thick, half = uniform(0.005, 0.03), (end - begin) / 2
         # So that neither an end nor the clip lies within.
         x = begin + half + max(half - thick - 3 * radius, 0) * uniform(-1, 1)
-        axis = [(x, y, floor + thick * uniform(0.5, 1.3)) for y in (-0.5, 0.5)]
-        obstacles.append(rj.Cylinder(*axis, thick))
+        left, right = ((x, y, floor + thick * uniform(0.5, 1.3)) for y in (-0.5, 0.5))
+        obstacles.append(rj.Cylinder(left, right, thick))
     holds = {"tangent": tangent} if "tangent" in clip else {"frame": rj.frame(tangent)} if "frame" in clip else {}
     clips = [] if clip == "none" else [rj.Clip(at, place, **holds, sliding="sliding" in clip)]
     end = rj.Clamp((span, uniform(-0.1, 0.1), uniform(-0.01, 0.1)), along)

@@ -211,7 +211,7 @@ def _ways_out(
     """The directions in which distances lead places out of obstacles at last, and whether they do not."""
 
     def further(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        places, last, _ = state
+        places, last = state[:2]
         distances, normals = jax.vmap(jax.value_and_grad(distance))(places)
         out = jnp.where(distances < radius, radius - distances, 0.0)[:, None]
         return places + out * normals, jnp.where(out > 0, normals, last), out[:, 0] > NEARER * radius

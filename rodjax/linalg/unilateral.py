@@ -229,8 +229,8 @@ class Sought(eqx.Module):
     count: Int[Array, ""]
 
     def exerted(self, contacts: Contacts, opening: Array, contact_compliance: Array) -> Array:
-        """What contacts of this compliance would exert there; those of the last iterate, where they were not found:
-        gaps that are open to it would be forces out of all proportion.
+        """What contacts of this compliance would exert there. Where they were not found, their gaps would be forces out
+        of all proportion: then what those of the last iterate do.
         """
         found = contacts.pressures - (contacts.gaps + opening) / contact_compliance
         return jnp.where(self.is_done, found, self.trial)

@@ -137,8 +137,7 @@ def led_out(
 ) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
     """A string held at its first place alone, led out of the obstacles from `points` and cut at `length`; and whether
     that was needed. It goes straight on beyond what it lies on, and has the tangent that the support holds, where that
-    is not zero.
-    `first_side`: the direction in which it is led out where others are as near.
+    is not zero. `first_side`: the direction in which it is led out where others are as near.
     """
     begin = resampled(points, DRAWN_PIECES)
     nearest = jnp.min(jax.vmap(_distance(obstacles))(begin[1:]))

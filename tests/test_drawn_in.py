@@ -303,6 +303,27 @@ FREE_SCENES = {
 }
 
 
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_free_end_beyond_a_clip_is_led_out(is_reversed):
+    """Straight on from the clip it goes through the middle of a box; before the clip the shape stays."""
+    box, along = rj.Box((0.6, 0.0, 0.0), (0.2, 2.0, 0.2)), rj.frame((-1.0 if is_reversed else 1.0, 0.0, 0.0))
+    clamp, at = rj.Clamp((0.0, 0.0, 0.0), along), 0.7 if is_reversed else 0.3
+    ends = (rj.Free(), clamp) if is_reversed else (clamp, rj.Free())
+    rod, clip = rj.Rod(1.0, 1.0, 0.8, 1e6, 1.0, radius=RADIUS), rj.Clip(at, (0.3, 0.0, 0.0), tangent=along[:, 2])
+    scene, _ = nondimensional(rj.Scene(rod, *ends, (0, 0, -1.0), clips=[clip], obstacles=[box]))
+    straight = np.linspace(0, 1, 65)[:, None] * np.array([1.0, 0.0, 0.0])
+    begin = jnp.asarray(straight[::-1] if is_reversed else straight)
+    nodes = np.asarray(by_numpy(lambda points: beside_obstacles(scene, points, 64))(begin))
+    nodes = nodes[::-1] if is_reversed else nodes
+    np.testing.assert_array_equal(nodes[:20], straight[:20])  # the clip is between nodes 19 and 20
+    # Kept away by a tenth more than the radius; nodes between places of the string are within the edge's arc of that
+    # radius by the height of a chord.
+    away, chord = 1.1 * RADIUS, 0.7 / DRAWN_PIECES
+    np.testing.assert_array_less(away - chord**2 / (8 * away), np.asarray(box.distance(nodes)))
+    # On top, against gravity.
+    assert np.min(np.interp(0.6, nodes[:, 0], nodes[:, 2])) > 0.1 + RADIUS
+
+
 @pytest.mark.parametrize("name", FREE_SCENES)
 def test_a_cable_with_a_free_end_whose_first_shape_is_through_obstacles_comes_to_rest(name):
     weight, capsule, (center, size), sphere = FREE_SCENES[name]

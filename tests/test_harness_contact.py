@@ -157,17 +157,17 @@ def test_a_star_with_a_branch_on_a_floor_is_in_balance():
 @pytest.mark.slow
 def test_a_cut_rod_slides_through_a_clip_over_a_pipe_on_a_floor():
     """The stiffness is not symmetric, and contacts are sought along a line even so. In whole steps alone they came in
-    turn, were never found, and pushed out of all proportion: this one, and 1 of 100, ended nowhere.
+    turn, were never found, and pushed out of all proportion, until no better point was found.
     """
-    floor, pipe = Plane((0, 0, -0.082), (0, 0, 1)), rodjax.Cylinder((0.65, 0, -0.082), (0, 1, 0), 0.029)
-    clip, end = rodjax.Clip(0.274, (0.246, 0.003, -0.007), sliding=True), Clamp((0.713, 0.02, 0), ALONG)
+    floor, pipe = Plane((0, 0, -0.056), (0, 0, 1)), rodjax.Cylinder((0.645, 0, -0.056), (0, 1, 0), 0.025)
+    clip, end = rodjax.Clip(0.171, (0.154, -0.003, 0.025), sliding=True), Clamp((0.858, 0.02, 0), ALONG)
     around = {"obstacles": [floor, pipe]}
     first = Scene(plain(0.5), START, Joint("cut"), GRAVITY, clips=[clip], **around)
     second = Scene(plain(0.5), Joint("cut"), end, GRAVITY, **around)
     parts = rodjax.solve(Harness({"a": first, "b": second}), segments=16)
     assert parts.converged
     assert parts.stable
-    assert int(parts.iterations) <= 24  # 16 seen
+    assert int(parts.iterations) <= 27  # 18 seen
     # To the tolerance, in units of forces of 2 N at most.
     carried = sum(jnp.sum(rod.contact_forces, axis=0) for rod in parts.values()) + parts.joints["cut"].contact_force
     carried += parts["a"].clip_forces[0] + parts["b"].end_force - parts["a"].start_force

@@ -416,9 +416,7 @@ def test_cut_rods(capsys):
 def test_float32(monkeypatch, capsys):
     monkeypatch.setenv("XLA_FLAGS", "")
     float32 = script("float32")
-    # As users have it at first, NumPy code: what tests compile without optimisation has roundings that no user sees,
-    # four times as large in one of these rows.
-    monkeypatch.setattr(float32, "set_up", lambda: None)
+    monkeypatch.setattr(float32, "set_up", lambda: None)  # NumPy code, as users have it at first
     rows = float32.main(["--slenderness", "10", "1e6", "--segments", "8"])
     assert [row.status for row in rows] == 4 * ["ROUNDING_FLOOR"]
     assert all(row.shape < 1e-5 and row.force < 1e-5 for row in rows)

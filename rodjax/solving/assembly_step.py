@@ -22,7 +22,7 @@ from rodjax.solving.assembly_balance import Balance, Here
 from rodjax.solving.condensation import BodyMotions, EliminatedRods
 from rodjax.solving.coupling import Coupling, EndContacts, RodInBodies, end_contact_energy, end_contact_rate
 from rodjax.solving.harness_contact import ContactStep
-from rodjax.solving.newton import CLOSURE_WEIGHT, ENERGY_ROUNDING, MAX_HALVINGS, SUFFICIENT_DECREASE, Newton
+from rodjax.solving.newton import CLOSURE_WEIGHT, MAX_HALVINGS, SUFFICIENT_DECREASE, Newton, energy_rounding
 from rodjax.solving.rod_contact import BetweenStep, Contacts, Curves, contact_energy, passes
 
 
@@ -196,7 +196,7 @@ def searched(
         next_part = jnp.where(tries == 1, steps.part, trial.part / 2)
         merit, points = merit_at(jnp.where(tries == 0, 0.0, next_part))
         bound = trial.first + SUFFICIENT_DECREASE * next_part * jnp.minimum(slope, 0.0)
-        bound += ENERGY_ROUNDING * (1 + jnp.abs(trial.first))
+        bound += energy_rounding(trial.first)
         is_better = (tries > 0) & (is_unjudged | (merit <= bound))
         for group, here, point in zip(assembly.groups, all_here, points, strict=True):
             if here.at_ends is not None:

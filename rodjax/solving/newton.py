@@ -57,7 +57,7 @@ MAX_FACTORS = 30
 CLOSURE_WEIGHT = 100.0
 # A step is accepted when this fraction of the fall that its slope promises comes true, up to the rounding of energies.
 SUFFICIENT_DECREASE = 1e-4
-ENERGY_ROUNDING = 1e-9
+ENERGY_ROUNDING, UNITS_OF_ROUNDING = 1e-9, 32  # the larger one: the latter in single precision
 # Under loads without a potential a whole step is accepted as well when it makes the square of what is out of balance
 # less by this part.
 FALL_OF_SQUARE = 0.2
@@ -157,7 +157,7 @@ def turn(form: Form, state: NewtonState, solver: Newton, find: Find) -> NewtonSt
         objective -= state.loads.work(rotation, others)
     merit = objective + state.weight / 2 * jnp.sum(constraint_residual**2)
     promised = SUFFICIENT_DECREASE * state.step * jnp.minimum(state.slope, 0.0)
-    bound = state.merit + promised + ENERGY_ROUNDING * (1 + jnp.abs(state.merit))
+    bound = state.merit + promised + energy_rounding(state.merit)
     is_better = merit <= bound
     if state.squares is not None:
         falls = _squares(form, linearization) <= (1 - FALL_OF_SQUARE * state.step) * state.squares
@@ -178,6 +178,11 @@ def least_shift(last: Float[Array, "*k"], first: ArrayLike = FIRST_SHIFT) -> Flo
     that needed more, or `first` where none did.
     """
     return jnp.where(last > NEUTRAL, jnp.clip(last / SHIFT_GROWTH, LEAST_SHIFT, FIRST_SHIFT), first)
+
+
+def energy_rounding(merit: Float[Array, ""]) -> Float[Array, ""]:
+    """What energies that are equal may differ by [EI/L]."""
+    return max(ENERGY_ROUNDING, UNITS_OF_ROUNDING * float(jnp.finfo(merit.dtype).eps)) * (1 + jnp.abs(merit))
 
 
 def _descends(form: Form, find: Find) -> bool:

@@ -1,5 +1,6 @@
 """Parts of pictures of rods: tubes as shaded faces, clips and obstacles around them, arrows, views and scales."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -223,20 +224,27 @@ class Labels:
         self._written: list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]] = []
 
     def write(
-        self, text: str, color: str, choices: Sequence[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]
+        self,
+        text: str,
+        color: str,
+        choices: Sequence[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]],
+        fontsize: float = 10,
     ) -> Float[np.ndarray, "3"]:
-        """At the first of the places that is free, on the side of it that a direction tells; else above or below the
-        first. Returns the place.
+        """At the first of the places that is free, on the side of it that a direction tells; else, with a line to the
+        first, as near to that as there is room. Returns the place.
         """
-        size = self._point * np.array([LABEL_SIZE[0] * len(text), LABEL_SIZE[1]])
+        size = self._point * fontsize / 10 * np.array([LABEL_SIZE[0] * len(text), LABEL_SIZE[1]])
         first, along = choices[0]
-        steps = [sign * k * size[1] * self.up for k in range(1, 9) for sign in (1, -1)]
-        places = [*choices, *((first + step, along) for step in steps)]
+        steps = sorted(itertools.product(range(-8, 9), range(-8, 9)), key=lambda step: np.hypot(*step))
+        aside = [first + size[1] * (x * self.right + y * self.up) for x, y in steps]
+        places = [*choices, *((place, along) for place in aside)]
         at, towards = next((one for one in places if self._is_free(*self._box(one[0], one[1], size))), choices[0])
         self._written.append(self._box(at, towards, size))
+        if not any(at is place for place, _ in choices):
+            self.axes.plot(*np.stack([first, at], axis=1), color=color, linewidth=0.7, alpha=0.6)
         x, y, z = at
         ha, va = "right" if towards @ self.right < 0 else "left", "top" if towards @ self.up < 0 else "bottom"
-        self.axes.text(x, y, z, text, color=color, ha=ha, va=va, path_effects=halo())
+        self.axes.text(x, y, z, text, color=color, fontsize=fontsize, ha=ha, va=va, path_effects=halo())
         return at
 
     def _box(self, at: Any, towards: Any, size: Any) -> tuple[Any, Any]:
@@ -270,7 +278,7 @@ def draw_arrows(
         along, reach = load / size, length * size / max(sizes)
         for head in heads:
             (fx, fy, fz), (x, y, z) = foot, head * reach * along
-            ratio = 0.2 * length / (head * reach)
+            ratio = min(0.2 * length / (head * reach), 1.0)
             axes.quiver(fx, fy, fz, x, y, z, color=color, arrow_length_ratio=ratio, linewidth=1.8)
         # Beyond the tip, or where something is written there already before the foot.
         choices = [(foot + (reach + 0.05 * length) * along, along), (foot - 0.1 * length * along, -along)]

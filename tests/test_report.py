@@ -50,6 +50,16 @@ def equilibrium():
 
 
 @pytest.fixture(scope="module")
+def lying():
+    """On a floor and over a pipe, which push it."""
+    rod = rj.Rod.circular(0.62, RADIUS, 2e6, poisson_ratio=0.45, density=1300.0)
+    start = rj.Clamp((0, 0, 0.05), rj.frame((1, 0, 0)))
+    end = rj.Clamp((0.55, 0.05, 0.04), rj.frame((1, 0, 0)))
+    obstacles = [rj.Plane((0, 0, 0), (0, 0, 1)), rj.Capsule((0.4, -0.2, 0.01), (0.4, 0.2, 0.01), 0.01)]
+    return rj.solve(rj.Scene(rod, start, end, GRAVITY, obstacles=obstacles), segments=24)
+
+
+@pytest.fixture(scope="module")
 def report(equilibrium):
     return rj.report(
         equilibrium, limits=LIMITS, obstacles=OBSTACLES, names=NAMES, gradients=GRADIENTS, title="Line <1>"
@@ -216,6 +226,51 @@ def test_several_cables_are_told_one_by_one(report, equilibrium):
     assert "--- a: kept" in str(told)
     assert "--- b: NOT kept" in str(told)
     assert rj.report([equilibrium, equilibrium], limits=[loose, None]).kept is True
+
+
+def test_what_pushes_the_cable_is_told_and_drawn(lying, tmp_path):
+    floor, _ = lying.scene.obstacles
+    report = rj.report(lying, obstacles=[floor], names=["floor"])
+    (cable,) = report.cables
+    assert {push.name for push in cable.pushes} == {"obstacles[0] (Plane)", "obstacles[1] (Capsule)"}
+    rod = lying.scene.rod
+    weight = float(rod.mass_per_length * rod.length) * np.array(GRAVITY)
+    acting = [one.force for one in (*cable.reactions, *cable.pushes)]
+    # In equilibrium to 1e-8 EI/L^2, by the tolerance of the search.
+    assert np.max(np.abs(np.sum(acting, axis=0) + weight)) < 1e-8 * float(rod.EI / rod.length**2)
+    for push in cable.pushes:
+        within = (lying.s >= push.first) & (lying.s <= push.last)
+        low, high = np.min(lying.nodes[within], axis=0), np.max(lying.nodes[within], axis=0)
+        # A mean of coordinates may differ from them by rounding.
+        assert np.all((low - 1e-12 <= push.position) & (push.position <= high + 1e-12))
+
+    report.save(tmp_path)
+    told = json.loads((tmp_path / "report.json").read_text())["cables"][0]["contacts"]
+    np.testing.assert_allclose([one["force"] for one in told], [push.force for push in cable.pushes], rtol=1e-12)
+    rows = list(csv.reader(io.StringIO((tmp_path / "report.csv").read_text())))
+    assert sum(row[1] == "contact" for row in rows) == 4 * len(cable.pushes)
+    heading = "what obstacles apply"
+    assert heading in (tmp_path / "report.txt").read_text()
+    assert heading in (tmp_path / "report.html").read_text()
+    # The floor by the name that was given, and once.
+    (legend,) = report.figure().legends
+    assert [text.get_text() for text in legend.get_texts()] == ["floor", "obstacles[1] (Capsule)"]
+    written = {text.get_text() for text in report.figure().axes[0].texts}
+    assert {f"{np.linalg.norm(push.force):.3g} N" for push in cable.pushes} <= written
+
+
+def test_a_cable_within_an_obstacle_is_told(equilibrium, lying):
+    wall = rj.Plane((0.2, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    verdict = rj.report(equilibrium, obstacles=[wall]).verdict
+    depth = float(np.max(equilibrium.nodes[:, 0])) - 0.2 + RADIUS
+    said = re.fullmatch(r"no limits given; but it lies (.*) mm within an obstacle, .*", verdict)
+    assert said is not None
+    # Nodes are the places looked at but for those between them, and the number has four digits.
+    assert float(said[1]) == pytest.approx(1e3 * depth, rel=2e-3)
+    asked = rj.report(equilibrium, obstacles=[wall], limits=rj.Limits(clearance=0.0)).verdict
+    assert "but it lies" not in asked
+    # Between its nodes a cable is within what it lies on by less than a hundredth of its radius.
+    assert "but it lies" not in rj.report(lying, obstacles=lying.scene.obstacles).verdict
 
 
 def test_limits_of_clips_are_of_cables_that_have_clips(equilibrium):
@@ -396,13 +451,13 @@ def test_the_picture_names_what_it_shows(report):
     assert [text.get_text() for text in legend.get_texts()] == NAMES
     written = [text.get_text() for text in axes.texts]
     sizes = [f"{np.linalg.norm(reaction.force):.3g} N" for reaction in report.cables[0].reactions]
-    assert written[:4] == sizes
+    assert written[:2] == ["clip 0", "clip 1"]
+    assert written[2:6] == sizes
     # None of them on another.
     right, up, _ = seen_axes(AZIMUTH)
-    positions = [np.array([right, up]) @ text.get_position_3d() for text in axes.texts[:4]]
+    positions = [np.array([right, up]) @ text.get_position_3d() for text in axes.texts[:6]]
     apart = [np.abs(a - b) for k, a in enumerate(positions) for b in positions[:k]]
     assert all(np.max(way) > 0.01 for way in apart)
-    assert written[4:6] == ["clip 0", "clip 1"]
 
 
 def test_places_that_bend_too_much_are_red(report, equilibrium):

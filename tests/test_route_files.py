@@ -107,6 +107,33 @@ def test_a_scene_may_be_in_the_file_and_cables_several(files):
     assert read_route_file("two.toml", with_scene=False).cables == {}
 
 
+def test_obstacles_of_a_file_that_is_a_scene_are_those_of_the_scene(files):
+    floor = """
+
+[[obstacles]]
+kind = "plane"
+point = "[0, 0, -1] m"
+normal = [0, 0, 1]
+"""
+    scene, harness = Path("scene.toml").read_text(), (ROUTES / "harness.toml").read_text()
+    harness = harness[harness.index("[cables") : harness.index("[limits]")]
+    Path("scene.toml").write_text(scene + floor)
+    read = read_route_file("scene.toml")
+    assert read.obstacles == read.names == ()
+    assert read.cables["cable"].scenes[0].obstacles == rj.read_scene("scene.toml").obstacles
+    Path("harness.toml").write_text(harness + floor)
+    read = read_route_file("harness.toml")
+    assert read.obstacles == ()
+    assert read.harness is not None
+    assert all(len(one.obstacles) == 1 for one in read.harness.harness.scenes)
+    # What only a route has makes it one; so does a name.
+    for more in ("[limits]\nstrain = 0.1\n", ""):
+        Path("route.toml").write_text(scene + floor + ('name = "floor"\n' if not more else "") + more)
+        read = read_route_file("route.toml")
+        assert len(read.obstacles) == 1
+        assert read.cables["cable"].scenes[0].obstacles == ()
+
+
 def test_a_mesh_and_a_union(files):
     trimesh.creation.box((100, 50, 20)).export("box.stl")
     Path("a.toml").write_text(

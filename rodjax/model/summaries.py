@@ -139,3 +139,8 @@ def scene_text(scene: "Scene") -> str:
         else:
             lines.append(f"{name}: {value_text(value, UNITS.get(name, ''))}")
     return "\n  ".join(lines)
+
+
+def obstacle_name(obstacle: Any, number: int) -> str:
+    """By its place among those of a scene: "obstacles[0] (Plane)"."""
+    return f"obstacles[{number}] ({type(obstacle).__name__})"

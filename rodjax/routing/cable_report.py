@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rodjax.analysis.curvature import curvature_along, most_curved
+from rodjax.analysis.pushes import Push, pushes
 from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.model.along import Along
 from rodjax.model.obstacles import Obstacle
@@ -22,6 +23,9 @@ from rodjax.solving.result_errors import estimated_errors
 
 # Limits that are put where none are asked for, so that what they limit is measured too.
 WITHOUT = {"bend_radius": 1.0, "clearance": 0.0, "twist": 1.0, "strain": 1.0}
+CLEARANCE = "smallest clearance"
+# Part of the radius by which a cable that lies on an obstacle may be within it, between its nodes.
+WITHIN = 0.01
 # Radians by which a rod turns along its whole length, at most, where it is straight but for rounding.
 STRAIGHT = 1e-8
 # Of which limit a margin is, by how its name begins.
@@ -83,7 +87,7 @@ class Fact(NamedTuple):
 
 
 class Cable(NamedTuple):
-    """One cable of a report: what it keeps to, what was found of it, and what its supports apply to it."""
+    """One cable of a report: what it keeps to, what was found of it, and what supports and obstacles apply to it."""
 
     name: str
     equilibrium: Equilibrium
@@ -91,12 +95,23 @@ class Cable(NamedTuple):
     margins: Margins | None
     facts: list[Fact]
     reactions: list[Reaction]
+    pushes: list[Push]
     gradients: Gradients | None
     outcome: str
 
     @property
     def converged(self) -> bool:
         return bool(self.equilibrium.converged)
+
+    @property
+    def within(self) -> float:
+        """How deep it lies within an obstacle of which no clearance is asked [m]; 0 of what lies on one."""
+        if self.limits is not None and self.limits.clearance is not None:
+            return 0.0
+        radius = self.equilibrium.scene.rod.radius
+        depth = max((-(fact.value or 0.0) for fact in self.facts if fact.name == CLEARANCE), default=0.0)
+        thickest = np.max(np.asarray(radius.samples if isinstance(radius, Along) else radius)) if depth > 0 else 0.0
+        return depth if depth > WITHIN * thickest else 0.0
 
     @property
     def kept(self) -> bool | None:
@@ -127,6 +142,7 @@ def cable(
         None if limits is None else _asked(found, limits),
         _facts(equilibrium, found, multiple),
         reactions(equilibrium),
+        pushes(equilibrium),
         gradients,
         describe(equilibrium),
     )
@@ -186,7 +202,7 @@ def _facts(equilibrium: Equilibrium, found: Margins, multiple: float) -> list[Fa
         nearest = min(clearances, key=lambda name: clearances[name][0])
         facts.append(
             Fact(
-                "smallest clearance",
+                CLEARANCE,
                 *_finite(clearances[nearest][0], "m", clearances[nearest][1]),
                 note=nearest.removeprefix("clearance "),
             )

@@ -36,7 +36,9 @@ A complete example; quantities are as in scene files, a number and any unit of t
     energy = "1 J"
     stability = "0.1 N"            # least stiffness of the softest motion
 
-Obstacles are as in `rodjax.io.obstacle_tables`, with a name; here they push nothing: those of a scene file do.
+Obstacles are as in `rodjax.io.obstacle_tables`, with a name. Here they push nothing; those of a scene file do, and a
+file that has nothing but the tables of a scene or a harness, its obstacles without names, is one: `rodjax report` has
+it as `rodjax solve` does.
 
 What `rodjax route` varies, and a report of the scene as it is leaves aside:
 
@@ -146,12 +148,14 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, fo
         content = toml_tables(read_text(path))
         required, optional = SCENE_TABLES
         check_keys(content, "", (), (*required, *optional, "scene", "cables", "joints", *OF_A_ROUTE))
-        names, obstacles = _obstacles(content.get("obstacles", []), path.parent)
+        is_scene = _is_scene(content)
+        names, obstacles = ((), ()) if is_scene else _obstacles(content.get("obstacles", []), path.parent)
         limits = _limits(content["limits"], obstacles) if "limits" in content else None
         objective = _objective(content["objective"]) if "objective" in content else None
         title, starts = _title(content), _starts(content)
-    harness = _harness(content, path) if with_scene else None
-    cables = _cables(content, path) if with_scene and harness is None else {}
+    of_scene = {key: table for key, table in content.items() if is_scene or key not in OF_A_ROUTE}
+    harness = _harness(of_scene, path) if with_scene else None
+    cables = _cables(of_scene, path) if with_scene and harness is None else {}
     with in_file(path):
         variables = _variables(content.get("variables", []))
         file = RouteFile(cables, harness, title, obstacles, names, limits, variables, objective, starts)
@@ -160,6 +164,17 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, fo
         if variables and (harness is not None or len(cables) == 1):
             _check_variables(variables, file.of_route)
     return file
+
+
+def _is_scene(content: dict[str, Any]) -> bool:
+    """Whether it says nothing that only a route has, so that its obstacles are those that push."""
+    tables = content.get("obstacles", [])
+    has_names = isinstance(tables, list) and any(isinstance(table, dict) and "name" in table for table in tables)
+    of_route = ("scene", *(key for key in OF_A_ROUTE if key != "obstacles"))
+    is_of_files = isinstance(content.get("cables"), dict) and not any(
+        isinstance(cable, dict) for cable in content["cables"].values()
+    )
+    return not (has_names or is_of_files or any(key in content for key in of_route))
 
 
 def _title(content: dict[str, Any]) -> str | None:
@@ -187,8 +202,7 @@ def _harness(content: dict[str, Any], path: Path) -> HarnessFile | None:
         with in_file(path):
             if scene is not None:
                 raise SceneFileError("scene is not allowed together with the tables of a harness")
-            tables = [key for key in HARNESS_TABLES if key in content and key not in OF_A_ROUTE]
-            return harness_file({key: content[key] for key in tables})
+            return harness_file({key: content[key] for key in HARNESS_TABLES if key in content})
     if "joints" in content:
         with in_file(path):
             raise SceneFileError("joints is not allowed without the tables [cables.NAME] of a harness")
@@ -199,7 +213,7 @@ def _harness(content: dict[str, Any], path: Path) -> HarnessFile | None:
 
 
 def _cables(content: dict[str, Any], path: Path) -> dict[str, SceneFile]:
-    tables = {key: content[key] for keys in SCENE_TABLES for key in keys if key in content and key not in OF_A_ROUTE}
+    tables = {key: content[key] for keys in SCENE_TABLES for key in keys if key in content}
     with in_file(path):
         given = [key for key in ("scene", "cables") if key in content] + [", ".join(tables)] * bool(tables)
         if len(given) != 1:

@@ -1,7 +1,7 @@
 """Pictures of routes, as matplotlib figures without pyplot: save them with `figure.savefig("route.png")`."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
-from mpl_toolkits.mplot3d import Axes3D
 
 from rodjax.checks import line
 from rodjax.drawing import (
@@ -21,7 +20,6 @@ from rodjax.drawing import (
     Labels,
     draw_arrows,
     draw_faces,
-    halo,
     seen_axes,
     set_view,
     tube_faces,
@@ -37,7 +35,7 @@ from rodjax.routing.view_data import (
     thickness_note,
 )
 
-FORCE_COLOR = "tab:red"
+FORCE_COLOR, NAME_COLOR = "tab:red", "black"
 # Of flat scenes, and how much less it is of those as high as they are wide.
 ZOOM, LESS = 1.2, 0.35
 # How far beside a place its name stands, by the extent of the cables.
@@ -46,13 +44,11 @@ ASIDE = 0.04
 WIDTH = 100
 
 
-def plot_route(
-    cable_views: Sequence[CableView], obstacles: Sequence[Obstacle], names: Sequence[str], title: str
-) -> Figure:
+def plot_route(cable_views: Sequence[CableView], obstacles: Mapping[str, Obstacle], title: str) -> Figure:
     """Cables as tubes colored by the margin of their bend radius, between translucent obstacles.
 
-    Clips are collars, forces that supports apply to the cables arrows with their sizes. Each obstacle has its name in
-    the legend.
+    Clips are collars, forces that supports and obstacles apply to the cables arrows with their sizes. Each obstacle has
+    its name in the legend.
     """
     figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.add_subplot(projection="3d")
@@ -69,30 +65,25 @@ def plot_route(
             faces.append(collar)
             shades.append(np.tile(to_rgba(CLIP_COLOR), (len(collar), 1)))
     legend = []
-    for k, (surface, name) in enumerate(zip(seen_surfaces(cable_views, obstacles), names, strict=True)):
+    for k, (surface, name) in enumerate(zip(seen_surfaces(cable_views, [*obstacles.values()]), obstacles, strict=True)):
         color = to_rgba(PALETTE[k % len(PALETTE)], OPACITY)
         faces.append(surface)
         shades.append(np.tile(color, (len(surface), 1)))
         label = line(name) if len(surface) else f"{line(name)} (not in the picture)"
         legend.append(Patch(facecolor=to_rgba(color, 0.8), label=label))
     # All faces together: each artist by itself would be sorted in depth as a whole.
-    view = azimuth(cable_views, obstacles)
+    view = azimuth(cable_views, [*obstacles.values()])
     draw_faces(axes, np.concatenate(faces), np.concatenate(shades), view)
     size = extent([cable_view.equilibrium for cable_view in cable_views])
-    acting = [reaction for cable_view in cable_views for reaction in cable_view.forces]
-    tips = draw_arrows(
-        axes,
-        np.reshape([reaction.position for reaction in acting], (-1, 3)),
-        np.reshape([reaction.force for reaction in acting], (-1, 3)),
-        "N",
-        0.0,
-        ARROW_LENGTH * size,
-        FORCE_COLOR,
-        Labels(axes, np.concatenate([cable_view.centerline for cable_view in cable_views]), ARROW_LENGTH * size, view),
-    )
+    acting = [force for cable_view in cable_views for force in cable_view.forces]
+    centerlines = np.concatenate([cable_view.centerline for cable_view in cable_views])
+    labels = Labels(axes, centerlines, ARROW_LENGTH * size, view)
     right, up, _ = seen_axes(view)
     for cable_view in cable_views:
-        _name(axes, cable_view, size * (right - up), len(cable_views) > 1)
+        _name(labels, cable_view, size * (right - up), len(cable_views) > 1)
+    feet = np.reshape([one.position for one in acting], (-1, 3))
+    forces = np.reshape([one.force for one in acting], (-1, 3))
+    tips = draw_arrows(axes, feet, forces, "N", 0.0, ARROW_LENGTH * size, FORCE_COLOR, labels)
     points = np.concatenate([np.concatenate(faces).reshape(-1, 3), tips])
     width, depth, height = np.ptp(points, axis=0)
     set_view(axes, points, zoom=ZOOM - LESS * min(height / max(width, depth), 1.0), azimuth=view)
@@ -116,11 +107,10 @@ def plot_route(
     return figure
 
 
-def _name(axes: Axes3D, cable_view: CableView, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
+def _name(labels: Labels, cable_view: CableView, aside: Float[np.ndarray, "3"], has_name: bool) -> None:
     """Words beside the clips, and the name of one cable of several beside its middle."""
-    labels = [(reaction.name, reaction.position) for reaction in cable_view.reactions[1:-1]]
+    named = [(reaction.name, reaction.position) for reaction in cable_view.reactions[1:-1]]
     if has_name:
-        labels.append((line(cable_view.name), cable_view.centerline[len(cable_view.centerline) // 2]))
-    for name, position in labels:
-        x, y, z = position + ASIDE * aside
-        axes.text(x, y, z, name, fontsize=8, ha="left", va="top", path_effects=halo())
+        named.append((line(cable_view.name), cable_view.centerline[len(cable_view.centerline) // 2]))
+    for name, position in named:
+        labels.write(name, NAME_COLOR, [(position + ASIDE * aside, aside)], fontsize=8)

@@ -71,6 +71,17 @@ def _cable(report: "Report", cable: Cable) -> dict[str, Any]:
             }
             for reaction in cable.reactions
         ],
+        "contacts": [
+            {
+                "name": push.name,
+                "first": push.first,
+                "last": push.last,
+                "position": plain(push.position),
+                "force": plain(push.force),
+                "force_magnitude": plain(np.linalg.norm(push.force)),
+            }
+            for push in cable.pushes
+        ],
         "inputs": dict(inputs(report, cable)),
         "gradients": None if cable.gradients is None else _gradients(cable.gradients),
     }
@@ -127,6 +138,13 @@ def csv_text(report: "Report") -> str:
                     (kind, f"{reaction.name} {axis}", plain(value), unit, None, None, None, reaction.s, reaction.kind)
                     for axis, value in values.items()
                 ]
+        for push in cable.pushes:
+            middle, values = (push.first + push.last) / 2, dict(zip("xyz", push.force, strict=True))
+            values |= {"magnitude": np.linalg.norm(push.force)}
+            rows += [
+                ("contact", f"{push.name} {axis}", plain(value), "N", None, None, None, middle, "")
+                for axis, value in values.items()
+            ]
         if cable.gradients is not None:
             for variable, of in _gradients(cable.gradients).items():
                 unit = f"1/({of['unit']})" if of["unit"] else ""

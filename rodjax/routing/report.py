@@ -10,12 +10,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import numpy as np
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, instance, is_known, sequence, shown
 from rodjax.model.harness import Harness
 from rodjax.model.obstacles import Obstacle, checked_obstacles
+from rodjax.model.summaries import obstacle_name
 from rodjax.notes import note
 from rodjax.programs.answers import one_answer
 from rodjax.routing import records, report_text
@@ -40,7 +42,7 @@ class Report:
 
     - `title`, and `verdict`: a sentence
     - `kept`: whether all of them are equilibria that keep to all limits; `None` where there are no limits
-    - `cables`: for each its name, equilibrium, margins, facts, what supports apply to it, and gradients
+    - `cables`: for each its name, equilibrium, margins, facts, what supports and obstacles apply to it, and gradients
     - `obstacles`, and their `names`
     - `source`: what it was made of, such as the name of a file; `date`: the day on which it was made
     - `design`: what the route of a harness found; that of one cable is told with its gradients
@@ -63,6 +65,17 @@ class Report:
         each = [cable.kept for cable in self.cables]
         return False if False in each else (True if True in each else None)
 
+    @cached_property
+    def drawn(self) -> dict[str, Obstacle]:
+        """What pictures show, by name: the obstacles, and those that push the cables."""
+        found = dict(zip(self.names, self.obstacles, strict=True))
+        for one in self.cables:
+            for k, obstacle in enumerate(one.equilibrium.scene.obstacles):
+                if not any(eqx.tree_equal(obstacle, other) for other in found.values()):
+                    name = obstacle_name(obstacle, k)
+                    found[f"{one.name}: {name}" if name in found else name] = obstacle
+        return found
+
     @property
     def margins(self) -> dict[str, float]:
         """The relative margin of each limit by its name; of several cables "cable: name"."""
@@ -84,7 +97,7 @@ class Report:
         """The cables, colored by the margin of their bend radius, between the obstacles."""
         from rodjax.routing.pictures import plot_route
 
-        return plot_route(self._sights, self.obstacles, self.names, self._heading)
+        return plot_route(self._sights, self.drawn, self._heading)
 
     def along(self) -> "Figure":
         """Curvature and bend radius, twist, tension, moment and clearances over the arclength, with their limits."""
@@ -155,7 +168,8 @@ def report(
       obstacles, their names and gradients are taken where none are given, and the bounds of its variables.
     - `limits`: `Limits` of all cables, those of clips of the cables that have any; or a list of `Limits` or `None`, one
         for each cable; `None`: none.
-    - `obstacles`: a list of `Obstacle`; without a limit of clearance they are drawn, and the nearest is told.
+    - `obstacles`: a list of `Obstacle`, which push nothing; without a limit of clearance they are drawn, and the
+        nearest is told. Those of the scenes are drawn too, and what they apply to the cables is told.
     - `names`: of the obstacles; `None`: "obstacle 0" and so on.
     - `gradients`: of the margins by design variables: a `Route` or `Gradients`, or a list, one for each cable.
     - `title`: `None`: "Route".

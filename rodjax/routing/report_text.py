@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rodjax.analysis.pushes import Push
 from rodjax.analysis.reactions import Reaction
 from rodjax.checks import line
 from rodjax.model.summaries import part_text, scene_text
@@ -58,6 +59,13 @@ def verdict(report: "Report") -> str:
     names = f" in {', '.join(cable.name for cable in taut)}" if len(report.cables) > 1 else ""
     strain = max((float(np.max(np.abs(cable.equilibrium.axial_strain))) for cable in taut), default=0.0)
     remark += f"; but the axial strain{names} reaches {100 * strain:.3g} %, which has no limit here" if taut else ""
+    within = [cable for cable in report.cables if cable.within > 0]
+    if within:
+        deepest = max(within, key=lambda cable: cable.within)
+        name = f"{deepest.name} lies" if len(report.cables) > 1 else "it lies"
+        remark += (
+            f"; but {name} {amount(deepest.within, 'm')} within an obstacle, which pushes nothing and has no limit here"
+        )
     return _kept_or_not(report) + remark
 
 
@@ -111,7 +119,14 @@ def text(report: "Report") -> str:
     for cable in report.cables:
         heading = [f"--- {cable.name}: {_kept(cable)}"] if len(report.cables) > 1 else []
         parts.append("\n".join([*heading, cable.outcome]))
-        told = (_limits(cable), _facts(cable), _reactions(cable), gradients(cable), _inputs(report, cable))
+        told = (
+            _limits(cable),
+            _facts(cable),
+            _reactions(cable),
+            _pushes(cable),
+            gradients(cable),
+            _inputs(report, cable),
+        )
         parts += [part for part in told if part]
     return "\n\n".join(["\n".join(parts[:2]), *parts[2:]])
 
@@ -189,6 +204,23 @@ def _reactions(cable: Cable) -> str:
     ]
     told = "Moments are about the centerline; left is level, up the normal at right angles to it and to the tangent."
     return "\n".join([table(rows, "<>>>>>>>>"), told, table(axes, "<>>>>>>>>>")])
+
+
+def _pushes(cable: Cable) -> str:
+    if not cable.pushes:
+        return ""
+    rows: list[tuple[str, ...]] = [
+        ("what obstacles apply to the cable, axes x, y, z", "force [N]", "", "", "magnitude")
+    ]
+    for push in cable.pushes:
+        size = float(np.linalg.norm(push.force))
+        rows.append((stretch(push), *(above(float(x), ROUNDING * size) for x in (*push.force, size))))
+    return table(rows, "<>>>>")
+
+
+def stretch(push: Push) -> str:
+    first, last = amount(push.first, "m"), amount(push.last, "m")
+    return f"{push.name} " + (f"at s = {first}" if first == last else f"between s = {first} and {last}")
 
 
 def support(reaction: Reaction) -> str:

@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 
 from rodjax.analysis.curvature import curvature_along
+from rodjax.analysis.pushes import Push, pushes
 from rodjax.analysis.reactions import Reaction, reactions
 from rodjax.drawing import AZIMUTH, COLOR_MAP, LABELS, LEAST_LOAD, largest_radius, radius_along, seen_axes
 from rodjax.model.obstacles import Obstacle, Plane
@@ -49,6 +50,7 @@ class CableView(NamedTuple):
     tension: Float[np.ndarray, "k"]
     margin: Float[np.ndarray, "k"] | None
     reactions: list[Reaction]
+    pushes: list[Push]
 
     @property
     def radius(self) -> float:
@@ -56,10 +58,10 @@ class CableView(NamedTuple):
         return float(np.max(self.radii))
 
     @property
-    def forces(self) -> list[Reaction]:
-        """Those that are more than rounding."""
+    def forces(self) -> list[Reaction | Push]:
+        """Of supports and obstacles, those that are more than rounding."""
         least = LEAST_LOAD * float(self.equilibrium.state.units.force)
-        return [reaction for reaction in self.reactions if np.linalg.norm(reaction.force) > least]
+        return [one for one in (*self.reactions, *self.pushes) if np.linalg.norm(one.force) > least]
 
 
 class Coloring(NamedTuple):
@@ -104,6 +106,7 @@ def cable_view(name: str, equilibrium: Equilibrium, limits: Limits | None, exten
         np.asarray(np.interp(along, nodes, np.asarray(equilibrium.tension))),
         margin,
         reactions(equilibrium),
+        pushes(equilibrium),
     )
 
 

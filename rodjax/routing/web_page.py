@@ -59,11 +59,11 @@ def web_page(report: Any, cable_views: Sequence[CableView]) -> str:
 
 
 def _scene(report: Any, cable_views: Sequence[CableView], colors: Coloring) -> dict[str, Any]:
-    size = extent([cable_view.equilibrium for cable_view in cable_views])
+    size, drawn = extent([cable_view.equilibrium for cable_view in cable_views]), [*report.drawn.values()]
     decimals = max(0, -math.floor(math.log10(DIGITS * size)))
     obstacles = [
         _surface(faces, PALETTE[k % len(PALETTE)], OPACITY, decimals)
-        for k, faces in enumerate(seen_surfaces(cable_views, report.obstacles))
+        for k, faces in enumerate(seen_surfaces(cable_views, drawn))
     ]
     clips = [
         _surface(faces, CLIP_COLOR, 1.0, decimals) for cable_view in cable_views for faces in clip_faces(cable_view)
@@ -75,7 +75,7 @@ def _scene(report: Any, cable_views: Sequence[CableView], colors: Coloring) -> d
     everything = np.concatenate(corners)
     low, high = everything.min(axis=0), everything.max(axis=0)
     return {
-        "azimuth": azimuth(cable_views, report.obstacles),
+        "azimuth": azimuth(cable_views, drawn),
         "elevation": ELEVATION,
         "center": _rounded((low + high) / 2, decimals),
         "size": float(np.linalg.norm(high - low)),
@@ -127,15 +127,15 @@ def _surface(faces: Faces, color: str, opacity: float, decimals: int) -> dict[st
 
 
 def _forces(cable_views: Sequence[CableView], length: float, decimals: int) -> list[dict[str, Any]]:
-    acting = [reaction for cable_view in cable_views for reaction in cable_view.forces]
-    sizes = [float(np.linalg.norm(reaction.force)) for reaction in acting]
+    acting = [force for cable_view in cable_views for force in cable_view.forces]
+    sizes = [float(np.linalg.norm(one.force)) for one in acting]
     return [
         {
-            "foot": _rounded(reaction.position, decimals),
-            "tip": _rounded(reaction.position + length / max(sizes) * reaction.force, decimals),
+            "foot": _rounded(one.position, decimals),
+            "tip": _rounded(one.position + length / max(sizes) * one.force, decimals),
             "label": f"{size:.3g} N",
         }
-        for reaction, size in zip(acting, sizes, strict=True)
+        for one, size in zip(acting, sizes, strict=True)
     ]
 
 
@@ -170,17 +170,17 @@ def _panel(report: Any) -> str:
     for k, cable in enumerate(report.cables):
         if len(report.cables) > 1:
             parts.append(f"<h2>{escape(cable.name)}</h2>")
-        parts += [_limits(cable, k), _facts(cable, k), _supports(cable)]
+        parts += [_limits(cable, k), _facts(cable, k), _supports(cable), _pushes(cable, k)]
         if cable.gradients is not None:
             parts.append(_gradients(cable.gradients))
         parts.append(f'<p class="soft">{escape(cable.outcome)}</p>')
         rows = [_row([name, text], k, None) for name, text in report_text.inputs(report, cable)]
         parts.append("<h2>inputs</h2>" + _table(("", ">SI units"), rows, ' class="inputs"'))
-    if report.obstacles:
+    if report.drawn:
         boxes = "".join(
             f'<li><label><input type="checkbox" checked data-obstacle="{k}">'
             f'<span class="swatch" style="background:{PALETTE[k % len(PALETTE)]}"></span>{escape(name)}</label></li>'
-            for k, name in enumerate(report.names)
+            for k, name in enumerate(report.drawn)
         )
         parts.append(f"<h2>obstacles</h2><ul>{boxes}</ul>")
     parts.append(f'<div id="along"><h2>along the cable</h2>{_diagrams(report)}</div>')
@@ -243,6 +243,21 @@ def _supports(cable: Cable) -> str:
                 rows.append(_row(cells, 0, None))
     heads = ("what supports apply", ">axes", ">1", ">2", ">3", ">magnitude")
     return "<h2>supports</h2>" + _table(heads, rows, ' class="vectors"')
+
+
+def _pushes(cable: Cable, number: int) -> str:
+    """For each stretch of contact a block, that can be looked at."""
+    if not cable.pushes:
+        return ""
+    rows = []
+    for push in cable.pushes:
+        size = float(np.linalg.norm(push.force))
+        rows.append(f'<tr class="support"><td colspan="5">{escape(report_text.stretch(push))}</td></tr>')
+        numbers = [report_text.above(float(x), report_text.ROUNDING * size) for x in push.force]
+        cells = ["force [N]", *numbers, _unbroken(report_text.amount(size, "N"))]
+        rows.append(_row(cells, number, (push.first + push.last) / 2))
+    heads = ("what obstacles apply", ">x", ">y", ">z", ">magnitude")
+    return "<h2>contacts</h2>" + _table(heads, rows, ' class="vectors"')
 
 
 def _gradients(gradients: Gradients) -> str:

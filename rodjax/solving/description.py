@@ -14,6 +14,7 @@ from rodjax.mechanics.passage import Passage
 from rodjax.mechanics.taut import taut
 from rodjax.model.rod import Rod
 from rodjax.model.scene import has_potential
+from rodjax.model.summaries import obstacle_name
 from rodjax.model.supports import Held
 from rodjax.solving import applied_forces
 from rodjax.solving.penetration import MOST_PENETRATION, passage_of, penetration
@@ -98,8 +99,8 @@ def _contacts_told(equilibrium: Equilibrium) -> list[str]:
         if touched.size:
             first, last = float(touched[0]), float(touched[-1])
             where = f"at s = {first:.4g} m" if first == last else f"between s = {first:.4g} and {last:.4g} m"
-            kind = type(equilibrium.scene.obstacles[k]).__name__
-            pushes = f"obstacles[{k}] ({kind}) pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}"
+            name = obstacle_name(equilibrium.scene.obstacles[k], k)
+            pushes = f"{name} pushes with {np.linalg.norm(forces.sum(0)):.4g} N {where}"
             told.append(pushes + _friction_told(equilibrium, contacts, k))
     return told
 

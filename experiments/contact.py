@@ -257,6 +257,37 @@ def branched(count: int, seed: int = 2, segments: int = 40) -> None:
         )
 
 
+def crossing_harness(rng: np.random.Generator) -> rj.Harness:
+    """On a floor, two branches over a pipe that they cross obliquely; one of their ends is scattered by 1 cm."""
+
+    def rod(length: float, radius: float) -> rj.Rod:
+        return rj.Rod.circular(length, radius, 1e7, poisson_ratio=0.5, density=1500)
+
+    joint = rj.Joint("y", rj.frame((1, 0, 0), (0, 1, 0)))
+    pipe = rj.Capsule((0.5, -0.3, 0.02), (0.5, 0.3, 0.02), 0.02)
+    around = {"gravity": (0, 0, -9.81), "obstacles": [rj.Plane((0, 0, 0), (0, 0, 1)), pipe]}
+    start, clips = rj.Clamp((0, 0, 0.06), rj.frame((1, 0, 0), (0, 1, 0))), [rj.Clip(0.2, (0.19, 0, 0.05), (1, 0, 0))]
+    scenes = {"trunk": rj.Scene(rod(0.4, 0.006), start, joint, clips=clips, **around)}
+    end = np.array([0.62, 0.15, 0.04]) + rng.normal(0, 0.01, 3)
+    for name, length, place, side in (("left", 0.3, end, 1), ("right", 0.32, (0.6, -0.18, 0.05), -1)):
+        towards = rj.frame((2, side, 0), (0, 0, 1))
+        scenes[name] = rj.Scene(rod(length, 0.004), rj.Joint("y", towards), rj.Clamp(place, towards), **around)
+    return rj.Harness(scenes, joints={"y": rj.Body(mass=0.01)})
+
+
+def crossing(count: int, seed: int = 0, segments: int = 32) -> None:
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        result = rj.solve(crossing_harness(rng), segments=segments, strain_limit=None)
+        found.append((bool(result.converged), int(result.iterations)))
+    converged, iterations = np.array(found).T
+    print(
+        f"harnesses across a pipe on a floor, seed {seed}, {segments} elements: {converged.sum()} of {count} "
+        f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}",
+        flush=True,
+    )
+
+
 def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:
     """A cable under a load without a potential, of a part of `size`, beside a floor and a wall."""
 
@@ -429,6 +460,7 @@ if __name__ == "__main__":
     pressed(scenes)
     over_pipes(scenes)
     branched(scenes // 4)
+    crossing(scenes)
     turned(scenes)
     turned(scenes, size=4.0)
     branches(scenes)

@@ -10,6 +10,7 @@ from scenes import box_mesh
 from scipy.spatial.transform import Rotation
 
 import rodjax as rj
+from rodjax.discretization.first_shape import first_shape
 from rodjax.mechanics.taut import DRAWN_PIECES, drawn_in, taut
 from rodjax.model.scene import nondimensional
 from rodjax.solving import guess
@@ -91,6 +92,25 @@ def test_a_string_under_a_pipe_on_a_floor_is_led_over_both():
         np.testing.assert_array_less(RADIUS, np.asarray(obstacle.distance(string[1:-1])))
     # Over the pipe, whose highest place is at -0.05.
     assert np.min(np.interp(0.3, string[:, 0], string[:, 2])) > -0.05 + RADIUS
+
+
+def test_a_string_obliquely_under_a_pipe_is_led_over_it():
+    """It is out sooner along the floor, to a place from which edges lead back through the pipe."""
+    pipe = rj.Capsule((0.5, -0.3, 0.02), (0.5, 0.3, 0.02), 0.02)
+    scene = rj.Scene(
+        rj.Rod(0.32, 1.0, 0.7, 1e5, mass_per_length=37.5, radius=0.004),
+        rj.Clamp((0.431, -0.003, 0.045), rj.frame((0.87, -0.5, 0))),
+        rj.Clamp((0.6, -0.18, 0.05), rj.frame((2, -1, 0))),
+        (0, 0, -9.81),
+        obstacles=[rj.Plane((0, 0, 0), (0, 0, 1)), pipe],
+    )
+    scaled, units = nondimensional(scene)
+    nodes = np.asarray(beside_obstacles(scaled, first_shape(scaled, 64), 32)) * float(units.length)
+    nodes += np.asarray(units.origin)
+    # Nodes lie on chords of the string, which is a tenth of the radius farther out.
+    between = (nodes[1:] + nodes[:-1]) / 2
+    for obstacle in scene.obstacles:
+        np.testing.assert_array_less(0.9 * 0.004, np.asarray(obstacle.distance(np.concatenate([nodes, between]))))
 
 
 def test_what_lies_within_is_led_out_with_the_tangents_of_supports():

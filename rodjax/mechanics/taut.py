@@ -38,6 +38,10 @@ BESIDE = 0.1
 OPPOSITE = -0.1
 DIRECTIONS = 8
 MOST_STEPS = 24
+# Depth of edges within obstacles, at these parts of them, counts so often: a way out leads nowhere where a string must
+# pass through the obstacle to get there.
+BETWEEN = (0.25, 0.5, 0.75)
+DEPTH_WEIGHT = 10.0
 ALIKE = 1e-6
 # A place within an obstacle is pushed out so often, where that leads into another one: pushed once more, it is caught.
 MOST_PUSHES = 4
@@ -168,7 +172,7 @@ def _led_to_one_side(
 ) -> Float[Array, "q 3"]:
     """Out of obstacles that it crosses in their middle, whose distance would lead one half of it forwards and the other
     backwards, and out of several that would lead it from one into the other: in the direction across, of several, in
-    which all of it is out soonest. Directions are counted from where the string sags, or from `first_side` of a string
+    which all of it is out soonest, and no edge leads through an obstacle to get there. Directions are counted from where the string sags, or from `first_side` of a string
     that is free at its end: that leads it out also where it ends within.
     """
     places, distance = string[1:-1], _distance(obstacles)
@@ -196,12 +200,30 @@ def _led_to_one_side(
         there = jax.vmap(jax.vmap(distance))(places[None] + ways[..., None] * across)
         return ways + jnp.maximum(radius - there, 0.0)
 
-    steps = jnp.where(jnp.any(is_parted), MOST_STEPS, 0)
+    is_led = is_parted & is_within
+
+    def led(ways: Float[Array, "p"], across: Float[Array, "p 3"]) -> Float[Array, "q 3"]:
+        return string.at[1:-1].add(jnp.where(is_led[:, None], ways[:, None] * across, 0.0))
+
+    def depths(_: int, ways: Float[Array, "d p"]) -> Float[Array, "d p"]:
+        """Ways, and how deep the edges to and from each place then lie within obstacles between their ends."""
+
+        def deepest(ways: Float[Array, "p"], across: Float[Array, "p 3"]) -> Float[Array, "p"]:
+            there = led(ways, across)
+            parts = jnp.array(BETWEEN, string.dtype)[None, :, None]
+            between = there[:-1, None] + parts * jnp.diff(there, axis=0)[:, None]
+            depth = radius - jnp.min(jax.vmap(jax.vmap(distance))(between), axis=1)
+            return jnp.maximum(jnp.maximum(depth[:-1], depth[1:]), 0.0)
+
+        return ways + DEPTH_WEIGHT * jax.vmap(deepest)(ways, across)
+
+    is_any = jnp.any(is_parted)
+    steps = jnp.where(is_any, MOST_STEPS, 0)
     ways = jax.lax.fori_loop(0, steps, further, jnp.zeros(across.shape[:2], string.dtype))
-    farthest = jax.vmap(lambda way: jax.ops.segment_max(way, number, count))(ways)[:, number]
-    best = jnp.argmax(farthest <= (1 + ALIKE) * jnp.min(farthest, axis=0, keepdims=True), axis=0)  # the first of those
-    out = ways[best, k][:, None] * across[best, k]
-    return string.at[1:-1].add(jnp.where((is_parted & is_within)[:, None], out, 0.0))
+    prices = jax.lax.fori_loop(0, jnp.where(is_any, 1, 0), depths, ways)
+    dearest = jax.vmap(lambda prices: jax.ops.segment_max(prices, number, count))(prices)[:, number]
+    best = jnp.argmax(dearest <= (1 + ALIKE) * jnp.min(dearest, axis=0, keepdims=True), axis=0)  # the first of those
+    return led(ways[best, k], across[best, k])
 
 
 def _ways_out(

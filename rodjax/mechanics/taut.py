@@ -170,14 +170,15 @@ def _led_to_one_side(
     radius: Float[Array, ""],
     first_side: Float[Array, "3"] | None = None,
 ) -> Float[Array, "q 3"]:
-    """Out of obstacles that it crosses in their middle, whose distance would lead one half of it forwards and the other
-    backwards, and out of several that would lead it from one into the other: in the direction across, of several, in
-    which all of it is out soonest, and no edge leads through an obstacle to get there. Directions are counted from where the string sags, or from `first_side` of a string
-    that is free at its end: that leads it out also where it ends within.
+    """Out of obstacles: also of those that it crosses in their middle, whose distance would lead one half of it
+    forwards and the other backwards, and of several that would lead it from one into the other, in the direction
+    across, of several, in which all of it is out soonest and no edge leads through an obstacle to get there. Directions
+    are counted from where the string sags, or from `first_side` of a string that is free at its end: that leads it out
+    also where it ends within.
     """
     places, distance = string[1:-1], _distance(obstacles)
     is_within = jax.vmap(distance)(places) < radius
-    normals, is_caught = _ways_out(places, distance, radius)
+    outside, normals, is_caught = _ways_out(places, distance, radius)
     # The places of each way through obstacles have a number of their own, those outside of all 0.
     begins = is_within & ~jnp.concatenate([jnp.zeros(1, bool), is_within[:-1]])
     number, count, k = jnp.where(is_within, jnp.cumsum(begins), 0), len(places), jnp.arange(len(places))
@@ -203,7 +204,7 @@ def _led_to_one_side(
     is_led = is_parted & is_within
 
     def led(ways: Float[Array, "p"], across: Float[Array, "p 3"]) -> Float[Array, "q 3"]:
-        return string.at[1:-1].add(jnp.where(is_led[:, None], ways[:, None] * across, 0.0))
+        return string.at[1:-1].set(jnp.where(is_led[:, None], places + ways[:, None] * across, outside))
 
     def depths(_: int, ways: Float[Array, "d p"]) -> Float[Array, "d p"]:
         """Ways, and how deep the edges to and from each place then lie within obstacles between their ends."""
@@ -228,8 +229,8 @@ def _led_to_one_side(
 
 def _ways_out(
     places: Float[Array, "p 3"], distance: Callable[[Array], Array], radius: Float[Array, ""]
-) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
-    """The directions in which distances lead places out of obstacles at last, and whether they do not."""
+) -> tuple[Float[Array, "p 3"], Float[Array, "p 3"], Bool[Array, "p"]]:
+    """Where and in which directions distances lead places out of obstacles at last, and whether they do not."""
 
     def further(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         places, last = state[:2]
@@ -238,8 +239,7 @@ def _ways_out(
         return places + out * normals, jnp.where(out > 0, normals, last), out[:, 0] > NEARER * radius
 
     begin = places, jnp.zeros_like(places), jnp.zeros(len(places), bool)
-    _, normals, is_caught = jax.lax.fori_loop(0, MOST_PUSHES, further, begin)
-    return normals, is_caught
+    return jax.lax.fori_loop(0, MOST_PUSHES, further, begin)
 
 
 def _unit(vectors: Float[Array, "p 3"]) -> Float[Array, "p 3"]:

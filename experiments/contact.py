@@ -17,6 +17,7 @@ import itertools
 import sys
 import time
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -201,18 +202,20 @@ def over_pipes_scene(rng: np.random.Generator, clip: str) -> rj.Scene | None:
 
 def over_pipes(count: int, seed: int = 1, segments: int = 32) -> None:
     for clip in ("none", "position", "tangent", "sliding tangent"):
-        rng, found = np.random.default_rng(seed), []
-        for _ in range(count):
-            scene = over_pipes_scene(rng, clip)
-            if scene is not None:
-                result = rj.solve(scene, segments=segments, strain_limit=None)
-                found.append((bool(result.converged), int(result.iterations)))
-        converged, iterations = np.array(found).T
-        print(
-            f"over pipes on a floor, clip: {clip}, seed {seed}, {segments} elements: {converged.sum()} of {len(found)} "
-            f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}",
-            flush=True,
-        )
+        rng = np.random.default_rng(seed)
+        scenes = (over_pipes_scene(rng, clip) for _ in range(count))
+        _tell(f"over pipes on a floor, clip: {clip}, seed {seed}", filter(None, scenes), segments)
+
+
+def _tell(kind: str, scenes: Iterable[rj.Scene | rj.Harness], segments: int) -> None:
+    """How many converge, in how many iterations."""
+    results = (rj.solve(scene, segments=segments, strain_limit=None) for scene in scenes)
+    converged, iterations = np.array([(bool(result.converged), int(result.iterations)) for result in results]).T
+    print(
+        f"{kind}, {segments} elements: {converged.sum()} of {len(converged)} converged, iterations median "
+        f"{np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}",
+        flush=True,
+    )
 
 
 def branched_harness(rng: np.random.Generator, sliding: bool) -> rj.Harness:
@@ -244,17 +247,9 @@ def branched_harness(rng: np.random.Generator, sliding: bool) -> rj.Harness:
 
 def branched(count: int, seed: int = 2, segments: int = 40) -> None:
     for sliding in (False, True):
-        rng, found = np.random.default_rng(seed), []
-        for _ in range(count):
-            result = rj.solve(branched_harness(rng, sliding), segments=segments, strain_limit=None)
-            found.append((bool(result.converged), int(result.iterations)))
-        converged, iterations = np.array(found).T
-        print(
-            f"harnesses over a pipe on a floor, {'sliding ' if sliding else ''}clip, seed {seed}, {segments} elements: "
-            f"{converged.sum()} of {count} converged, iterations median {np.median(iterations):g}, 90 % "
-            f"{np.percentile(iterations, 90):g}",
-            flush=True,
-        )
+        rng, clip = np.random.default_rng(seed), "sliding clip" if sliding else "clip"
+        harnesses = (branched_harness(rng, sliding) for _ in range(count))
+        _tell(f"harnesses over a pipe on a floor, {clip}, seed {seed}", harnesses, segments)
 
 
 def crossing_harness(rng: np.random.Generator) -> rj.Harness:
@@ -276,16 +271,9 @@ def crossing_harness(rng: np.random.Generator) -> rj.Harness:
 
 
 def crossing(count: int, seed: int = 0, segments: int = 32) -> None:
-    rng, found = np.random.default_rng(seed), []
-    for _ in range(count):
-        result = rj.solve(crossing_harness(rng), segments=segments, strain_limit=None)
-        found.append((bool(result.converged), int(result.iterations)))
-    converged, iterations = np.array(found).T
-    print(
-        f"harnesses across a pipe on a floor, seed {seed}, {segments} elements: {converged.sum()} of {count} "
-        f"converged, iterations median {np.median(iterations):g}, 90 % {np.percentile(iterations, 90):g}",
-        flush=True,
-    )
+    rng = np.random.default_rng(seed)
+    harnesses = (crossing_harness(rng) for _ in range(count))
+    _tell(f"harnesses across a pipe on a floor, seed {seed}", harnesses, segments)
 
 
 def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:

@@ -126,7 +126,11 @@ normal = [0, 0, 1]
     assert read.obstacles == ()
     assert read.harness is not None
     assert all(len(one.obstacles) == 1 for one in read.harness.harness.scenes)
-    # What only a route has makes it one; so does a name.
+    # What only a route has makes it one; so do a name and a mesh.
+    with_mesh = f'{scene}\n[[obstacles]]\nkind = "mesh"\nfile = "step.stl"\nunit = "1 m"\n'
+    trimesh.creation.box((0.1, 0.1, 0.1)).export("step.stl")
+    Path("route.toml").write_text(with_mesh)
+    assert len(read_route_file("route.toml").obstacles) == 1
     for more in ("[limits]\nstrain = 0.1\n", ""):
         Path("route.toml").write_text(scene + floor + ('name = "floor"\n' if not more else "") + more)
         read = read_route_file("route.toml")

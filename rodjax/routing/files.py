@@ -37,8 +37,8 @@ A complete example; quantities are as in scene files, a number and any unit of t
     stability = "0.1 N"            # least stiffness of the softest motion
 
 Obstacles are as in `rodjax.io.obstacle_tables`, with a name. Here they push nothing; those of a scene file do, and a
-file that has nothing but the tables of a scene or a harness, its obstacles without names, is one: `rodjax report` has
-it as `rodjax solve` does.
+file that has nothing but the tables of a scene or a harness, its obstacles without names and none a mesh, is one:
+`rodjax report` has it as `rodjax solve` does.
 
 What `rodjax route` varies, and a report of the scene as it is leaves aside:
 
@@ -169,12 +169,13 @@ def read_route_file(path: str | os.PathLike[str], *, with_scene: bool = True, fo
 def _is_scene(content: dict[str, Any]) -> bool:
     """Whether it says nothing that only a route has, so that its obstacles are those that push."""
     tables = content.get("obstacles", [])
-    has_names = isinstance(tables, list) and any(isinstance(table, dict) and "name" in table for table in tables)
+    tables = [table for table in tables if isinstance(table, dict)] if isinstance(tables, list) else []
+    has_own = any("name" in table or table.get("kind") == "mesh" for table in tables)
     of_route = ("scene", *(key for key in OF_A_ROUTE if key != "obstacles"))
     is_of_files = isinstance(content.get("cables"), dict) and not any(
         isinstance(cable, dict) for cable in content["cables"].values()
     )
-    return not (has_names or is_of_files or any(key in content for key in of_route))
+    return not (has_own or is_of_files or any(key in content for key in of_route))
 
 
 def _title(content: dict[str, Any]) -> str | None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rodjax as rj
-from rodjax.programs import compilation, parts
+from rodjax.programs import answers, compilation, kept, parts
 from rodjax.programs.parts import traced_once
 from rodjax.programs.stacks import of_each
 
@@ -52,6 +52,22 @@ def test_programs_are_dropped_before_the_process_has_too_many_maps(monkeypatch, 
 def test_programs_are_kept_where_there_is_room(caplog):
     rj.solve(rj.problems.cantilever(0.1), segments=5, discretization="finite_difference")
     assert not caplog.records
+
+
+def test_the_loops_of_a_huge_program_are_left_as_they_are(monkeypatch, compiled_at_once):
+    """The pass that moves numbers out of them is asked not to, for a program of so many operations alone."""
+    asked, compile_lowered = [], kept.compile_lowered
+
+    def compile_told(lowered, options):
+        asked.append(options.items() >= answers.OF_HUGE.items())
+        return compile_lowered(lowered, options)
+
+    monkeypatch.setattr(kept, "compile_lowered", compile_told)
+    for operations in (1, 1000):
+        monkeypatch.setattr(answers, "HUGE", operations)
+        small = compilation.compiled(lambda x: jnp.sin(x) + 1.0)
+        np.testing.assert_allclose(small(jnp.asarray(0.5)), np.sin(0.5) + 1.0, rtol=1e-14)
+    assert asked == [True, False]
 
 
 @pytest.mark.exhaustive

@@ -16,12 +16,16 @@ import jax
 from rodjax.checks import shown
 from rodjax.notes import noted, told
 from rodjax.programs import kept
-from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
+from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError, operation_count
 from rodjax.programs.numpy_operations import TookTooLongError
 
 # XLA's older generator of code for loops on a processor: half the compile time at the same run time, see
 # `docs/design.md`. jaxlib 0.12 has it no more.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
+# What does not change is not moved out of the loops of a program of so many operations: to look for it takes a fifth of
+# the compile time there, and what it gains is not seen.
+HUGE = 25_000
+OF_HUGE = {"xla_disable_hlo_passes": "while-loop-invariant-code-motion"}
 # So many answers get a program as NumPy code: a script that solves twice ends sooner without a compiler.
 ANSWERS_BY_NUMPY = 2
 # Compiling takes about so many seconds for an operation of a small program, and for one of a program of LARGE and more
@@ -116,13 +120,19 @@ class Program:
             if self.name is not None:
                 self.executable = kept.load(self.name, self.tree)
             if self.executable is None:
-                lowered = (self.traced or trace()).lower()
-                self.executable, is_new = kept.compile_lowered(lowered, QUICK if knows_quick() else None)
+                traced = self.traced or trace()
+                self.executable, is_new = kept.compile_lowered(traced.lower(), _options(traced))
                 if is_new and self.name is not None:
                     kept.store(self.name, self.executable)
             self.code = self.traced = None
             ANSWERS.forget(self)
             return self.executable
+
+
+def _options(traced: Any) -> dict[str, Any]:
+    """With which XLA compiles a program."""
+    quick = QUICK if knows_quick() else {}
+    return {**quick, **OF_HUGE} if operation_count(traced.jaxpr) >= HUGE else quick
 
 
 def compile_seconds(operations: int) -> float:

@@ -154,7 +154,7 @@ def _listen(event: str, **_: Any) -> None:
 jax.monitoring.register_event_listener(_listen)
 
 
-def compile_lowered(lowered: Any, options: dict[str, Any] | None) -> tuple[Any, bool]:
+def compile_lowered(lowered: Any, options: dict[str, Any]) -> tuple[Any, bool]:
     """The program, and whether it can be kept."""
     _compiling.taken = False
     program = lowered.compile(options)

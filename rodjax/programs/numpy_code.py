@@ -57,7 +57,7 @@ class AnswerCode:
         code = compile("\n".join(writer.lines), "<rodjax program>", "exec")
         kinds = [np.dtype(kind.dtype) for kind in program.in_avals]
         tree = jax.tree.structure(traced.out_info)
-        return AnswerCode(marshal.dumps(code), writer.constants, kinds, tree, _operations(program, {}))
+        return AnswerCode(marshal.dumps(code), writer.constants, kinds, tree, operation_count(program))
 
     def __call__(self, leaves: Sequence[Any], seconds: float) -> Any:
         """Raises `TookTooLong` where loops take more than so many seconds."""
@@ -82,8 +82,13 @@ def skeleton(tree: Any) -> Any:
     return jax.tree.unflatten(tree, range(tree.num_leaves))
 
 
+def operation_count(program: ClosedJaxpr | Jaxpr) -> int:
+    """Of a program, those of inner ones as often as they are called."""
+    return _operations(program, {})
+
+
 def _operations(program: ClosedJaxpr | Jaxpr, known: dict[int, int]) -> int:
-    """Of a program, those of inner ones as often as they are called; `known`: of programs, by their addresses."""
+    """`known`: of programs, by their addresses."""
     if id(program) not in known:
         jaxpr = program.jaxpr if isinstance(program, ClosedJaxpr) else program
         known[id(program)] = sum(

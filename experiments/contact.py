@@ -252,15 +252,18 @@ def branched(count: int, seed: int = 2, segments: int = 40) -> None:
         _tell(f"harnesses over a pipe on a floor, {clip}, seed {seed}", harnesses, segments)
 
 
-def crossing_harness(rng: np.random.Generator) -> rj.Harness:
-    """On a floor, two branches over a pipe that they cross obliquely; one of their ends is scattered by 1 cm."""
+def crossing_harness(rng: np.random.Generator, gap: float) -> rj.Harness:
+    """On a floor, two branches over a pipe that they cross obliquely; one of their ends is scattered by 1 cm. The pipe
+    is up to `gap` above the floor.
+    """
 
     def rod(length: float, radius: float) -> rj.Rod:
         return rj.Rod.circular(length, radius, 1e7, poisson_ratio=0.5, density=1500)
 
     joint = rj.Joint("y", rj.frame((1, 0, 0), (0, 1, 0)))
     pipe = rj.Capsule((0.5, -0.3, 0.02), (0.5, 0.3, 0.02), 0.02)
-    around = {"gravity": (0, 0, -9.81), "obstacles": [rj.Plane((0, 0, 0), (0, 0, 1)), pipe]}
+    floor = rj.Plane((0, 0, -rng.uniform(0, gap) if gap else 0.0), (0, 0, 1))
+    around = {"gravity": (0, 0, -9.81), "obstacles": [floor, pipe]}
     start, clips = rj.Clamp((0, 0, 0.06), rj.frame((1, 0, 0), (0, 1, 0))), [rj.Clip(0.2, (0.19, 0, 0.05), (1, 0, 0))]
     scenes = {"trunk": rj.Scene(rod(0.4, 0.006), start, joint, clips=clips, **around)}
     end = np.array([0.62, 0.15, 0.04]) + rng.normal(0, 0.01, 3)
@@ -270,10 +273,10 @@ def crossing_harness(rng: np.random.Generator) -> rj.Harness:
     return rj.Harness(scenes, joints={"y": rj.Body(mass=0.01)})
 
 
-def crossing(count: int, seed: int = 0, segments: int = 32) -> None:
+def crossing(count: int, gap: float = 0.0, seed: int = 0, segments: int = 32) -> None:
     rng = np.random.default_rng(seed)
-    harnesses = (crossing_harness(rng) for _ in range(count))
-    _tell(f"harnesses across a pipe on a floor, seed {seed}", harnesses, segments)
+    harnesses = (crossing_harness(rng, gap) for _ in range(count))
+    _tell(f"harnesses across a pipe up to {1000 * gap:g} mm above a floor, seed {seed}", harnesses, segments)
 
 
 def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:
@@ -449,6 +452,7 @@ if __name__ == "__main__":
     over_pipes(scenes)
     branched(scenes // 4)
     crossing(scenes)
+    crossing(scenes, gap=0.012)
     turned(scenes)
     turned(scenes, size=4.0)
     branches(scenes)

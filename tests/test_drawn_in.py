@@ -97,6 +97,8 @@ def test_a_string_under_a_pipe_on_a_floor_is_led_over_both():
 ACROSS = {
     # The string is out of the pipe sooner along the floor, at a place from which edges lead back through the pipe.
     "pipe": (rj.Capsule((0.5, -0.3, 0.02), (0.5, 0.3, 0.02), 0.02), (0.431, -0.003, 0.045), (0.87, -0.5, 0)),
+    # Between pipe and floor is 5 mm, and the rod 8 mm thick: out of both, the string lies half before and half behind.
+    "raised pipe": (rj.Capsule((0.5, -0.3, 0.025), (0.5, 0.3, 0.025), 0.02), (0.427, -0.006, 0.052), (0.88, -0.475, 0)),
     # The nearer face of the step is below the floor, which leads back up into the step.
     "step": (rj.Box((0.56, 0, 0), (0.2, 0.8, 0.035)), (0.4253, -0.006, 0.0472), (0.875, -0.484, 0.001)),
 }

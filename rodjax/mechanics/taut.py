@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rodjax.geometry.interpolation import resampled
 from rodjax.model.obstacles import Obstacle, least
@@ -43,6 +43,9 @@ MOST_STEPS = 24
 BETWEEN = (0.25, 0.5, 0.75)
 DEPTH_WEIGHT = 10.0
 ALIKE = 1e-6
+# Where a string drawn in after that lies within obstacles still, as between two that leave it no room, it is led out in
+# other directions, so many at most.
+MOST_DIRECTIONS = 4
 # A place within an obstacle is pushed out so often, where that leads into another one: pushed once more, it is caught.
 MOST_PUSHES = 4
 
@@ -67,6 +70,11 @@ def _outside(string: Float[Array, "q 3"], obstacles: tuple[Obstacle, ...], radiu
     distances, normals = jax.vmap(jax.value_and_grad(_distance(obstacles)))(string[1:-1])
     out = jnp.where(distances < radius, radius - distances, 0.0)
     return string.at[1:-1].add(out[:, None] * normals)
+
+
+def _nearest(string: Float[Array, "q 3"], obstacles: tuple[Obstacle, ...]) -> Float[Array, ""]:
+    """The distance of its inner places from obstacles."""
+    return jnp.min(jax.vmap(_distance(obstacles))(string[1:-1]))
 
 
 def _length(string: Float[Array, "q 3"]) -> Float[Array, ""]:
@@ -97,13 +105,14 @@ def drawn_in(
 ) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
     """A string that begins as `points` and is led out of the obstacles and drawn in until it is taut or no longer than
     `length`; and whether that was needed. It stays on its side of what is thicker than its steps, and has the tangents
-    that supports hold, where these are not zero.
+    that supports hold, where these are not zero. Of the directions in which it may be led out the first is taken after
+    which it lies outside, or else the one that leaves it least deep within.
 
     A rod that begins far too long, within an obstacle, or with kinks, its axial stiffness alone pulls, to any side.
     """
     begin = resampled(points, DRAWN_PIECES)
-    nearest = jnp.min(jax.vmap(_distance(obstacles))(begin[1:-1]))
-    is_needed = (_length(begin) > (1 + LONGER) * length) | (nearest < (1 - NEARER) * radius)
+    nearest, enough = _nearest(begin, obstacles), (1 - NEARER) * radius
+    is_needed = (_length(begin) > (1 + LONGER) * length) | (nearest < enough)
     radius = (1 + BESIDE) * radius
 
     def turned(string: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
@@ -123,12 +132,27 @@ def drawn_in(
         pulled = jnp.where((size > length) | (count < LEAST_ROUNDS), pulled, _outside(string, obstacles, radius))
         return pulled, _length(pulled), size, count + 1
 
-    begin = _led_to_one_side(begin, obstacles, radius)
-    start = begin, _length(begin), _length(begin), jnp.zeros((), int)
-    string = jax.lax.while_loop(goes_on, closer, start)[0]
-    for _ in range(SPREADS):
-        string = _outside(_spread(string), obstacles, radius)
-    return string, is_needed
+    def in_direction(rank: Array) -> tuple[Array, Array]:
+        led, is_led = _led_to_one_side(begin, obstacles, radius, rank)
+        start = led, _length(led), _length(led), jnp.zeros((), int)
+        string = jax.lax.while_loop(goes_on, closer, start)[0]
+        for _ in range(SPREADS):
+            string = _outside(_spread(string), obstacles, radius)
+        return string, is_led
+
+    def is_inside(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        _, distance, is_led, rank = state
+        return (rank == 0) | (is_led & (distance < enough) & (rank < MOST_DIRECTIONS))
+
+    def further_out(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        string, distance, _, rank = state
+        new, is_led = in_direction(rank)
+        there = _nearest(new, obstacles)
+        is_better = there > distance
+        return jnp.where(is_better, new, string), jnp.where(is_better, there, distance), is_led, rank + 1
+
+    none = begin, jnp.asarray(-jnp.inf, begin.dtype), jnp.zeros((), bool), jnp.zeros((), int)
+    return jax.lax.while_loop(is_inside, further_out, none)[0], is_needed
 
 
 def led_out(
@@ -154,7 +178,7 @@ def led_out(
 
     # With a place beyond its end, which need not be outside.
     string = jnp.concatenate([begin, 2 * begin[-1:] - begin[-2:-1]])
-    string = _led_to_one_side(string, obstacles, radius, first_side)
+    string, _ = _led_to_one_side(string, obstacles, radius, jnp.zeros((), int), first_side)
     rounds = jnp.where(is_needed, ROUNDS_OUT, 0)
     string = jax.lax.fori_loop(0, rounds, lambda _, last: _pulled(last, obstacles, radius, straight_on), string)
     for _ in range(SPREADS):
@@ -168,13 +192,14 @@ def _led_to_one_side(
     string: Float[Array, "q 3"],
     obstacles: tuple[Obstacle, ...],
     radius: Float[Array, ""],
+    rank: Int[Array, ""],
     first_side: Float[Array, "3"] | None = None,
-) -> Float[Array, "q 3"]:
+) -> tuple[Float[Array, "q 3"], Bool[Array, ""]]:
     """Out of obstacles: also of those that it crosses in their middle, whose distance would lead one half of it
     forwards and the other backwards, and of several that would lead it from one into the other, in the direction
-    across, of several, in which all of it is out soonest and no edge leads through an obstacle to get there. Directions
-    are counted from where the string sags, or from `first_side` of a string that is free at its end: that leads it out
-    also where it ends within.
+    across, of several, in which all of it is out soonest and no edge leads through an obstacle to get there, or in that
+    of a higher `rank`; and whether any is led in such a direction. Directions are counted from where the string sags,
+    or from `first_side` of a string that is free at its end: that leads it out also where it ends within.
     """
     places, distance = string[1:-1], _distance(obstacles)
     is_within = jax.vmap(distance)(places) < radius
@@ -223,8 +248,10 @@ def _led_to_one_side(
     ways = jax.lax.fori_loop(0, steps, further, jnp.zeros(across.shape[:2], string.dtype))
     prices = jax.lax.fori_loop(0, jnp.where(is_any, 1, 0), depths, ways)
     dearest = jax.vmap(lambda prices: jax.ops.segment_max(prices, number, count))(prices)[:, number]
-    best = jnp.argmax(dearest <= (1 + ALIKE) * jnp.min(dearest, axis=0, keepdims=True), axis=0)  # the first of those
-    return led(ways[best, k], across[best, k])
+    # Of those that are alike the first.
+    dearest *= 1 + ALIKE * jnp.arange(DIRECTIONS, dtype=string.dtype)[:, None]
+    chosen = jnp.argmax(jnp.sum(dearest[None] < dearest[:, None], axis=1) == rank, axis=0)
+    return led(ways[chosen, k], across[chosen, k]), is_any
 
 
 def _ways_out(

@@ -205,6 +205,9 @@ def test_a_file_has_ends_that_move(written, end, kind):
         ('force = "[0, 0, -0.1] N"', 'mass = "-1 g"', "joints.y.mass must not be negative"),
         ("tangent = [1, 1, 0], d2 = [0, 0, 1]", "tangent = [1, 1, 0]", "cables.left.start.d2 or start.frame is needed"),
         ("[loads]", "[load]", "load is not allowed here; allowed are cables, contact, joints, loads, obstacles, solve"),
+        ('-9.81] m/s^2"', '-9.81] N"', ".toml: loads.gravity must be in m/s^2"),
+        ("[loads]", '[[obstacles]]\nkind = "plan"\n[loads]', ".toml: obstacles[0].kind must be one of plane, sphere"),
+        ("[loads]", '[[cables.left.obstacles]]\nkind = "plan"\n[loads]', ".toml: cables.left.obstacles[0].kind must"),
     ],
 )
 def test_mistakes_in_a_file_are_told_in_one_line(written, old, new, message):

@@ -142,7 +142,9 @@ def harness_file(content: dict[str, Any]) -> HarnessFile:
             near = table.get("obstacles", around)
             cables[name] = reader.read(table | {"loads": loads} | ({"obstacles": near} if near else {})).scenes[0]
         except SceneFileError as error:
-            raise SceneFileError(f"{where}.{error}") from None
+            # What all cables have in common is named as it stands in the file.
+            is_common = str(error).startswith(tuple({"loads", "obstacles"} - table.keys()))
+            raise SceneFileError(str(error) if is_common else f"{where}.{error}") from None
     joints = {name: _body(reader, table, f"joints.{name}") for name, table in content.get("joints", {}).items()}
     try:
         return HarnessFile(Harness(cables, joints, content.get("contact", False)), segments, rtol, strain_limit)

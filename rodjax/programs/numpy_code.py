@@ -82,17 +82,13 @@ def skeleton(tree: Any) -> Any:
     return jax.tree.unflatten(tree, range(tree.num_leaves))
 
 
-def operation_count(program: ClosedJaxpr | Jaxpr) -> int:
-    """Of a program, those of inner ones as often as they are called."""
-    return _operations(program, {})
-
-
-def _operations(program: ClosedJaxpr | Jaxpr, known: dict[int, int]) -> int:
-    """`known`: of programs, by their addresses."""
+def operation_count(program: ClosedJaxpr | Jaxpr, known: dict[int, int] | None = None) -> int:
+    """Of a program, those of inner ones as often as they are called; `known`: of programs, by their addresses."""
+    known = {} if known is None else known
     if id(program) not in known:
         jaxpr = program.jaxpr if isinstance(program, ClosedJaxpr) else program
         known[id(program)] = sum(
-            sum(_operations(inner, known) for inner in jaxprs_in_params(equation.params)) or 1
+            sum(operation_count(inner, known) for inner in jaxprs_in_params(equation.params)) or 1
             for equation in jaxpr.eqns
         )
     return known[id(program)]

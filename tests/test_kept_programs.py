@@ -146,7 +146,20 @@ def test_what_is_defined_elsewhere_is_not_kept(folder):
     assert not files(folder)
 
 
-@pytest.mark.parametrize("damage", [lambda content: content[:100], lambda content: content[:-1] + b"x", lambda _: b""])
+def cut(content: bytes) -> bytes:
+    return content[:100]
+
+
+def changed(content: bytes) -> bytes:
+    # Its last byte, whatever it is, into another.
+    return content[:-1] + bytes([content[-1] ^ 0xFF])
+
+
+def emptied(_: bytes) -> bytes:
+    return b""
+
+
+@pytest.mark.parametrize("damage", [cut, changed, emptied])
 def test_a_damaged_file_is_written_anew(folder, damage):
     program()(1.0)
     (file,) = files(folder)

@@ -1,5 +1,6 @@
 """Programs as NumPy code: each operation beside JAX's own, and when such code runs in the place of an executable."""
 
+import threading
 import time
 
 import diffrax
@@ -324,6 +325,38 @@ def test_the_third_answer_is_compiled(impatient):
     with rj.numpy_first(False):
         tripled(X[0])
     assert executables(tripled) == 2
+
+
+def test_programs_of_the_same_answer_are_compiled_with_it(impatient):
+    """Unless a part of larger work, as a case of a sweep, asks for it: that needs no other of them."""
+
+    @compiled
+    def of_a_part(x):
+        return 2 * x
+
+    @compiled
+    def asked_again(x):
+        return 3 * x
+
+    @compiled
+    def asked_once(x):
+        return 4 * x
+
+    def ask(function) -> None:
+        before = threading.enumerate()
+        with ANSWERS.one():
+            function(X)
+        for thread in set(threading.enumerate()) - set(before):
+            thread.join()
+
+    with ANSWERS.one():
+        of_a_part(X), asked_again(X), asked_once(X)
+    with answers.compiled_only():
+        ask(of_a_part)
+    assert list(map(executables, (of_a_part, asked_again, asked_once))) == [1, 0, 0]
+    for _ in range(answers.ANSWERS_BY_NUMPY):
+        ask(asked_again)
+    assert list(map(executables, (of_a_part, asked_again, asked_once))) == [1, 1, 1]
 
 
 def test_what_takes_longer_than_compiling_is_compiled(impatient, monkeypatch):

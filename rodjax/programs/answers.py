@@ -76,7 +76,8 @@ class Program:
                 self.seconds_left -= time.thread_time() - begin
         executable = self.executable
         if executable is None:
-            ANSWERS.compile_others(self)
+            if not _here.is_compiled_only:  # a part of larger work, which needs some programs of another answer alone
+                ANSWERS.compile_others(self)
             with noted(COMPILING):
                 executable = self.compile(lambda: self.trace(args, options))
         return executable(*given, **named)
@@ -188,7 +189,8 @@ class _Answers:
 
     def compile_others(self, program: Program | None) -> None:
         """Side by side with a program that another answer asks for, in other threads: those that were made for the same
-        answer, as all will be asked for. In a session with a person at the keyboard (`None`): those of the last answer.
+        answer, as all will be asked for by another of its kind. In a session with a person at the keyboard (`None`):
+        those of the last answer.
         """
         number = self.number if program is None else program.answer
         settings = kept.settings()

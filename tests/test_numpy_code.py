@@ -19,6 +19,7 @@ from rodjax.programs.compilation import compiled
 from rodjax.programs.linear import linear
 from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError
 from rodjax.programs.numpy_rules import ELEMENTWISE
+from rodjax.programs.tasks import in_order
 
 X = np.random.default_rng(0).normal(size=(4, 5))
 POSITIVE = X[:, :4] @ X[:, :4].T + np.eye(4)
@@ -350,13 +351,38 @@ def test_programs_of_the_same_answer_are_compiled_with_it(impatient):
             thread.join()
 
     with ANSWERS.one():
-        of_a_part(X), asked_again(X), asked_once(X)
+        for function in (of_a_part, asked_again, asked_once):
+            function(X)
     with answers.compiled_only():
         ask(of_a_part)
     assert list(map(executables, (of_a_part, asked_again, asked_once))) == [1, 0, 0]
     for _ in range(answers.ANSWERS_BY_NUMPY):
         ask(asked_again)
     assert list(map(executables, (of_a_part, asked_again, asked_once))) == [1, 1, 1]
+
+
+def test_what_many_parts_ask_for_is_compiled_where_that_is_quicker_for_all(impatient):
+    @compiled
+    def of_each_part(x):
+        return 2 * x
+
+    def asked(to_come: int) -> int:
+        with answers.part_of_work(to_come):
+            of_each_part(X)
+        return executables(of_each_part)
+
+    with ANSWERS.one():
+        # How long it takes is known after the first time.
+        assert asked(10**9) == 0
+        assert asked(1) == 0
+        assert asked(10**9) == 1
+
+
+def test_parts_know_how_many_are_to_come():
+    with rj.numpy_first():
+        for threads in (1, 2):
+            found = in_order(lambda k: (k, answers._here.parts_to_come), [(k,) for k in range(3)], threads=threads)
+            assert found == [(0, 2), (1, 1), (2, 0)]
 
 
 def test_what_takes_longer_than_compiling_is_compiled(impatient, monkeypatch):

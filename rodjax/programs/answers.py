@@ -60,7 +60,7 @@ class Program:
         self.traced: Any = None
         self.answer = ANSWERS.number
         self.asked = ANSWERS.number, 1
-        self.seconds_left = math.inf
+        self.seconds_left, self.longest = math.inf, 0.0  # of NumPy code
         self.lock, self.writing = threading.Lock(), threading.Lock()
 
     def __call__(self, args: tuple, options: dict[str, Any], leaves: list[Any], given: tuple, named: Any) -> Any:
@@ -73,10 +73,11 @@ class Program:
             except TookTooLongError:
                 pass
             finally:
-                self.seconds_left -= time.thread_time() - begin
+                seconds = time.thread_time() - begin
+                self.seconds_left, self.longest = self.seconds_left - seconds, max(self.longest, seconds)
         executable = self.executable
         if executable is None:
-            if not _here.is_compiled_only:  # a part of larger work, which needs some programs of another answer alone
+            if not (_here.is_compiled_only or _here.is_part):
                 ANSWERS.compile_others(self)
             with noted(COMPILING):
                 executable = self.compile(lambda: self.trace(args, options))
@@ -87,7 +88,9 @@ class Program:
         last, count = self.asked
         self.asked = ANSWERS.number, count + (last != ANSWERS.number)
         is_early = self.is_patient or ANSWERS.is_patient or self.asked[1] <= ANSWERS_BY_NUMPY
-        if not ANSWERS.by_numpy or _here.is_compiled_only or not is_early or self.seconds_left <= 0:
+        if not ANSWERS.by_numpy or _here.is_compiled_only or not is_early:
+            return None
+        if self.seconds_left <= self.longest * _here.parts_to_come:
             return None
         with self.writing:
             if self.code is None and self.executable is None:
@@ -233,9 +236,9 @@ class numpy_first:  # noqa: N801 - called as a function
 
 
 class _Here(threading.local):
-    """What holds in this thread alone."""
+    """What holds in this thread alone: whether it is at a part of larger work, and how many parts come after that."""
 
-    is_compiled_only = False
+    is_compiled_only, is_part, parts_to_come = False, False, 0
 
 
 _here = _Here()
@@ -254,6 +257,20 @@ def compiled_only(is_so: bool = True) -> Iterator[None]:
         yield
     finally:
         _here.is_compiled_only = before
+
+
+@contextlib.contextmanager
+def part_of_work(to_come: int) -> Iterator[None]:
+    """For a part of larger work, as a case of a sweep, after which so many like it are to come. A program that it asks
+    for is compiled alone, as others need not what else an answer does; at once, where NumPy code would take longer for
+    all that are to come.
+    """
+    before = _here.is_part, _here.parts_to_come
+    _here.is_part, _here.parts_to_come = True, to_come
+    try:
+        yield
+    finally:
+        _here.is_part, _here.parts_to_come = before
 
 
 def one_answer(function: F) -> F:

@@ -24,7 +24,7 @@ from jaxtyping import Int
 from rodjax.checks import line, shown, whole_number
 from rodjax.notes import bar
 from rodjax.programs import kept
-from rodjax.programs.answers import compiled_only, is_compiled_only
+from rodjax.programs.answers import compiled_only, is_compiled_only, part_of_work
 from rodjax.version import __version__
 
 # The environment variable: the most threads.
@@ -154,6 +154,7 @@ def as_completed(
     at_once = checked_threads(threads)
     of_part = max(at_once // count, 1) if count else 1
     done = functools.partial(_part_done, function, threads=of_part, by_numpy=by_numpy)
+    parts = ((count - k - 1 if count else 0, *part) for k, part in enumerate(parts))
     return _by_threads(done, parts, at_once) if at_once > 1 else _one_by_one(done, parts)
 
 
@@ -191,8 +192,8 @@ def _limited_to(threads: int | None) -> Iterator[None]:
         _here.threads = before
 
 
-def _part_done(function: Callable[..., Any], *part: Any, threads: int = 1, by_numpy: bool = False) -> Any:
-    with _limited_to(threads), compiled_only(is_compiled_only() or not by_numpy):
+def _part_done(function: Callable[..., Any], to_come: int, *part: Any, threads: int = 1, by_numpy: bool = False) -> Any:
+    with _limited_to(threads), compiled_only(is_compiled_only() or not by_numpy), part_of_work(to_come):
         return function(*part)
 
 
@@ -326,7 +327,7 @@ def _done_elsewhere(
             stack.enter_context(jax.enable_x64(surroundings.is_double))
         leaves, tree = jax.tree.flatten(part)
         leaves = [jax.device_put(leaf) if is_jax else leaf for leaf, is_jax in zip(leaves, are_jax, strict=True)]
-        return _as_numpy(_part_done(function, *jax.tree.unflatten(tree, leaves)))
+        return _as_numpy(_part_done(function, 0, *jax.tree.unflatten(tree, leaves)))
 
 
 def _as_numpy(values: Any) -> Any:

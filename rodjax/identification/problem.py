@@ -20,6 +20,7 @@ from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.programs.compilation import compiled
 from rodjax.programs.parts import traced_once
+from rodjax.solving.harness_derivatives import jacobian
 from rodjax.solving.harness_result import Solution
 from rodjax.solving.newton import Newton
 from rodjax.solving.options import Discretization
@@ -196,20 +197,22 @@ def evaluation(
     structure: Structure, problem: Problem, z: Coordinates, guesses: tuple[Solution, ...], is_used: Bool[Array, "e"]
 ) -> Evaluation:
     """At unknowns by their sizes, on the scale on which they are sought."""
-    directions = jnp.eye(z.shared.shape[0] + z.own.shape[1], dtype=z.shared.dtype)
-    of_shared, of_own = directions[:, : z.shared.shape[0]], directions[:, z.shared.shape[0] :]
+    p = z.shared.shape[0]
 
     def one(experiment: Experiment, own: Float[Array, "q"], guess: Solution) -> Any:
-        def rows(shared: Float[Array, "p"], own: Float[Array, "q"]) -> tuple[list[Float[Array, "k d"]], Solution]:
-            shared, own = values(structure, problem.unbounded, Coordinates(shared, own))
-            placed = with_unknowns(structure, experiment, shared, own)
-            result = solved(structure, placed.scene, guess)
-            deviations = [measured.deviations(measured.of_rod(result)) for measured in placed.measured]
-            pairs = zip(placed.measured, deviations, strict=True)
-            return [measured.weights[:, None] * rows for measured, rows in pairs], result
+        def placed(u: Float[Array, "n"]) -> Experiment:
+            shared, own = values(structure, problem.unbounded, Coordinates(u[:p], u[p:]))
+            return with_unknowns(structure, experiment, shared, own)
 
-        found, tangent, result = jax.linearize(rows, z.shared, own, has_aux=True)
-        return found, jax.vmap(tangent)(of_shared, of_own), result
+        def rows(u: Float[Array, "n"], _: Scene | Harness, result: Solution) -> tuple[list[Float[Array, "k d"]], Any]:
+            deviations = [(each.weights, each.deviations(each.of_rod(result))) for each in placed(u).measured]
+            return [weights[:, None] * rows for weights, rows in deviations], result
+
+        def scene_at(u: Float[Array, "n"]) -> Scene | Harness:
+            return placed(u).scene
+
+        u = jnp.concatenate([z.shared, own])
+        return jacobian(rows, scene_at, u, solved(structure, scene_at(u), guess))
 
     parts = [
         in_lanes(one, (group.experiments, z.own[here], guess))

@@ -170,7 +170,7 @@ def _values(
 
 @traced_once
 def _evaluated(problem: Problem, design: Float[Array, "n"], result: Solution) -> Evaluation:
-    def outputs(scene: Scene | Harness, near: Solution) -> tuple[Float[Array, "r"], Any]:
+    def outputs(_: Array, scene: Scene | Harness, near: Solution) -> tuple[Float[Array, "r"], Any]:
         objective, slacks, spare, kept = _values(problem, scene, near)
         worst = [jnp.argmin(jax.lax.stop_gradient(each.margin)) for each in kept]
         kept = [jax.tree.map(lambda x, k=k: x[k][None], each) for each, k in zip(kept, worst, strict=True)]

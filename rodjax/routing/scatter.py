@@ -169,7 +169,7 @@ def _slopes(scattering: Scattering) -> Slopes:
     else:
         is_examined = has_potential(result.scene)
 
-    def found(_: Any, near: Solution) -> tuple[tuple[Quantities, Float[Array, ""]], None]:
+    def found(_: Array, __: Any, near: Solution) -> tuple[tuple[Quantities, Float[Array, ""]], None]:
         stiffness = lowest_mode(near).stiffness if is_examined else jnp.full_like(near.energy, jnp.nan)
         return (scattering.quantities(near), stiffness), None
 

@@ -69,24 +69,24 @@ def _change_of_result(harness: Harness, result: HarnessEquilibrium, change: Harn
 
 
 def jacobian(
-    function: Callable[[Any, Any], tuple[Any, Any]],
+    function: Callable[[Array, Any, Any], tuple[Any, Any]],
     subject_at: Callable[[Array], Any],
     u: Float[Array, "n"],
     result: Solution,
 ) -> tuple[Any, Any, Any]:
-    """Of the first output of a function of a scene or harness and its equilibrium the value, and the derivatives by
-    `u` along a leading axis; the second output. The rods of a harness are linearised in one place of the program, where
-    `jax.jacfwd` of it has two.
+    """Of the first output of a function of `u`, the scene or harness there and its equilibrium the value, and the
+    derivatives by `u` along a leading axis; the second output. The rods of a harness are linearised in one place of the
+    program, where `jax.jacfwd` of it has two.
     """
     near = _Near.of(subject_at(u), result) if isinstance(result, HarnessEquilibrium) else None
 
     def found(u: Float[Array, "n"], unknown: Float[Array, "k"]) -> tuple[Any, Any]:
         subject = subject_at(u)
         if near is None:
-            value, other = function(subject, differentiable_by(subject, result))
+            value, other = function(u, subject, differentiable_by(subject, result))
             return (value, unknown), other
         there, lacking = near.at(subject, unknown)
-        value, other = function(subject, there)
+        value, other = function(u, subject, there)
         return (value, lacking), other
 
     nowhere = jnp.zeros(0, u.dtype) if near is None else near.nowhere

@@ -167,6 +167,16 @@ def test_more_contacts_than_are_sought_are_told():
 
 
 @pytest.mark.slow
+def test_supports_that_hold_cables_within_one_another_are_told():
+    low, high = (beam((1, 0, 0), ALONG, height, rod()) for height in (0.0, 0.015))
+    with pytest.warns(rodjax.NotConvergedWarning) as warned:
+        result = rodjax.solve(Harness({"upper": high, "lower": low}, contact=True), segments=8, solver=TIGHT)
+    for told in (str(warned[0].message), rodjax.describe(result)):
+        assert "upper (start) and lower (start) are held 0.015 m apart, less than their radii together, 0.02 m" in told
+        assert "upper (end) and lower (end)" in told
+        assert "upper (start) and lower (end)" not in told
+
+
 def test_derivatives_of_rods_along_one_another():
     """By how far they are apart, and the stiffness of one, beside differences."""
     begin = jnp.array([0.04 * RADIUS, 0.0])

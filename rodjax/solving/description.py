@@ -5,7 +5,7 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from rodjax.checks import instance, leaf
 from rodjax.discretization.moving_mesh import NEARLY_OUT
@@ -201,7 +201,7 @@ def too_short(equilibrium: Equilibrium) -> list[str]:
         return []
     if bool(equilibrium.converged) and not bool(_is_overstretched(equilibrium)):
         return []
-    radius, length = float(np.min(_radii(scene.rod))), float(scene.rod.length)
+    radius, length = least_radius(scene.rod), float(scene.rod.length)
     ends = np.asarray(start.position), np.asarray(end.position)
     points = np.asarray(before.points).copy()
     points[0], points[-1] = ends
@@ -217,10 +217,10 @@ def too_short(equilibrium: Equilibrium) -> list[str]:
     return [f"the rod is at least {lacking:.2g} m too short{where}"]
 
 
-def _radii(rod: Rod) -> Float[np.ndarray, "k"]:
-    """All numbers of the radius along a rod: those between which it varies are not smaller."""
+def least_radius(rod: Rod) -> float:
+    """The least of the numbers of the radius along a rod: those between which it varies are not smaller."""
     assert rod.radius is not None
-    return np.atleast_1d(np.asarray(getattr(rod.radius, "values", rod.radius)))
+    return float(np.min(np.asarray(getattr(rod.radius, "values", rod.radius))))
 
 
 def _passages(equilibrium: Equilibrium) -> list[str]:

@@ -1,5 +1,6 @@
 """What a solve of a harness gives: the equilibria of its rods, and the poses of its bodies."""
 
+import itertools
 from collections.abc import Iterator
 from typing import ClassVar
 
@@ -12,7 +13,8 @@ from rodjax.checks import is_known, leaf
 from rodjax.model.harness import Harness
 from rodjax.model.scene import Scene
 from rodjax.model.summaries import range_text
-from rodjax.solving.description import Described, describe
+from rodjax.model.supports import Clip, Held
+from rodjax.solving.description import Described, describe, least_radius
 from rodjax.solving.result import Equilibrium, pictures
 from rodjax.solving.result_summary import harness_told, title_of_harness, told_html, told_text
 from rodjax.solving.rod_contact_results import RodContacts, rod_contacts
@@ -152,7 +154,23 @@ class HarnessEquilibrium(Described):
     def outcome(self) -> str:
         """Of one equilibrium, in words."""
         told = Status(int(self.status)).message
-        return f"{told}; residual {float(self.residual):.1e} EI/L^2 after {int(self.iterations)} iterations"
+        told += f"; residual {float(self.residual):.1e} EI/L^2 after {int(self.iterations)} iterations"
+        return "; ".join([told, *([] if bool(self.converged) else self._held_too_near())])
+
+    def _held_too_near(self) -> list[str]:
+        """Of rods that may touch, which supports or clips hold places nearer to one another than the radii allow."""
+        told = []
+        for pair in self.harness.contact:
+            names, scenes = [self.names[k] for k in pair], [self.harness.scenes[k] for k in pair]
+            allowed = sum(least_radius(scene.rod) for scene in scenes)
+            for (place, x), (other, y) in itertools.product(*map(_held_places, scenes)):
+                distance = float(np.linalg.norm(x - y))
+                if distance < allowed:
+                    told.append(
+                        f"{names[0]} ({place}) and {names[1]} ({other}) are held {distance:.4g} m apart, less than "
+                        f"their radii together, {allowed:.4g} m"
+                    )
+        return told
 
     def _contacts_told(self) -> list[str]:
         """Of one equilibrium, which rods touch one another, with which force and where."""
@@ -168,6 +186,13 @@ class HarnessEquilibrium(Described):
                 force = np.linalg.norm(found.forces.sum(0))
                 told.append(f"{first} and {second} touch, {where}, and push one another with {force:.4g} N")
         return told if told else ["no rods touch one another"]
+
+
+def _held_places(scene: Scene) -> list[tuple[str, Float[np.ndarray, "3"]]]:
+    """The supports and clips that hold a rod where they are, and where that is."""
+    clips = [(f"clips[{k}]", clip) for k, clip in enumerate(scene.clips)]
+    held = [("start", scene.start), ("end", scene.end), *clips]
+    return [(name, np.asarray(one.position)) for name, one in held if isinstance(one, Held | Clip)]
 
 
 Solution = Equilibrium | HarnessEquilibrium

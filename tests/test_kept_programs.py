@@ -14,7 +14,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 import rodjax as rj
-from rodjax.programs import kept
+from rodjax.programs import blas, kept
 from rodjax.programs.compilation import compiled
 
 # Solves, inverts a matrix by LAPACK, and says how many programs were traced and compiled for that and what was found.
@@ -183,6 +183,23 @@ def test_a_folder_that_cannot_be_written_to_is_told_of_once(folder, monkeypatch,
     rj.keep_programs(folder.parent / "file")
     assert program()(np.ones(3))["scaled"][0] == 2.0
     assert len(caplog.records) == 2
+
+
+def test_programs_that_call_blas_are_kept_as_such(folder):
+    def inverse(x):
+        return jnp.linalg.inv(x)
+
+    inverse.__module__, inverse.__qualname__ = "rodjax.example", "inverse"
+    found = []
+    for rows in (blas.FEW_ROWS, blas.FEW_ROWS + 1):
+        matrix = np.eye(rows) + 1.0
+        before = files(folder)
+        compiled(inverse)(matrix)
+        (file,) = set(files(folder)) - set(before)
+        program = kept.load(file.stem, jax.tree.structure(((matrix,), {})))
+        np.testing.assert_allclose(program(matrix), np.linalg.inv(matrix), atol=1e-14)
+        found.append(hasattr(program, "__wrapped__"))
+    assert found == [False, True]
 
 
 def test_those_used_longest_ago_go(folder, monkeypatch):

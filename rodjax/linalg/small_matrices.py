@@ -102,6 +102,16 @@ def _negatives(matrices: Float[Array, "*m c c"]) -> Int[Array, "*m"]:
 
     last = pivot(diagonal[..., 0])
     count = (last < 0).astype(int)
+    if c > MOST_ROWS:  # written out they take half a second to compile
+
+        def counted(carry: tuple[Array, Array], row: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+            last, count = carry
+            value, beside = row
+            last = pivot(value - beside**2 / last)
+            return (last, count + (last < 0).astype(int)), None
+
+        rows = jnp.moveaxis(diagonal[..., 1:], -1, 0), jnp.moveaxis(beside, -1, 0)
+        return jax.lax.scan(counted, (last, count), rows, unroll=10)[0][1]
     for k in range(1, c):
         last = pivot(diagonal[..., k] - beside[..., k - 1] ** 2 / last)
         count += (last < 0).astype(int)

@@ -15,7 +15,7 @@ import jax
 
 from rodjax.checks import shown
 from rodjax.notes import noted, told
-from rodjax.programs import kept
+from rodjax.programs import blas, kept
 from rodjax.programs.numpy_code import AnswerCode, NotInNumpyError, operation_count
 from rodjax.programs.numpy_operations import TookTooLongError
 
@@ -69,7 +69,8 @@ class Program:
             ANSWERS.remember(self)
             begin = time.thread_time()
             try:
-                return code(leaves, self.seconds_left)
+                with blas.one_thread:
+                    return code(leaves, self.seconds_left)
             except TookTooLongError:
                 pass
             finally:
@@ -126,8 +127,11 @@ class Program:
             if self.executable is None:
                 traced = self.traced or trace()
                 self.executable, is_new = kept.compile_lowered(traced.lower(), _options(traced))
+                calls_blas = blas.calls_blas(traced.jaxpr)
                 if is_new and self.name is not None:
-                    kept.store(self.name, self.executable)
+                    kept.store(self.name, self.executable, calls_blas)
+                if calls_blas:
+                    self.executable = blas.by_one_thread(self.executable)
             self.code = self.traced = None
             ANSWERS.forget(self)
             return self.executable

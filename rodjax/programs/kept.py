@@ -30,6 +30,7 @@ from jax.experimental import serialize_executable
 
 from rodjax.atomic_write import replace_file
 from rodjax.checks import file_path, shown
+from rodjax.programs.blas import by_one_thread
 from rodjax.programs.numpy_code import AnswerCode, skeleton
 from rodjax.programs.numpy_operations import Callback
 
@@ -99,11 +100,12 @@ def name_of(function: str, options: dict[str, Any], statics: Sequence[Any], tree
 def load(name: str, tree: Any) -> Any:
     """The program of that name, to be called with arguments of this structure; `None` where there is none."""
 
-    def loaded(executable: bytes, skeleton: Any) -> Any:
+    def loaded(executable: bytes, skeleton: Any, calls_blas: bool) -> Any:
         if b"lapack_" in executable:
             _prepare_lapack()
         out_tree = jax.tree.structure(skeleton)
-        return serialize_executable.deserialize_and_load(executable, tree, out_tree, execution_devices=_devices())
+        program = serialize_executable.deserialize_and_load(executable, tree, out_tree, execution_devices=_devices())
+        return by_one_thread(program) if calls_blas else program
 
     return _read(name + SUFFIX, loaded)
 
@@ -161,7 +163,7 @@ def compile_lowered(lowered: Any, options: dict[str, Any]) -> tuple[Any, bool]:
     return program, not _compiling.taken
 
 
-def store(name: str, program: Any) -> None:
+def store(name: str, program: Any, calls_blas: bool) -> None:
     """Keeps a program, if that is possible; a folder that cannot be written to is told of once."""
     if _folder is None or _is_broken:
         return
@@ -173,7 +175,7 @@ def store(name: str, program: Any) -> None:
     # Beside functions of this process that are called by their address, and classes that others may lack.
     if b"python_cpu_callback" in executable or _tree_text(out_tree) is None:
         return
-    _write(name + SUFFIX, (executable, skeleton(out_tree)))
+    _write(name + SUFFIX, (executable, skeleton(out_tree), calls_blas))
 
 
 def store_code(name: str, code: AnswerCode) -> None:

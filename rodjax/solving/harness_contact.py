@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.small_matrices import inverse_matrix, solved_where_regular
+from rodjax.linalg.small_matrices import inverse_matrix, negative_count, solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, sought
 from rodjax.programs.stacks import of_each
 from rodjax.solving.contact_elimination import Eliminated, RodsInContact, along_rod, eliminated
@@ -289,7 +289,7 @@ class ContactModel(eqx.Module):
             matrix += jnp.einsum("k,kzy->zy", rods.shares, found.stiffness[:, moves:, moves:])
             by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.stiffness[:, moves:, :moves], rods.by_q)
             force += jnp.einsum("k,kz->z", rods.shares, found.force[:, moves:])
-        excess = jnp.sum(jnp.linalg.eigvalsh(matrix) < 0) - between.positive
+        excess = negative_count(jax.lax.stop_gradient(matrix)[None]) - between.positive
         is_minimum = (negative + excess == 0) & jnp.isfinite(jnp.sum(matrix))
         return _Touching(is_minimum, excess, inverse_matrix(matrix), jnp.asarray(by_bodies), force)
 

@@ -61,13 +61,12 @@ def _libraries(_: bool) -> list[LibController]:
 
 def by_one_thread(program: Callable[..., Any]) -> Callable[..., Any]:
     """A program that has ended when it returns."""
+    return functools.partial(_run, program)
 
-    @functools.wraps(program, ())
-    def call(*args: Any, **options: Any) -> Any:
-        with one_thread:
-            return jax.block_until_ready(program(*args, **options))
 
-    return call
+def _run(program: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    with one_thread:
+        return jax.block_until_ready(program(*args, **options))
 
 
 def calls_blas(program: ClosedJaxpr | Jaxpr) -> bool:

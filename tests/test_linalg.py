@@ -380,7 +380,7 @@ def check_chain(system: ChainSystem):
     assert int(factors.negative) > 0
 
 
-@pytest.mark.parametrize("size", [1, 2, 9])
+@pytest.mark.parametrize("size", [1, 2, 9, 33])
 def test_negative_eigenvalues_are_counted(size):
     """Of matrices whose eigenvalues are known, over 16 orders, a singular one and one of zeros among them."""
     generator = np.random.default_rng(size)

@@ -19,10 +19,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
+from rodjax.programs.blas import FEW_ROWS
 from rodjax.programs.numpy_rules import OTHERS
-
-# Of more rows LAPACK is quicker.
-MOST_ROWS = 16
 
 
 def inverse_matrix(matrices: Float[Array, "*m c c"]) -> Float[Array, "*m c c"]:
@@ -54,7 +52,7 @@ def _inverses(matrices: Float[Array, "*m c c"]) -> Float[Array, "*m c c"]:
     c = matrices.shape[-1]
     if c == 1:
         return 1 / matrices
-    if c <= MOST_ROWS:
+    if c <= FEW_ROWS:
         return _each(_by_exchanges, matrices)
     factors, _, order = jax.lax.linalg.lu(matrices)
     rows = jax.nn.one_hot(order, c, dtype=matrices.dtype)
@@ -89,7 +87,7 @@ def _negatives(matrices: Float[Array, "*m c c"]) -> Int[Array, "*m"]:
     c = matrices.shape[-1]
     if c == 1:
         return (matrices[..., 0, 0] < 0).astype(int)
-    if c <= MOST_ROWS:
+    if c <= FEW_ROWS:
         matrices = _each(_tridiagonal, matrices)
         diagonal, beside = (jnp.diagonal(matrices, offset, -2, -1) for offset in (0, -1))
     else:
@@ -102,7 +100,7 @@ def _negatives(matrices: Float[Array, "*m c c"]) -> Int[Array, "*m"]:
 
     last = pivot(diagonal[..., 0])
     count = (last < 0).astype(int)
-    if c > MOST_ROWS:  # written out they take half a second to compile
+    if c > FEW_ROWS:  # written out they take half a second to compile
 
         def counted(carry: tuple[Array, Array], row: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
             last, count = carry

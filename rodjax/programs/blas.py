@@ -15,8 +15,8 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxprs_in_params
 from threadpoolctl import LibController, OpenBLASController, ThreadpoolController
 
-# Operations for which XLA or this package (`small_matrices`) calls LAPACK, which shares matrices of more than so many
-# rows among threads.
+# Operations that call LAPACK, those of this package (`small_matrices`) for matrices of more than so many rows. Smaller
+# ones are not shared among threads.
 LAPACK = {"cholesky", "eig", "eigh", "inverse", "lu", "negative_counts", "qr", "svd", "triangular_solve", "tridiagonal"}
 FEW_ROWS = 16
 
